@@ -163,7 +163,7 @@ def _reference(design: TrialDesign, random: np.random.Generator) -> Reference:
     cohort = Cohort(table=table, sides={"L": side}, x=axes[0], y=axes[1], units={})
     source: Modeled | Retested
     if design.retest:
-        source = Retested(retest_cohort(cohort, 3), design.settings, several=True)
+        source = Retested(retest_cohort(cohort, 3), design.settings, has_visits=True)
     else:
         time = VisitTime(table, "months", ()) if design.effect.visits else None
         source = Modeled(cohort, ModelRequest(), design.settings, time)

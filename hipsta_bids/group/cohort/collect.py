@@ -121,45 +121,45 @@ def collect_sheets(request: GroupRequest, *, may_lack: bool = False) -> Collecti
         if not folder.is_dir():
             raise InputError(f"{folder}: no such folder; check --segmentations")
     roots = [root for root in request.roots if root.is_dir() or not may_lack]
-    everything = [place for root in roots for place in _wanted_results(root, request)]
-    found = [place for place in everything if place.name.region == request.region]
-    notes = _other_regions(everything, request)
-    if may_lack and not found:
+    results = [place for root in roots for place in _wanted_results(root, request)]
+    places = [place for place in results if place.name.region == request.region]
+    notes = _other_regions(results, request)
+    if may_lack and not places:
         return Collection(
             grid=SheetSettings(), settings_hash=settings_hash(Settings()), notes=notes
         )
-    seg = _one_protocol(found, everything, request)
-    found = [place for place in found if place.name.seg == seg]
-    _refuse_twice(found)
+    seg = _one_protocol(places, results, request)
+    places = [place for place in places if place.name.seg == seg]
+    _refuse_twice(places)
     choices = read_choices(request.exclude_table, request.ratings)
-    kept: list[SheetRecord] = []
+    records: list[SheetRecord] = []
     left_out: list[Exclusion] = []
-    for place in sorted(found, key=_key):
+    for place in sorted(places, key=_key):
         entry = _judge(place, request, choices)
         if isinstance(entry, Exclusion):
             left_out.append(entry)
         else:
-            kept.append(entry)
+            records.append(entry)
     _refuse_unfinished(request, seg, choices)
-    if not kept:
+    if not records:
         reasons = ", ".join(f"{n} {why}" for why, n in Counter(e.reason for e in left_out).items())
         raise NothingToDoError(
             f"{request.roots[0]}: no hemisphere is left for the group level ({reasons})"
         )
-    digest = _one_settings(kept)
+    digest = _one_settings(records)
     return Collection(
-        records=tuple(kept),
+        records=tuple(records),
         exclusions=tuple(left_out),
-        grid=grid_of(kept[0].place.root),
+        grid=grid_of(records[0].place.root),
         settings_hash=digest,
-        versions=tuple(sorted({record.version for record in kept})),
-        ratings=choices.counts((place.name, _digest(place)) for place in found),
+        versions=tuple(sorted({record.version for record in records})),
+        ratings=choices.counts((place.name, _digest(place)) for place in places),
         notes=(
             *notes,
-            *choices.excluded.notes((place.name, _digest(place)) for place in everything),
-            *choices.rated.notes((place.name, _digest(place)) for place in everything),
+            *choices.excluded.notes((place.name, _digest(place)) for place in results),
+            *choices.rated.notes((place.name, _digest(place)) for place in results),
         ),
-        warnings=_several_versions(kept),
+        warnings=_several_versions(records),
     )
 
 
@@ -169,18 +169,18 @@ def _digest(place: hemisphere.ResultPlace) -> str | None:
     return None if digest is None else str(digest)
 
 
-def _several_versions(kept: Sequence[SheetRecord]) -> tuple[str, ...]:
+def _several_versions(records: Sequence[SheetRecord]) -> tuple[str, ...]:
     """Say which hemispheres another version has measured: versions may give other numbers."""
-    counts = Counter(record.version for record in kept)
+    counts = Counter(record.version for record in records)
     if len(counts) < 2:  # noqa: PLR2004 -- one is as it should be
         return ()
     usual = counts.most_common(1)[0][0]
-    others = [record.place.name.stem for record in kept if record.version != usual]
-    more = f" and {len(others) - SHOWN} more" if len(others) > SHOWN else ""
+    stems = [record.place.name.stem for record in records if record.version != usual]
+    ending = f" and {len(stems) - SHOWN} more" if len(stems) > SHOWN else ""
     found = ", ".join(f"{version} ({n})" for version, n in sorted(counts.items()))
     text = (
         f"hemispheres were measured by several versions, {found}; measure"
-        f" {', '.join(others[:SHOWN])}{more} with {usual}: a version may change numbers"
+        f" {', '.join(stems[:SHOWN])}{ending} with {usual}: a version may change numbers"
     )
     return (text,)
 
@@ -207,11 +207,11 @@ def _wanted_results(root: Path, request: GroupRequest) -> list[hemisphere.Result
 
 
 def _other_regions(
-    everything: Sequence[hemisphere.ResultPlace], request: GroupRequest
+    results: Sequence[hemisphere.ResultPlace], request: GroupRequest
 ) -> tuple[str, ...]:
     """Say which results are left out because another region was asked for."""
     counts = Counter(
-        place.name.region for place in everything if request.seg in {None, place.name.seg}
+        place.name.region for place in results if request.seg in {None, place.name.seg}
     )
     return tuple(
         f"{count} hemispheres of region {region} are not in this analysis;"
@@ -226,18 +226,22 @@ def _key(place: hemisphere.ResultPlace) -> tuple[str, str, str]:
 
 
 def _one_protocol(
-    found: Sequence[hemisphere.ResultPlace],
-    everything: Sequence[hemisphere.ResultPlace],
+    places: Sequence[hemisphere.ResultPlace],
+    results: Sequence[hemisphere.ResultPlace],
     request: GroupRequest,
 ) -> str:
-    counts = Counter(place.name.seg for place in found)
+    counts = Counter(place.name.seg for place in places)
     if not counts or request.seg not in {None, *counts}:
-        asked = f" with --seg {request.seg}" if request.seg else " as asked for"
-        asked += f" --region {request.region}" if request.region != "body" else ""
-        kinds = sorted({(place.name.seg, place.name.region) for place in everything})
-        there = [seg if region == "body" else f"{seg} --region {region}" for seg, region in kinds]
-        hint = f"there is {', '.join(there)}" if there else "run the participant level first"
-        raise NothingToDoError(f"{request.roots[0]}: no hemisphere{asked}; {hint}")
+        request_text = f" with --seg {request.seg}" if request.seg else " as asked for"
+        request_text += f" --region {request.region}" if request.region != "body" else ""
+        kinds = sorted({(place.name.seg, place.name.region) for place in results})
+        protocols = [
+            seg if region == "body" else f"{seg} --region {region}" for seg, region in kinds
+        ]
+        hint = (
+            f"there is {', '.join(protocols)}" if protocols else "run the participant level first"
+        )
+        raise NothingToDoError(f"{request.roots[0]}: no hemisphere{request_text}; {hint}")
     if request.seg is None and len(counts) > 1:
         names = ", ".join(f"{name} ({n})" for name, n in sorted(counts.items()))
         raise InputError(
@@ -246,13 +250,13 @@ def _one_protocol(
     return request.seg or next(iter(counts))
 
 
-def _refuse_twice(found: Sequence[hemisphere.ResultPlace]) -> None:
+def _refuse_twice(places: Sequence[hemisphere.ResultPlace]) -> None:
     first: dict[tuple[str, str, str], Path] = {}
-    for place in found:
-        other = first.setdefault(_key(place), place.root)
-        if other != place.root:
+    for place in places:
+        root = first.setdefault(_key(place), place.root)
+        if root != place.root:
             raise InputError(
-                f"{place.name.stem} is in {other} and in {place.root}; participants of different"
+                f"{place.name.stem} is in {root} and in {place.root}; participants of different"
                 " sites need different labels"
             )
 
@@ -287,8 +291,8 @@ def _judge(
 def _metrics(record: Mapping[str, Any]) -> dict[str, Any]:
     """List what conditions can name: numbers and words of the record and of its metrics."""
     metrics = record.get("metrics") or {}
-    both = {**metrics, **{name: record.get(name) for name in ("status", "undefined_columns")}}
-    return {k: v for k, v in both.items() if not isinstance(v, (list, dict))}
+    merged = {**metrics, **{name: record.get(name) for name in ("status", "undefined_columns")}}
+    return {k: v for k, v in merged.items() if not isinstance(v, (list, dict))}
 
 
 def _refuse_unfinished(request: GroupRequest, seg: str, choices: Choices) -> None:
@@ -297,24 +301,24 @@ def _refuse_unfinished(request: GroupRequest, seg: str, choices: Choices) -> Non
     for root in request.roots:
         for row in read_status(root):
             name = name_of(row)
-            asked = request.wants(name.subject, name.session)
+            is_wanted = request.wants(name.subject, name.session)
             listed = choices.reason_to_leave_out(name, None) is not None
-            same = (name.seg, name.region) == (seg, request.region)
-            if row.get("reason") == NOT_FINISHED and same and asked and not listed:
+            matches = (name.seg, name.region) == (seg, request.region)
+            if row.get("reason") == NOT_FINISHED and matches and is_wanted and not listed:
                 pending.append(name.stem)
     if pending:
-        shown = ", ".join(pending[:SHOWN]) + (" ..." if len(pending) > SHOWN else "")
+        names = ", ".join(pending[:SHOWN]) + (" ..." if len(pending) > SHOWN else "")
         raise InputError(
             f"{request.roots[0]}: the participant level has not finished {len(pending)} hemispheres"
-            f" ({shown}); complete it by the same command, or list them in --exclude",
+            f" ({names}); complete it by the same command, or list them in --exclude",
             reason=NOT_FINISHED,
         )
 
 
-def _one_settings(kept: Sequence[SheetRecord]) -> str:
-    counts = Counter(record.settings_hash for record in kept)
+def _one_settings(records: Sequence[SheetRecord]) -> str:
+    counts = Counter(record.settings_hash for record in records)
     if len(counts) > 1:
-        examples = {record.settings_hash: record.place for record in reversed(kept)}
+        examples = {record.settings_hash: record.place for record in reversed(records)}
         parts = [
             f"{n} with {digest[:8]} (as {examples[digest].name.stem} in {examples[digest].root})"
             for digest, n in counts.most_common()

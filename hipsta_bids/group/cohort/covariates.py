@@ -17,7 +17,7 @@ from hipsta_bids.io import files
 from hipsta_bids.types import PARTICIPANT, SESSION
 
 #: Number of rows that a message lists.
-_SHOWN = 6
+_MOST_NAMES = 6
 #: Column of BIDS' sessions.tsv with dates, and columns that are made here.
 _DATE, TIME, _ICV = "acq_time", "time", "icv"
 _DAYS_PER_YEAR = 365.25
@@ -163,16 +163,17 @@ def _join(joined: pd.DataFrame, table: pd.DataFrame, path: Path) -> pd.DataFrame
     keys = [PARTICIPANT, SESSION] if by_session else [PARTICIPANT]
     table = table.drop(columns=[SESSION]) if SESSION in table and not by_session else table
     table = table[table[PARTICIPANT].isin(joined[PARTICIPANT])]
-    twice = table.loc[table.duplicated(keys), keys].astype(str).agg(" ".join, axis=1)
-    if len(twice):
-        names = sorted(set(twice))
-        more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
+    repeated = table.loc[table.duplicated(keys), keys].astype(str).agg(" ".join, axis=1)
+    if len(repeated):
+        names = sorted(set(repeated))
+        ending = f" and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
         raise InputError(
-            f"{path}: {', '.join(names[:_SHOWN])}{more} occur more than once; keep one row each"
+            f"{path}: {', '.join(names[:_MOST_NAMES])}{ending} occur more than once; keep one row"
+            " each"
         )
     indexed = table.set_index(keys)
-    wanted = pd.MultiIndex.from_frame(joined[keys]) if by_session else joined[PARTICIPANT]
-    aligned = indexed.reindex(wanted)
+    rows = pd.MultiIndex.from_frame(joined[keys]) if by_session else joined[PARTICIPANT]
+    aligned = indexed.reindex(rows)
     result = joined.copy()
     for column in indexed.columns:
         values = pd.Series(aligned[column].to_numpy(), index=joined.index, dtype=object)
@@ -194,11 +195,14 @@ def add_icv(
     for name in settings.model.icv_columns:
         if name in by_name:
             return table, by_name[name]
-    known = {name: sources[name] for name in table.index if name in sources}
-    read = read_icv([source for source, _ in known.values()], [root for _, root in known.values()])
+    sources_of_table = {name: sources[name] for name in table.index if name in sources}
+    read = read_icv(
+        [source for source, _ in sources_of_table.values()],
+        [root for _, root in sources_of_table.values()],
+    )
     if all(volume is None for volume in read):
         return table, None
-    volumes = dict(zip(known, read, strict=True))
+    volumes = dict(zip(sources_of_table, read, strict=True))
     column = pd.array([volumes.get(name) for name in table.index], dtype=np.float64)
     return table.assign(**{_ICV: column}), _ICV
 
@@ -245,21 +249,21 @@ def add_time(table: pd.DataFrame, settings: GroupSettings) -> VisitTime:
     """
     covariates = tuple(settings.model.covariates)
     by_name = {str(column).casefold(): str(column) for column in table.columns}
-    people, made = table[PARTICIPANT], dict[str, Any]()
+    people, columns = table[PARTICIPANT], dict[str, Any]()
     times, unit = None, 1.0
     if "age" in by_name:
         ages = typed(table[by_name["age"]])
         if pd.api.types.is_numeric_dtype(ages):
             check_numbers(ages, settings.design)
         if _varies(ages, people):
-            times, made[FIRST_AGE] = ages, ages.groupby(people).transform("first")
+            times, columns[FIRST_AGE] = ages, ages.groupby(people).transform("first")
             covariates = tuple(
                 FIRST_AGE if name.casefold() == "age" else name for name in covariates
             )
     names = [name.casefold() for name in settings.longitudinal.time_columns]
     named = {by_name[name]: table[by_name[name]] for name in names if name in by_name}
-    given = ((name, typed(values)) for name, values in named.items())
-    column, own = next((one for one in given if _varies(one[1], people)), (None, None))
+    candidates = ((name, typed(values)) for name, values in named.items())
+    column, own = next((one for one in candidates if _varies(one[1], people)), (None, None))
     if column is None:
         if _DATE in table.columns and table[_DATE].notna().any():
             times, unit = _dates(table[_DATE]), _DAYS_PER_YEAR
@@ -267,16 +271,16 @@ def add_time(table: pd.DataFrame, settings: GroupSettings) -> VisitTime:
             first = times.groupby(people).transform("min")
             column, own = TIME, (times - first) / unit
     if column is not None:
-        made[column] = own
-    return VisitTime(table.assign(**made), column, covariates)
+        columns[column] = own
+    return VisitTime(table.assign(**columns), column, covariates)
 
 
 def _varies(values: pd.Series, people: pd.Series) -> bool:
     """Whether numbers differ between sessions of a participant."""
     if not pd.api.types.is_numeric_dtype(values):
         return False
-    own = values.groupby(people)
-    return bool((own.transform("min") < own.transform("max")).any())
+    grouped = values.groupby(people)
+    return bool((grouped.transform("min") < grouped.transform("max")).any())
 
 
 def _dates(values: pd.Series) -> pd.Series:

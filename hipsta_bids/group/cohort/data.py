@@ -48,35 +48,35 @@ class Cohort:
         )
 
 
-def summary_values(cohort: Cohort, hemi: str, only: Sequence[str] | None = None) -> pd.DataFrame:
+def summary_values(cohort: Cohort, hemi: str, names: Sequence[str] | None = None) -> pd.DataFrame:
     """Summary measures by visit.
 
     One row per visit of the cohort's table, NaN where missing.
     """
     if hemi == BOTH:
-        left, right = (summary_values(cohort, side, only) for side in BOTH)
+        left, right = (summary_values(cohort, side, names) for side in BOTH)
         return (left + right) / 2
     side = cohort.sides[hemi]
     table = side.summary.set_axis(cohort.table.index[side.rows])
-    chosen = table if only is None else table[[name for name in only if name in table.columns]]
-    return chosen.reindex(cohort.table.index)
+    selected = table if names is None else table[[name for name in names if name in table.columns]]
+    return selected.reindex(cohort.table.index)
 
 
 def hemispheres(cohort: Cohort) -> list[str]:
     """Hemispheres that are there, and both together if both are."""
-    own = list(cohort.sides)
-    return [*own, BOTH] if len(own) == len(BOTH) else own
+    sides = list(cohort.sides)
+    return [*sides, BOTH] if len(sides) == len(BOTH) else sides
 
 
-def participants_with(known: Bool, who: NDArray[np.object_]) -> Int:
+def participants_with(finite: Bool, participants: NDArray[np.object_]) -> Int:
     """Count those (columns,) of whom any row (rows, columns) is known."""
-    names, numbers = np.unique(who.astype(str), return_inverse=True)
-    if len(names) == len(who):
-        return np.asarray(known.sum(axis=0), dtype=np.int64)
+    names, numbers = np.unique(participants.astype(str), return_inverse=True)
+    if len(names) == len(participants):
+        return np.asarray(finite.sum(axis=0), dtype=np.int64)
     order = np.argsort(numbers, kind="stable")
     starts = np.searchsorted(numbers[order], np.arange(len(names)))
     return np.asarray(
-        np.logical_or.reduceat(known[order], starts, axis=0).sum(axis=0), dtype=np.int64
+        np.logical_or.reduceat(finite[order], starts, axis=0).sum(axis=0), dtype=np.int64
     )
 
 
@@ -87,24 +87,24 @@ def choose_visits(cohort: Cohort, comparison: Comparison) -> tuple[Cohort, Mappi
         return cohort, {}
     if comparison.pair is None:
         keep = ~table[PARTICIPANT].duplicated().to_numpy()
-        why = pd.Series("the first session of each participant is analyzed", index=table.index)
+        reasons = pd.Series("the first session of each participant is analyzed", index=table.index)
     else:
-        known = sorted(table[SESSION].dropna().unique())
-        if unknown := sorted(set(comparison.pair) - set(known)):
+        sessions = sorted(table[SESSION].dropna().unique())
+        if unknown := sorted(set(comparison.pair) - set(sessions)):
             raise ModelError(
-                f"there is no session {listed(unknown)}, only {listed(known) or 'none'}"
+                f"there is no session {listed(unknown)}, only {listed(sessions) or 'none'}"
             )
-        asked = table[SESSION].isin(comparison.pair)
-        both = asked.groupby(table[PARTICIPANT]).transform("sum") == len(comparison.pair)
-        keep = (asked & both).to_numpy()
-        why = pd.Series("the other session of the pair is missing", index=table.index)
-        why[~asked] = f"sessions {' and '.join(comparison.pair)} are compared"
+        in_pair = table[SESSION].isin(comparison.pair)
+        complete = in_pair.groupby(table[PARTICIPANT]).transform("sum") == len(comparison.pair)
+        keep = (in_pair & complete).to_numpy()
+        reasons = pd.Series("the other session of the pair is missing", index=table.index)
+        reasons[~in_pair] = f"sessions {' and '.join(comparison.pair)} are compared"
         if not keep.any():
             raise ModelError(
                 f"no participant has both sessions {' and '.join(comparison.pair)}; choose two"
                 " others"
             )
-    return cohort.take(keep), dict(why[~keep])
+    return cohort.take(keep), dict(reasons[~keep])
 
 
 def modeled_table(table: pd.DataFrame, comparison: Comparison) -> pd.DataFrame:

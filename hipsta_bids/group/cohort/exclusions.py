@@ -45,11 +45,11 @@ class UserTable:
 
     @cached_property
     def _by_subject(self) -> Mapping[str, list[Mapping[str, str]]]:
-        found: dict[str, list[Mapping[str, str]]] = {}
+        rows_of: dict[str, list[Mapping[str, str]]] = {}
         for row in self.rows:
             cell = row.get("participant_id", files.MISSING).removeprefix("sub-")
-            found.setdefault("" if cell == files.MISSING else cell, []).append(row)
-        return found
+            rows_of.setdefault("" if cell == files.MISSING else cell, []).append(row)
+        return rows_of
 
     def about(self, name: HemisphereName) -> list[Mapping[str, str]]:
         """List rows that mean a hemisphere; those without a participant mean all."""
@@ -60,23 +60,25 @@ class UserTable:
         """List rows that mean a hemisphere with this hash of its input, if both are known."""
         return [row for row in self.about(name) if _is_current(row, digest)]
 
-    def notes(self, found: Iterable[tuple[HemisphereName, str | None]]) -> list[str]:
+    def notes(self, names: Iterable[tuple[HemisphereName, str | None]]) -> list[str]:
         """Note rows that match no hemisphere, as by a misspelled label, or earlier labels.
 
-        Those ``found`` are of all protocols and regions, as rows of a saved table may be.
+        Those ``names`` are of all protocols and regions, as rows of a saved table may be.
         """
         if self.path is None:
             return []
         if not self.rows:
             return [f"{self.path}: has no rows that count; it changes nothing"]
-        meant, old = set(), []
-        for name, digest in found:
+        matched, old = set(), []
+        for name, digest in names:
             rows = self.about(name)
-            meant |= {id(row) for row in rows}
+            matched |= {id(row) for row in rows}
             if any(not _is_current(row, digest) for row in rows):
                 old.append(name.stem)
-        lost = [row["participant_id"] for row in self.rows if id(row) not in meant]
-        notes = [f"{self.path}: matches no hemisphere here: {_some(lost)}"] if lost else []
+        unmatched = [row["participant_id"] for row in self.rows if id(row) not in matched]
+        notes = (
+            [f"{self.path}: matches no hemisphere here: {_some(unmatched)}"] if unmatched else []
+        )
         if old:
             notes.append(
                 f"{self.path}: not applied to hemispheres whose labels have changed since they were"
@@ -105,14 +107,14 @@ class Choices:
                 return "rated", _note(row, f"rated {RATINGS[-1]}")
         return None
 
-    def counts(self, found: Iterable[tuple[HemisphereName, str | None]]) -> dict[str, int] | None:
+    def counts(self, names: Iterable[tuple[HemisphereName, str | None]]) -> dict[str, int] | None:
         """Count hemispheres by rating, the strictest of several; ``None`` without a table."""
         if self.rated.path is None:
             return None
         counts = dict.fromkeys((*RATINGS, _NO_RATING), 0)
-        for name, digest in found:
-            given = {row[_RATING] for row in self.rated.applying(name, digest)}
-            counts[next((word for word in reversed(RATINGS) if word in given), _NO_RATING)] += 1
+        for name, digest in names:
+            ratings = {row[_RATING] for row in self.rated.applying(name, digest)}
+            counts[next((word for word in reversed(RATINGS) if word in ratings), _NO_RATING)] += 1
         return counts
 
 
@@ -152,8 +154,8 @@ def _read(path: Path, needed: Sequence[str]) -> list[dict[str, str]]:
 
 
 def _some(names: Sequence[str]) -> str:
-    more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
-    return f"{', '.join(names[:SHOWN])}{more}"
+    ending = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
+    return f"{', '.join(names[:SHOWN])}{ending}"
 
 
 def _note(row: Mapping[str, str], default: str) -> str:
@@ -170,9 +172,9 @@ def is_listed(name: HemisphereName, row: Mapping[str, str]) -> bool:
 
     One without a protocol, of other programs' maps, is meant by rows of any protocol and region.
     """
-    own = {"participant_id": name.subject, "session_id": name.session or "", "hemi": name.hemi}
-    own |= {"protocol": name.seg, "region": name.region} if name.seg else {}
-    for key, value in own.items():
+    keys = {"participant_id": name.subject, "session_id": name.session or "", "hemi": name.hemi}
+    keys |= {"protocol": name.seg, "region": name.region} if name.seg else {}
+    for key, value in keys.items():
         cell = row.get(key, files.MISSING).removeprefix("sub-").removeprefix("ses-")
         if cell not in {files.MISSING, "", value}:
             return False
@@ -246,5 +248,5 @@ class QualityCondition:
             raise self._refusal(f"has {name!r}, which is no quality metric; {hint}")
         return metrics[name]
 
-    def _refusal(self, what: str) -> UsageError:
-        return UsageError(f"--exclude-qc {self.text!r} {what}")
+    def _refusal(self, problem: str) -> UsageError:
+        return UsageError(f"--exclude-qc {self.text!r} {problem}")

@@ -55,17 +55,17 @@ class ExternalFiles:
 def map_patterns(
     patterns: Sequence[tuple[str, str]],
     surfaces: Sequence[tuple[str | None, str]],
-    taken: Sequence[str],
+    reserved: Sequence[str],
 ) -> tuple[MapPattern, ...]:
     """Combine and check the options about maps; a surface without a name is for all others."""
     names = [name for name, _ in patterns]
     for name, pattern in patterns:
         if not (name.isalnum() and name.isascii() and name[0].isalpha()):
             raise UsageError(f"--maps: {name!r} is not a name of letters and digits")
-        if name in taken or names.count(name) > 1:
-            why = "belongs to the sheets" if name in taken else "occurs twice"
+        if name in reserved or names.count(name) > 1:
+            problem = "belongs to the sheets" if name in reserved else "occurs twice"
             raise UsageError(
-                f"--maps: the name {name} {why}; choose another one, such as other{name}"
+                f"--maps: the name {name} {problem}; choose another one, such as other{name}"
             )
         check_pattern("--maps", name, pattern)
         fields = fields_of(pattern)
@@ -75,13 +75,13 @@ def map_patterns(
                 f"--maps {name}: the pattern needs {{subject}}, and {{hemi}} or {{side}} unless it"
                 f" ends with {DENSE_SCALARS}"
             )
-    if lost := [name for name, _ in surfaces if name is not None and name not in names]:
-        raise UsageError(f"--maps-surface: there is no --maps {lost[0]}=...")
-    for whose, pattern in surfaces:
-        check_pattern("--maps-surface", whose or "", pattern)
-    chosen = dict(surfaces)
+    if unmatched := [name for name, _ in surfaces if name is not None and name not in names]:
+        raise UsageError(f"--maps-surface: there is no --maps {unmatched[0]}=...")
+    for surface, pattern in surfaces:
+        check_pattern("--maps-surface", surface or "", pattern)
+    pattern_of = dict(surfaces)
     return tuple(
-        MapPattern(name=name, pattern=pattern, surface=chosen.get(name, chosen.get(None)))
+        MapPattern(name=name, pattern=pattern, surface=pattern_of.get(name, pattern_of.get(None)))
         for name, pattern in patterns
     )
 
@@ -94,70 +94,70 @@ def taken_names(*, with_sheets: bool) -> tuple[str, ...]:
 def find_maps(
     request: MapPattern,
     root: Path,
-    known: Iterable[VisitKey],
+    visits: Iterable[VisitKey],
     is_wanted: Callable[[str, str | None, str], bool],
 ) -> ExternalFiles:
     """Find the files of one map."""
     sessions: dict[str, list[str | None]] = {}
-    for subject, session in known:
+    for subject, session in visits:
         sessions.setdefault(subject, []).append(session)
-    found: dict[str, dict[VisitKey, Path]] = {}
-    for one in scan(request.pattern, root):
-        hemis = [one.hemi] if one.hemi else cifti_sides(one.path)
-        for hemi, session in product(hemis, _sessions(one, sessions)):
-            if not is_wanted(one.subject, session, hemi):
+    paths: dict[str, dict[VisitKey, Path]] = {}
+    for match in scan(request.pattern, root):
+        hemis = [match.hemi] if match.hemi else cifti_sides(match.path)
+        for hemi, session in product(hemis, _sessions(match, sessions)):
+            if not is_wanted(match.subject, session, hemi):
                 continue
-            first = found.setdefault(hemi, {}).setdefault((one.subject, session), one.path)
-            if first != one.path:
+            first = paths.setdefault(hemi, {}).setdefault((match.subject, session), match.path)
+            if first != match.path:
                 raise InputError(
-                    f"--maps {request.name}: {first} and {one.path} are both for sub-{one.subject}"
-                    f" hemi-{hemi}; make the pattern match one of them",
+                    f"--maps {request.name}: {first} and {match.path} are both for"
+                    f" sub-{match.subject} hemi-{hemi}; make the pattern match one of them",
                     reason="several-files",
                 )
-    if not found:
+    if not paths:
         raise NothingToDoError(
             f"--maps {request.name}: no file matches {request.pattern} (in {root})"
         )
     return ExternalFiles(
-        request=request, root=root, files={hemi: found[hemi] for hemi in "LR" if hemi in found}
+        request=request, root=root, files={hemi: paths[hemi] for hemi in "LR" if hemi in paths}
     )
 
 
-def _sessions(one: Found, known: Mapping[str, Sequence[str | None]]) -> Sequence[str | None]:
+def _sessions(match: Found, visits: Mapping[str, Sequence[str | None]]) -> Sequence[str | None]:
     """Sessions that a file is for."""
-    own = known.get(one.subject)
-    if own is None:
-        return [one.session]
-    if one.session is None:
-        return own
-    return [one.session] if one.session in own else []
+    sessions = visits.get(match.subject)
+    if sessions is None:
+        return [match.session]
+    if match.session is None:
+        return sessions
+    return [match.session] if match.session in sessions else []
 
 
 def read_maps(
-    found: ExternalFiles, visits: Sequence[VisitKey], grid: tuple[int, int], *, with_sheets: bool
+    source: ExternalFiles, visits: Sequence[VisitKey], grid: tuple[int, int], *, with_sheets: bool
 ) -> tuple[dict[str, SideMaps], str, list[str]]:
     """Read one map of all hemispheres, by rows of visits, its unit, and notes of impossible ones.
 
     On the regular grid of sheets there is no mesh; without sheets, files may have their own grid.
     """
     row_of = {visit: row for row, visit in enumerate(visits)}
-    name, sides, units, notes = found.request.name, {}, [], list[str]()
-    for hemi, path_of in found.files.items():
-        own = sorted(path_of, key=row_of.__getitem__)
-        paths = [path_of[visit] for visit in own]
+    name, sides, units, notes = source.request.name, {}, [], list[str]()
+    for hemi, path_of in source.files.items():
+        keys = sorted(path_of, key=row_of.__getitem__)
+        paths = [path_of[visit] for visit in keys]
         maps = [read_map(path, name, hemi) for path in paths]
         _refuse_mixed(name, hemi, paths, maps)
         # The curvature of other programs may be huge at single vertices of good maps.
-        why = [why_impossible(name, m.values) if name == THICKNESS else None for m in maps]
-        lost = [(path, text) for path, text in zip(paths, why, strict=True) if text]
-        notes += [f"{path}: {text}; left out" for path, text in lost]
-        if len(lost) == len(maps):
+        problems = [why_impossible(name, m.values) if name == THICKNESS else None for m in maps]
+        impossible = [(path, text) for path, text in zip(paths, problems, strict=True) if text]
+        notes += [f"{path}: {text}; left out" for path, text in impossible]
+        if len(impossible) == len(maps):
             raise InputError(f"--maps {name}: {notes[-1]}, as are all")
-        own = [visit for visit, text in zip(own, why, strict=True) if not text]
-        maps = [one for one, text in zip(maps, why, strict=True) if not text]
+        keys = [visit for visit, text in zip(keys, problems, strict=True) if not text]
+        maps = [one for one, text in zip(maps, problems, strict=True) if not text]
         first, points = maps[0], len(maps[0].values)
         nodes = first.nodes if first.nodes is not None and not with_sheets else grid
-        mesh = None if first.nodes == nodes else _mesh(found, hemi, points)
+        mesh = None if first.nodes == nodes else _mesh(source, hemi, points)
         if mesh is None and points != nodes[0] * nodes[1]:
             raise InputError(
                 f"--maps {name}, hemisphere {hemi}: no surface of {points} vertices lies beside"
@@ -167,11 +167,11 @@ def read_maps(
         shape = nodes if mesh is None else (points, 1)
         values = np.stack([one.values.reshape(shape) for one in maps])  # noqa: PD011  (no table)
         sides[hemi] = SideMaps(
-            rows=np.array([row_of[visit] for visit in own], dtype=np.int64),
+            rows=np.array([row_of[visit] for visit in keys], dtype=np.int64),
             maps={name: values},
             subfield=np.full(values.shape, -1, dtype=np.int8),
             names=(),
-            summary=pd.DataFrame(index=range(len(own))),
+            summary=pd.DataFrame(index=range(len(keys))),
             mesh=mesh,
         )
         units.append(first.unit)
@@ -189,23 +189,23 @@ def _refuse_mixed(name: str, hemi: str, paths: Sequence[Path], maps: Sequence[Po
         )
 
 
-def _mesh(found: ExternalFiles, hemi: str, points: int) -> Mesh | None:
+def _mesh(source: ExternalFiles, hemi: str, points: int) -> Mesh | None:
     """Read the surface that the user named, or else that beside the first map that has one."""
-    if found.request.surface is not None:
-        return _named_surface(found, hemi, points)
-    paths = found.files[hemi].values()
+    if source.request.surface is not None:
+        return _named_surface(source, hemi, points)
+    paths = source.files[hemi].values()
     meshes = (read_mesh(one) for path in paths for one in _surfaces_beside(path, hemi))
     return next((mesh for mesh in meshes if len(mesh.points) == points), None)
 
 
-def _named_surface(found: ExternalFiles, hemi: str, points: int) -> Mesh:
-    request = found.request
+def _named_surface(source: ExternalFiles, hemi: str, points: int) -> Mesh:
+    request = source.request
     pattern = request.surface or ""
     names = dict.fromkeys(
-        fill(pattern, subject, session, hemi) for subject, session in found.files[hemi]
+        fill(pattern, subject, session, hemi) for subject, session in source.files[hemi]
     )
     for name in names:
-        for path in find(name, found.root) or find(name, Path()):
+        for path in find(name, source.root) or find(name, Path()):
             mesh = read_mesh(path)
             if len(mesh.points) != points:
                 raise InputError(
@@ -220,16 +220,18 @@ def _named_surface(found: ExternalFiles, hemi: str, points: int) -> Mesh:
 
 def _surfaces_beside(path: Path, hemi: str) -> list[Path]:
     """HippUnfold's unfolded surface: beside the map, or in version 2 in ``surf/``."""
-    own = {**entities(path.name), "hemi": hemi}
+    wanted_entities = {**entities(path.name), "hemi": hemi}
     keys = ("sub", "ses", "hemi", "den", "label")
     folders = path.parent, path.parent.parent / "surf"
     pattern = "*space-unfold*_midthickness.surf.gii"
-    found = {one: entities(one.name) for folder in folders for one in sorted(folder.glob(pattern))}
+    candidates = {
+        one: entities(one.name) for folder in folders for one in sorted(folder.glob(pattern))
+    }
     # Sheets of this program have an unfolded surface too, but their maps have their grid.
     return [
         one
-        for one, other in found.items()
-        if "seg" not in other and all(own.get(key) == other.get(key) for key in keys)
+        for one, other in candidates.items()
+        if "seg" not in other and all(wanted_entities.get(key) == other.get(key) for key in keys)
     ]
 
 
@@ -251,13 +253,13 @@ def find_all(
     is_wanted: Callable[[str, str | None, str], bool],
 ) -> tuple[list[ExternalFiles], list[VisitKey]]:
     """Find the files of all maps, and who has them or a sheet."""
-    found = [find_maps(request, root, known, is_wanted) for request in requests]
-    visits: set[VisitKey] = set(known).union(*(one.visits for one in found))
-    return found, sorted(visits, key=lambda visit: (visit[0], visit[1] or ""))
+    sources = [find_maps(request, root, known, is_wanted) for request in requests]
+    visits: set[VisitKey] = set(known).union(*(one.visits for one in sources))
+    return sources, sorted(visits, key=lambda visit: (visit[0], visit[1] or ""))
 
 
 def add_external(
-    measured: Measured, found: Iterable[ExternalFiles], visits: Sequence[VisitKey]
+    measured: Measured, sources: Iterable[ExternalFiles], visits: Sequence[VisitKey]
 ) -> ExternalCohorts:
     """Read other programs' maps, and add those on the grid of the sheets to the sheets.
 
@@ -265,9 +267,9 @@ def add_external(
     """
     grid, with_sheets = (len(measured.x), len(measured.y)), bool(measured.sides)
     maps, units, notes = {}, dict(measured.units), []
-    for one in found:
-        name = one.request.name
-        maps[name], units[name], left_out = read_maps(one, visits, grid, with_sheets=with_sheets)
+    for source in sources:
+        name = source.request.name
+        maps[name], units[name], left_out = read_maps(source, visits, grid, with_sheets=with_sheets)
         notes += left_out
         counts = ", ".join(f"{len(side.rows)} {hemi}" for hemi, side in maps[name].items())
         points = ", ".join(str(np.prod(side.shape)) for side in maps[name].values())
@@ -318,13 +320,15 @@ def _with_maps(side: SideMaps, hemi: str, maps: Mapping[str, Mapping[str, SideMa
     for name, sides in maps.items():
         added[name] = np.full((len(side.rows), *side.shape), np.nan)
         if hemi in sides:
-            _, own, other = np.intersect1d(side.rows, sides[hemi].rows, return_indices=True)
-            added[name][own] = sides[hemi].maps[name][other]
+            _, kept_rows, map_rows = np.intersect1d(
+                side.rows, sides[hemi].rows, return_indices=True
+            )
+            added[name][kept_rows] = sides[hemi].maps[name][map_rows]
     return replace(side, maps={**side.maps, **added})
 
 
 #: Volume that no structure reaches, mm^3: 10 liters.
-_MOST = 1e7
+_LARGEST_VOLUME = 1e7
 #: Unit of all of them.
 UNIT = "mm^3"
 Volumes = Mapping[str, Mapping[str, float]]
@@ -357,16 +361,16 @@ def table_beside(segmentation: Path) -> tuple[str, Path] | None:
 
 def _hippunfold(segmentation: Path) -> Path | None:
     """Find the table of the same space and atlas."""
-    own = entities(segmentation.name)
-    if own.get("desc") != "subfields":
+    pairs = entities(segmentation.name)
+    if pairs.get("desc") != "subfields":
         return None
     keys = ("sub", "ses", "space", "atlas")
-    found = [
+    tables = [
         path
         for path in sorted(segmentation.parent.glob("sub-*_volumes.tsv"))
-        if all(entities(path.name).get(key) == own.get(key) for key in keys)
+        if all(entities(path.name).get(key) == pairs.get(key) for key in keys)
     ]
-    return found[0] if found else None
+    return tables[0] if tables else None
 
 
 _BESIDE: Mapping[str, Callable[[Path], Path | None]] = {
@@ -380,15 +384,15 @@ def read_volumes(path: Path) -> Volumes:
     """Read one table of any program."""
     try:
         text = path.read_text(encoding="utf-8-sig")
-        found: dict[str, dict[str, float]] = {}
+        volumes: dict[str, dict[str, float]] = {}
         for hemi, structure, volume in _entries(path, text):
-            found.setdefault(hemi, {})[re.sub(r"\W+", "_", structure)] = volume
+            volumes.setdefault(hemi, {})[re.sub(r"\W+", "_", structure)] = volume
     except (OSError, ValueError, KeyError) as error:
         raise InputError(
             f"{path}: not readable as a table of volumes ({error}); FreeSurfer's hippoSfVolumes,"
             " ASHS's and HippUnfold's _volumes are known"
         ) from error
-    return found
+    return volumes
 
 
 def _entries(path: Path, text: str) -> Iterator[tuple[str, str, float]]:
@@ -415,7 +419,7 @@ def _volume(text: str) -> float:
     if text in {files.MISSING, "nan", "NaN"}:
         return float("nan")
     value = float(text)
-    if not 0 <= value < _MOST:
+    if not 0 <= value < _LARGEST_VOLUME:
         raise ValueError(f"{text} is no volume")
     return value
 
@@ -459,8 +463,10 @@ def check_volumes(patterns: Sequence[tuple[str, str]]) -> None:
     names = [name for name, _ in patterns]
     for name, pattern in patterns:
         if not (name.isalnum() and name.isascii()) or names.count(name) > 1:
-            why = "occurs twice" if names.count(name) > 1 else "has more than letters and digits"
-            raise UsageError(f"--volumes: the name {name!r} {why}")
+            problem = (
+                "occurs twice" if names.count(name) > 1 else "has more than letters and digits"
+            )
+            raise UsageError(f"--volumes: the name {name!r} {problem}")
         check_pattern("--volumes", name, pattern)
         if "subject" not in fields_of(pattern):
             raise UsageError(f"--volumes {name}: the pattern needs {{subject}}")
@@ -501,10 +507,10 @@ def _beside(records: Sequence[SheetRecord]) -> Iterator[VolumeTable]:
 
 
 def _matching(name: str, pattern: str, root: Path, measured: Measured) -> list[VolumeTable]:
-    found = [(visit_name(one.subject, one.session), one) for one in scan(pattern, root)]
+    matches = [(visit_name(one.subject, one.session), one) for one in scan(pattern, root)]
     tables = [
         VolumeTable(name=name, visit=visit, path=one.path, hemi=one.hemi)
-        for visit, one in found
+        for visit, one in matches
         if visit in measured.visits.index
     ]
     if not tables:

@@ -36,40 +36,42 @@ ARBITRARY = "arbitrary"
 #: Share of the sheets that need a value at a point, where sheets have rims without values.
 LEAST_SHARE = 0.5
 #: Number of measures that a message lists.
-_SHOWN = 12
+_MOST_NAMES = 12
 _ROWS = 1000  # of summaries that are words at once
 
 
 def choose_measures(
-    wanted: Sequence[str], records: Sequence[SheetRecord], others: Sequence[str] = ()
+    requested: Sequence[str], records: Sequence[SheetRecord], further: Sequence[str] = ()
 ) -> Measures:
     """Tell maps from summary measures."""
-    if not wanted:
-        return Measures(maps=(*(DEFAULT if records else ()), *others))
+    if not requested:
+        return Measures(maps=(*(DEFAULT if records else ()), *further))
     summaries = _summary_names(records)
-    known = [*(SHEET_MAPS if records else ()), *others, *_sampled(records), *summaries]
+    available = [*(SHEET_MAPS if records else ()), *further, *_sampled(records), *summaries]
     maps, numbers = [], []
-    for name in wanted:
-        if name in others or (records and name in SHEET_MAPS) or _is_sampled(name, records):
+    for name in requested:
+        if name in further or (records and name in SHEET_MAPS) or _is_sampled(name, records):
             maps.append(name)
         elif name in summaries or name.startswith(VOLUME):
             numbers.append(name)
         else:
-            more = " ..." if len(known) > _SHOWN else ""
-            raise _unknown(name, known, f"there are {', '.join(known[:_SHOWN])}{more}")
+            ending = " ..." if len(available) > _MOST_NAMES else ""
+            raise _unknown(
+                name, available, f"there are {', '.join(available[:_MOST_NAMES])}{ending}"
+            )
     return Measures(maps=tuple(maps), summaries=tuple(numbers) or None)
 
 
 def check_summaries(measures: Measures, sides: Mapping[str, SideMaps]) -> None:
     """Refuse summary measures that no hemisphere has."""
-    known = sorted({str(name) for side in sides.values() for name in side.summary.columns})
+    available = sorted({str(name) for side in sides.values() for name in side.summary.columns})
     for name in measures.summaries or ():
-        if name not in known:
-            raise _unknown(name, known, "are its tables there?")
+        if name not in available:
+            raise _unknown(name, available, "are its tables there?")
 
 
-def _unknown(name: str, known: Sequence[str], hint: str) -> InputError:
-    if near := difflib.get_close_matches(name, known, n=1):
+def _unknown(name: str, available: Sequence[str], hint: str) -> InputError:
+    if near := difflib.get_close_matches(name, available, n=1):
         hint = f"did you mean {near[0]}?"
     return InputError(f"no measure is called {name!r}; {hint}")
 
@@ -84,8 +86,8 @@ def _sampled(records: Sequence[SheetRecord]) -> list[str]:
         return []
     pattern = records[0].place.path("map_table", "*")
     start, _, end = pattern.name.partition("*")
-    found = pattern.parent.glob(pattern.name)
-    return sorted(path.name.removeprefix(start).removesuffix(end) for path in found)
+    paths = pattern.parent.glob(pattern.name)
+    return sorted(path.name.removeprefix(start).removesuffix(end) for path in paths)
 
 
 def _summary_names(records: Sequence[SheetRecord]) -> tuple[str, ...]:
@@ -132,31 +134,33 @@ def read_sheets(
     sides = {}
     damaged: list[Exclusion] = []
     for hemi in "LR":
-        own = [record for record in records if record.place.name.hemi == hemi]
-        rows = [row_of[r.place.name.subject, r.place.name.session] for r in own]
-        if own:
-            side = _read_side(own, np.array(rows, dtype=np.int64), shape, names)
+        records_of_side = [record for record in records if record.place.name.hemi == hemi]
+        rows = [row_of[r.place.name.subject, r.place.name.session] for r in records_of_side]
+        if records_of_side:
+            side = _read_side(records_of_side, np.array(rows, dtype=np.int64), shape, names)
             columns = {str(name): one.to_numpy() for name, one in side.summary.items()}
             doubtful = {name: one for name, one in columns.items() if why_impossible(name, one)}
-            why = [_damage(side, i, doubtful, rules) for i in range(len(own))]
+            problems = [_damage(side, i, doubtful, rules) for i in range(len(records_of_side))]
             found = [
                 Exclusion.of_sheet(record.place.name, "damaged-map", text)
-                for record, text in zip(own, why, strict=True)
+                for record, text in zip(records_of_side, problems, strict=True)
                 if text
             ]
-            if len(found) == len(own):
+            if len(found) == len(records_of_side):
                 raise InputError(
                     f"hemisphere {hemi}: no sheet can be used; {found[0].participant}:"
                     f" {found[0].message}"
                 )
             damaged += found
-            sides[hemi] = side.sheets(np.array([not text for text in why]))
-            own = [r for r, text in zip(own, why, strict=True) if not text]
+            sides[hemi] = side.sheets(np.array([not text for text in problems]))
+            records_of_side = [
+                r for r, text in zip(records_of_side, problems, strict=True) if not text
+            ]
             if region in EXPERIMENTAL:
                 for values in sides[hemi].maps.values():
                     leave_rare(values)
-        if own and error_window:
-            errors = _read_errors(own, shape, maps, error_window)
+        if records_of_side and error_window:
+            errors = _read_errors(records_of_side, shape, maps, error_window)
             sides[hemi] = replace(sides[hemi], errors=errors)
     table = pd.DataFrame(
         {
@@ -182,9 +186,9 @@ def read_sheets(
 
 def leave_rare(values: Float) -> None:
     """Take points that few sheets have out of a map (sheets, x, y): beside rims, a selection."""
-    known = np.isfinite(values)
-    some = known.any(axis=(1, 2))  # other volumes may lack in a participant
-    values[:, known[some].sum(axis=0) < LEAST_SHARE * some.sum()] = np.nan
+    finite = np.isfinite(values)
+    measured = finite.any(axis=(1, 2))  # other volumes may lack in a participant
+    values[:, finite[measured].sum(axis=0) < LEAST_SHARE * measured.sum()] = np.nan
 
 
 def _damage(
@@ -199,23 +203,23 @@ def _damage(
         return "no point of the thickness map has a value"
     values = [(name, one[i]) for name, one in side.maps.items()]
     values += [(name, column[i : i + 1]) for name, column in doubtful.items()]
-    found = (why_impossible(name, one) for name, one in values)
-    return next((text for text in found if text), None)
+    problems = (why_impossible(name, one) for name, one in values)
+    return next((text for text in problems if text), None)
 
 
 def _check_errors(records: Sequence[SheetRecord], maps: Sequence[str]) -> None:
     """Refuse weights by uncertainty where an SD is missing."""
-    if others := [name for name in maps if name not in SHEET_MAPS]:
+    if unsupported := [name for name in maps if name not in SHEET_MAPS]:
         raise InputError(
-            f"--weights uncertainty: there are no SDs of {', '.join(others)}; leave these maps"
+            f"--weights uncertainty: there are no SDs of {', '.join(unsupported)}; leave these maps"
             " out by --measures, or the weights"
         )
     lacking = [r.place.name.stem for r in records if not r.place.path("uncertainty").is_file()]
     if lacking:
-        shown = ", ".join(lacking[:_SHOWN]) + (" ..." if len(lacking) > _SHOWN else "")
+        names = ", ".join(lacking[:_MOST_NAMES]) + (" ..." if len(lacking) > _MOST_NAMES else "")
         raise InputError(
             f"--weights uncertainty: {len(lacking)} of {len(records)} hemispheres have no SD maps"
-            f" ({shown}); run the participant level again with --uncertainty 8, or leave them"
+            f" ({names}); run the participant level again with --uncertainty 8, or leave them"
             " out by --exclude"
         )
 
@@ -231,13 +235,13 @@ def _read_errors(
     errors = {}
     for name in maps:
         squares = np.stack([t[hemisphere.spread_name(name)] for t in tables]) ** 2
-        known = np.isfinite(squares)
+        finite = np.isfinite(squares)
         total, count = (
             uniform_filter(values, (1, window, window), mode="nearest")
-            for values in (np.where(known, squares, 0.0), known.astype(np.float64))
+            for values in (np.where(finite, squares, 0.0), finite.astype(np.float64))
         )
-        mean = total / np.where(known, count, 1.0)
-        errors[name] = np.where(known, np.sqrt(np.maximum(mean, 0.0)), np.nan)
+        mean = total / np.where(finite, count, 1.0)
+        errors[name] = np.where(finite, np.sqrt(np.maximum(mean, 0.0)), np.nan)
     return errors
 
 

@@ -132,12 +132,12 @@ def parse_model(document: Mapping[str, Any]) -> ModelSpec:
         raise _refusal("has Contrasts that are no list")
     specs = tuple(_parse_contrast(one) for one in contrasts)
     names = [spec.name for spec in specs]
-    if twice := sorted({one for one in names if names.count(one) > 1}):
-        raise _refusal(f"has contrasts of the same name: {', '.join(twice)}")
+    if repeated := sorted({one for one in names if names.count(one) > 1}):
+        raise _refusal(f"has contrasts of the same name: {', '.join(repeated)}")
     labels = [file_label(one) for one in names]
-    if same := [one for one in names if labels.count(file_label(one)) > 1]:
+    if alike := [one for one in names if labels.count(file_label(one)) > 1]:
         raise _refusal(
-            f"has contrasts whose files would have one name: {listed(same)}; give one"
+            f"has contrasts whose files would have one name: {listed(alike)}; give one"
             " a name, as other=group[A]:age"
         )
     return ModelSpec(
@@ -168,16 +168,16 @@ def parse_expression(text: str) -> dict[str, float]:
     weights: dict[str, float] = {}
     position = 0
     while position < len(text.rstrip()):
-        found = _TERM.match(text, position)
-        if found is None or (position and found["sign"] is None):
+        match = _TERM.match(text, position)
+        if match is None or (position and match["sign"] is None):
             raise ModelError(
                 f"contrast {text!r}: cannot read {text[position:].strip()!r}; write it as"
                 " group[A]-group[B] or 0.5*age, and names with blanks in backticks"
             )
-        weight = float(found["weight"] or 1) * (-1 if found["sign"] == "-" else 1)
-        name = found["name"].replace("`", "")
+        weight = float(match["weight"] or 1) * (-1 if match["sign"] == "-" else 1)
+        name = match["name"].replace("`", "")
         weights[name] = weights.get(name, 0.0) + weight
-        position = found.end()
+        position = match.end()
     if not weights:
         raise ModelError("contrast: empty; name what to compare")
     return weights
@@ -238,8 +238,8 @@ def _formula(model: Mapping[str, Any]) -> str:
     return " + ".join(["1" if len(names) < len(terms) else "0", *names])
 
 
-def _refusal(what: str) -> ModelError:
-    return ModelError(f"model file {what} (BIDS Stats Models {_VERSION})")
+def _refusal(problem: str) -> ModelError:
+    return ModelError(f"model file {problem} (BIDS Stats Models {_VERSION})")
 
 
 def file_label(text: str) -> str:
@@ -252,25 +252,25 @@ def file_label(text: str) -> str:
 
 def check_names(names: Iterable[str], columns: pd.Index) -> None:
     """Refuse names that the table does not have."""
-    known = [str(column) for column in columns]
+    available = [str(column) for column in columns]
     for name in names:
-        if name not in known:
-            near = difflib.get_close_matches(name, known, n=1)
-            hint = f"did you mean {near[0]}?" if near else f"the table has {listed(known)}"
+        if name not in available:
+            near = difflib.get_close_matches(name, available, n=1)
+            hint = f"did you mean {near[0]}?" if near else f"the table has {listed(available)}"
             raise ModelError(f"model: the table has no column {name!r}; {hint}")
 
 
 def with_factors(table: pd.DataFrame, settings: GroupSettings) -> pd.DataFrame:
     """Make factors, of pandas' type, of the columns that are some by their name."""
-    known = (*settings.design.factors, *settings.model.group_columns)
-    names = {name.casefold() for name in known}
-    chosen = [
+    factor_names = (*settings.design.factors, *settings.model.group_columns)
+    names = {name.casefold() for name in factor_names}
+    factors = [
         column
         for column in table.columns
         if str(column).casefold() in names
         and not isinstance(table[column].dtype, pd.CategoricalDtype)
     ]
-    return table.assign(**{str(column): as_factor(table[column]) for column in chosen})
+    return table.assign(**{str(column): as_factor(table[column]) for column in factors})
 
 
 def as_factor(values: pd.Series) -> pd.Series:
@@ -324,7 +324,7 @@ def typed(values: pd.Series) -> pd.Series:
 def level_labels(values: pd.Series) -> pd.Series:
     """Names of levels, whatever they look like; ``None`` where missing."""
     names = typed(values).astype(object)
-    texts = names.map(lambda one: f"{one:g}" if isinstance(one, float) else str(one))
+    texts = names.map(lambda value: f"{value:g}" if isinstance(value, float) else str(value))
     return texts.where(names.notna(), None)
 
 
@@ -332,7 +332,7 @@ def columns_of(
     table: pd.DataFrame,
     formula: str,
     levels: Mapping[str, Sequence[str]],
-    where: str,
+    source: str,
 ) -> tuple[Float, tuple[str, ...], Int64]:
     """Make columns of a formula with given levels, without intercept; and rows that have all."""
     closed = closed_formula(formula)
@@ -340,35 +340,37 @@ def columns_of(
     if not names:
         return np.empty((len(table), 0)), (), np.arange(len(table))
     check_names(names, table.columns)
-    used = pd.DataFrame(
+    variables = pd.DataFrame(
         {n: level_labels(table[n]) if n in levels else typed(table[n]) for n in names}
     )
-    complete = used.notna().all(axis=1).to_numpy()
-    used = used[complete].copy()
-    for name, known in levels.items():
-        if unknown := sorted(set(used[name]) - set(known)):
+    complete = variables.notna().all(axis=1).to_numpy()
+    variables = variables[complete].copy()
+    for name, levels_of in levels.items():
+        if unknown := sorted(set(variables[name]) - set(levels_of)):
             raise ModelError(
-                f"{where}has no {name!r} {listed(unknown)}, only {listed(known)}; leave these"
+                f"{source}has no {name!r} {listed(unknown)}, only {listed(levels_of)}; leave these"
                 " participants out, or harmonize anew"
             )
-        used[name] = pd.Categorical(used[name], categories=list(known))
-    if text := [name for name in names if name not in levels and used[name].dtype == object]:
-        raise ModelError(f"{where}{listed(text)} should be numbers, as where it was made")
-    made = Formula(closed.text).get_model_matrix(used, na_action="raise", context=dict(CONTEXT))
-    inside = [str(name) for name in made.columns if str(name) != INTERCEPT]
-    return made[inside].to_numpy(np.float64), tuple(inside), np.flatnonzero(complete)
+        variables[name] = pd.Categorical(variables[name], categories=list(levels_of))
+    if text := [name for name in names if name not in levels and variables[name].dtype == object]:
+        raise ModelError(f"{source}{listed(text)} should be numbers, as where it was made")
+    matrix = Formula(closed.text).get_model_matrix(
+        variables, na_action="raise", context=dict(CONTEXT)
+    )
+    inside = [str(name) for name in matrix.columns if str(name) != INTERCEPT]
+    return matrix[inside].to_numpy(np.float64), tuple(inside), np.flatnonzero(complete)
 
 
 def _refuse_spellings(text: pd.Series) -> None:
     """Refuse what is meant for numbers but is not written so: decimal commas, and dates."""
     points = pd.to_numeric(text.str.replace(",", ".", n=1, regex=False), errors="coerce")
-    for written, what, remedy in (
+    for written, problem, remedy in (
         (points.notna(), "decimal commas", "write 70.5 for 70,5"),
         (text.str.fullmatch(_DATE), "dates", "give years or days, as numbers"),
     ):
         if len(text) and written.mean() > NUMERIC_SHARE:
             raise ModelError(
-                f"model: column {text.name!r} holds {what}, as {_cells(text[written][:1])};"
+                f"model: column {text.name!r} holds {problem}, as {_cells(text[written][:1])};"
                 f" {remedy}"
             )
 
@@ -377,9 +379,9 @@ def check_numbers(values: pd.Series, settings: DesignSettings) -> None:
     """Refuse codes for missing values that are far from all others, and values out of all range."""
     present = values[values.notna()]
     codes = present.isin(settings.missing_codes)
-    rest = present[~codes]
-    if codes.any() and len(rest):
-        low, high = float(rest.min()), float(rest.max())
+    values_left = present[~codes]
+    if codes.any() and len(values_left):
+        low, high = float(values_left.min()), float(values_left.max())
         gap = np.maximum(low - present, present - high)
         far = codes & (gap > high - low)
         if far.any():
@@ -402,8 +404,8 @@ def check_numbers(values: pd.Series, settings: DesignSettings) -> None:
 
 def _cells(values: pd.Series) -> str:
     """List rows with what stands in them."""
-    shown = [f"{value:g}" if isinstance(value, float) else repr(value) for value in values]
-    return listed(f"{row} ({cell})" for row, cell in zip(values.index, shown, strict=True))
+    texts = [f"{value:g}" if isinstance(value, float) else repr(value) for value in values]
+    return listed(f"{row} ({cell})" for row, cell in zip(values.index, texts, strict=True))
 
 
 def check_spelling(levels: Mapping[str, int], name: str) -> None:
@@ -411,12 +413,12 @@ def check_spelling(levels: Mapping[str, int], name: str) -> None:
 
     Which of them is meant is for a person to say: merged silently, a typing error would pass.
     """
-    alike: dict[str, list[str]] = {}
+    spellings: dict[str, list[str]] = {}
     for level in levels:
-        alike.setdefault("".join(level.split()).casefold(), []).append(level)
-    for found in alike.values():
-        if len(found) > 1:
-            words = ", ".join(f"{level!r} ({levels[level]})" for level in sorted(found))
+        spellings.setdefault("".join(level.split()).casefold(), []).append(level)
+    for variants in spellings.values():
+        if len(variants) > 1:
+            words = ", ".join(f"{level!r} ({levels[level]})" for level in sorted(variants))
             raise ModelError(
                 f"model: levels of {name!r} differ in capitals or blanks only: {words}; write them"
                 " alike"
@@ -425,52 +427,54 @@ def check_spelling(levels: Mapping[str, int], name: str) -> None:
 
 def coding_note(values: pd.Series) -> str | None:
     """Say that few different numbers are fitted as a line, as perhaps they should not."""
-    found = sorted(values.unique())
-    if not _LEAST_LINE <= len(found) <= FEW_VALUES:
+    codes = sorted(values.unique())
+    if not _LEAST_LINE <= len(codes) <= FEW_VALUES:
         return None
     return (
-        f"{values.name} has {len(found)} different values ({', '.join(f'{x:g}' for x in found)})"
+        f"{values.name} has {len(codes)} different values ({', '.join(f'{x:g}' for x in codes)})"
         f" and is fitted as a line; if these are codes, write C({values.name}) in --formula, or"
         " give their Levels in participants.json"
     )
 
 
-def rows_by_lack(used: pd.DataFrame, complete: NDArray[np.bool_]) -> dict[str, tuple[str, ...]]:
+def rows_by_lack(
+    variables: pd.DataFrame, complete: NDArray[np.bool_]
+) -> dict[str, tuple[str, ...]]:
     """Group incomplete rows by the first variable that they lack."""
     result: dict[str, list[str]] = {}
-    lacking = used.isna().to_numpy()
+    lacking = variables.isna().to_numpy()
     for row in np.flatnonzero(~complete).tolist():
-        name = str(used.columns[int(np.argmax(lacking[row]))])
-        result.setdefault(name, []).append(str(used.index[row]))
+        name = str(variables.columns[int(np.argmax(lacking[row]))])
+        result.setdefault(name, []).append(str(variables.index[row]))
     return {name: tuple(rows) for name, rows in result.items()}
 
 
-def check_left(used: pd.DataFrame, dropped: Mapping[str, tuple[str, ...]]) -> None:
+def check_left(variables: pd.DataFrame, dropped: Mapping[str, tuple[str, ...]]) -> None:
     """Refuse a model that leaves no row; says what the rows lack."""
-    if not len(used):
+    if not len(variables):
         lack = ", ".join(f"{name} ({len(rows)})" for name, rows in dropped.items())
-        why = f"; missing are {lack}" if lack else ""
-        raise ModelError(f"model: no row has all variables{why}")
+        reason = f"; missing are {lack}" if lack else ""
+        raise ModelError(f"model: no row has all variables{reason}")
 
 
 def set_levels(
-    used: pd.DataFrame, references: Mapping[str, str], settings: DesignSettings
+    variables: pd.DataFrame, references: Mapping[str, str], settings: DesignSettings
 ) -> dict[str, list[str]]:
     """Make factors of text columns in place."""
-    chosen = {}
-    for column in used.columns:
+    levels = {}
+    for column in variables.columns:
         name = str(column)
-        if pd.api.types.is_numeric_dtype(used[name]):
-            check_numbers(used[name], settings)
-            _check_varies(used[name], name)
+        if pd.api.types.is_numeric_dtype(variables[name]):
+            check_numbers(variables[name], settings)
+            _check_varies(variables[name], name)
         else:
-            chosen[name] = _levels(used[name], name, references.get(name), settings)
-            used[name] = pd.Categorical(used[name], categories=chosen[name])
-    if unknown := sorted(set(references) - set(chosen)):
+            levels[name] = _levels(variables[name], name, references.get(name), settings)
+            variables[name] = pd.Categorical(variables[name], categories=levels[name])
+    if unknown := sorted(set(references) - set(levels)):
         raise ModelError(
             f"model: reference level given for {listed(unknown)}, which is no factor of the model"
         )
-    return chosen
+    return levels
 
 
 def _check_varies(values: pd.Series, name: str) -> None:
@@ -526,5 +530,5 @@ def in_order(level: str) -> tuple[float, str]:
 def listed(items: Iterable[object]) -> str:
     """Join names for a message, not too many."""
     texts = [str(item) for item in items]
-    more = f" and {len(texts) - _NAMED} more" if len(texts) > _NAMED else ""
-    return ", ".join(texts[:_NAMED]) + more
+    ending = f" and {len(texts) - _NAMED} more" if len(texts) > _NAMED else ""
+    return ", ".join(texts[:_NAMED]) + ending

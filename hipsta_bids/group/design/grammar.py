@@ -105,8 +105,8 @@ def _refuse(text: str, part: str) -> NoReturn:
     )
 
 
-def _shortened(text: str, most: int = 200) -> str:
-    return text if len(text) <= most else f"{text[:most]}..."
+def _shortened(text: str, limit: int = 200) -> str:
+    return text if len(text) <= limit else f"{text[:limit]}..."
 
 
 def _tokens(text: str) -> list[_Token]:
@@ -116,15 +116,15 @@ def _tokens(text: str) -> list[_Token]:
     tokens: list[_Token] = []
     position, depth, stop = 0, 0, len(text.rstrip())
     while position < stop:
-        found = _TOKEN.match(text, position)
-        if found is None:
+        match = _TOKEN.match(text, position)
+        if match is None:
             _refuse(text, text[position:].split(maxsplit=1)[0])
-        kind = str(found.lastgroup)
-        tokens.append(_Token(kind, found[kind]))
-        depth += {"(": 1, ")": -1}.get(found[kind], 0)
+        kind = str(match.lastgroup)
+        tokens.append(_Token(kind, match[kind]))
+        depth += {"(": 1, ")": -1}.get(match[kind], 0)
         if not 0 <= depth <= _DEEPEST:
-            _refuse(text, text[: found.end()].strip())
-        position = found.end()
+            _refuse(text, text[: match.end()].strip())
+        position = match.end()
     if depth:
         _refuse(text, "( without )")
     return tokens
@@ -194,10 +194,10 @@ class _Call:
                 self._check_options(more, node.keywords)
                 inner = [part]
             case ast.Call(func=ast.Name(id="C"), args=[ast.Name(id=name), *more]):
-                given = [option for option in node.keywords if option.arg == "contrasts"]
-                for coding in [*more, *(option.value for option in given)]:
+                codings = [option for option in node.keywords if option.arg == "contrasts"]
+                for coding in [*more, *(option.value for option in codings)]:
                     self._check_coding(coding)
-                self._check_options([], [one for one in node.keywords if one not in given])
+                self._check_options([], [one for one in node.keywords if one not in codings])
                 names = [self._name(name)]
             case _:
                 self._refuse(node)
@@ -235,8 +235,8 @@ class _Call:
                     self._refuse(node)
 
     @staticmethod
-    def _is_number(node: ast.Constant, most: int) -> bool:
-        return isinstance(node.value, int | float) and abs(node.value) <= most
+    def _is_number(node: ast.Constant, limit: int) -> bool:
+        return isinstance(node.value, int | float) and abs(node.value) <= limit
 
     def _refuse(self, node: ast.AST) -> NoReturn:
         part = ast.unparse(node)

@@ -63,8 +63,8 @@ def find_groups(
 ) -> Groups | None:
     """Find the column of groups and their reference level."""
     by_name = {str(column).casefold(): str(column) for column in table.columns}
-    for wanted in settings.model.group_columns:
-        column = by_name.get(wanted.casefold())
+    for name in settings.model.group_columns:
+        column = by_name.get(name.casefold())
         values = formulas.typed(table[column]).dropna() if column else None
         if column is None or values is None or values.nunique() < 2:  # noqa: PLR2004 -- two groups
             continue
@@ -76,8 +76,8 @@ def find_groups(
                 f"model: no participant has {column!r} {first!r}; there are"
                 f" {', '.join(sorted(counts))}"
             )
-        others = sorted((level for level in counts if level != first), key=formulas.in_order)
-        return Groups(column, (first, *others))
+        remaining = sorted((level for level in counts if level != first), key=formulas.in_order)
+        return Groups(column, (first, *remaining))
     return None
 
 
@@ -121,21 +121,21 @@ def default_contrasts(
     bends = [f"{name} nonlinear = {_NONLINEAR}({name})" for name in nonlinear]
     if groups is None:
         return [*([time] if time else []), *bends]
-    found = [*groups.contrasts(), *bends]
+    contrasts = [*groups.contrasts(), *bends]
     if time is None:
-        return found
+        return contrasts
     slopes = {level: f"{groups.column}[T.{level}]:{time}" for level in groups.levels[1:]}
-    found.append(f"{time} in {groups.reference} = {time}")
+    contrasts.append(f"{time} in {groups.reference} = {time}")
     for level, slope in slopes.items():
-        found.append(f"{time} in {level} = {time} + {slope}")
-        found.append(f"{time} in {groups.reference}-{level} = -1*{slope}")
-    return found
+        contrasts.append(f"{time} in {level} = {time} + {slope}")
+        contrasts.append(f"{time} in {groups.reference}-{level} = -1*{slope}")
+    return contrasts
 
 
 def empty_covariates(table: pd.DataFrame, settings: GroupSettings) -> list[str]:
     """Name covariates of the default model whose column holds nothing."""
-    wanted = {name.casefold() for name in settings.model.covariates}
-    named = [str(name) for name in table.columns if str(name).casefold() in wanted]
+    names = {name.casefold() for name in settings.model.covariates}
+    named = [str(name) for name in table.columns if str(name).casefold() in names]
     return [name for name in named if formulas.typed(table[name]).isna().all()]
 
 
@@ -270,11 +270,15 @@ def model_document(
     comparison = comparison or Comparison()
     within = comparison.longitudinal or comparison.pair or comparison.asymmetry
     if groups is None and not within:
-        own = [str(name) for name in table.columns if name not in {PARTICIPANT, SESSION}]
-        there = f"there are {formulas.listed(own)}" if own else "BIDS_DIR has no participants.tsv"
+        columns = [str(name) for name in table.columns if name not in {PARTICIPANT, SESSION}]
+        available = (
+            f"there are {formulas.listed(columns)}"
+            if columns
+            else "BIDS_DIR has no participants.tsv"
+        )
         raise ModelError(
             f"no column tells groups ({', '.join(settings.model.group_columns)}) with two levels;"
-            f' {there}; or give a model by --formula "age + sex" --contrast age'
+            f' {available}; or give a model by --formula "age + sex" --contrast age'
         )
     time = visits.column if visits else None
     if comparison.longitudinal and time is None:
@@ -329,40 +333,42 @@ def build_design(
     formula = _read_formula(closed.text)
     names = sorted(closed.names)
     formulas.check_names(names, table.columns)
-    used = table[names].copy()
+    variables = table[names].copy()
     for name in names:
-        column = formulas.as_factor(used[name]) if name in closed.factors else used[name]
-        used[name] = formulas.typed(column)
-    complete = used.notna().all(axis=1).to_numpy()
-    dropped = formulas.rows_by_lack(used, complete)
-    used = used.loc[complete].copy()
-    formulas.check_left(used, dropped)
-    numeric = used.select_dtypes("number")
+        column = formulas.as_factor(variables[name]) if name in closed.factors else variables[name]
+        variables[name] = formulas.typed(column)
+    complete = variables.notna().all(axis=1).to_numpy()
+    dropped = formulas.rows_by_lack(variables, complete)
+    variables = variables.loc[complete].copy()
+    formulas.check_left(variables, dropped)
+    numeric = variables.select_dtypes("number")
     notes = {name: formulas.coding_note(numeric[name]) for name in map(str, numeric.columns)}
-    chosen = formulas.set_levels(used, references, settings)
+    levels_used = formulas.set_levels(variables, references, settings)
     for name in map(str, numeric.columns):
         _check_possible(numeric[name], name.casefold())
     try:
         with np.errstate(invalid="ignore", divide="ignore"):  # rows without a value are told below
-            made = formula.get_model_matrix(used, na_action="ignore", context=dict(CONTEXT))
+            model_matrix = formula.get_model_matrix(
+                variables, na_action="ignore", context=dict(CONTEXT)
+            )
     except Exception as error:  # formulaic raises all kinds where a formula makes no sense
         raise ModelError(
             f"formula {model.formula!r}: {str(error).partition(chr(10))[0]}"
         ) from error
-    columns = tuple(str(column) for column in made.columns)
-    matrix: Float = np.asarray(made, dtype=np.float64)
-    _check_matrix(matrix, columns, used.index, settings)
-    terms = _Terms(columns, used, made.model_spec, chosen, matrix)
+    columns = tuple(str(column) for column in model_matrix.columns)
+    matrix: Float = np.asarray(model_matrix, dtype=np.float64)
+    _check_matrix(matrix, columns, variables.index, settings)
+    terms = _Terms(columns, variables, model_matrix.model_spec, levels_used, matrix)
     specs = (*model.contrasts, *_dummies(columns, model.dummy))
     return Design(
         matrix=matrix,
         columns=columns,
         rows=np.flatnonzero(complete),
         dropped=dropped,
-        references={name: levels[0] for name, levels in chosen.items()},
+        references={name: levels[0] for name, levels in levels_used.items()},
         contrasts=tuple(terms.contrast(spec) for spec in specs),
         notes={name: note for name, note in notes.items() if note},
-        levels=chosen,
+        levels=levels_used,
     )
 
 
@@ -391,13 +397,13 @@ class _Terms:
         its coefficients at right angles to ``line``. A single one is scaled to the coefficient of
         the square.
         """
-        own = [
+        columns = [
             column
             for structure in self.spec.structure
             if closed_formula(str(structure.term)).names == (variable,)
             for column in structure.columns
         ]
-        places = [i for i, column in enumerate(self.columns) if column in own]
+        places = [i for i, column in enumerate(self.columns) if column in columns]
         if variable not in self.table or len(places) < 2:  # noqa: PLR2004 -- a line is one
             raise ModelError(
                 f"contrast {contrast!r}: {variable!r} is in the formula as a line at most; write it"
@@ -425,12 +431,12 @@ class _Terms:
             return np.asarray(np.eye(len(self.columns))[self.columns.index(name)])
         factor, level = self._split(name)
         if factor is None:
-            known = [
+            names = [
                 *self.columns,
                 *(f"{f}[{x}]" for f, levels in self.levels.items() for x in levels),
             ]
-            near = difflib.get_close_matches(name, known, n=1)
-            hint = f"did you mean {near[0]}?" if near else f"known are {formulas.listed(known)}"
+            near = difflib.get_close_matches(name, names, n=1)
+            hint = f"did you mean {near[0]}?" if near else f"known are {formulas.listed(names)}"
             raise ModelError(f"contrast {contrast!r}: nothing is called {name!r}; {hint}")
         # The mean of the model over all rows if every one had this level.
         moved = self.table.copy()
@@ -458,10 +464,10 @@ def _check_possible(values: pd.Series, name: str) -> None:
     if name in _AGES:  # in months, say, most are larger
         bad |= (numbers > _OLDEST) & (middle <= _OLDEST)
     if bad.any():
-        found = formulas.listed(f"{row} ({value:g})" for row, value in values[bad].items())
+        rows_text = formulas.listed(f"{row} ({value:g})" for row, value in values[bad].items())
         raise ModelError(
-            f"model: column {values.name!r} has {found}, which nobody has; correct them, or mark"
-            " them n/a"
+            f"model: column {values.name!r} has {rows_text}, which nobody has; correct them, or"
+            " mark them n/a"
         )
 
 
@@ -508,8 +514,8 @@ def _check_matrix(
     for last in range(1, len(columns)):
         before = unit[:, :last]
         weights = np.linalg.lstsq(before, unit[:, last], rcond=None)[0]
-        rest = float(np.linalg.norm(unit[:, last] - before @ weights))
-        if rest < DEPENDENCE:
+        remainder = float(np.linalg.norm(unit[:, last] - before @ weights))
+        if remainder < DEPENDENCE:
             involved = [columns[i] for i in np.flatnonzero(np.abs(weights) > DEPENDENCE)]
             raise ModelError(
                 f"model: column {columns[last]!r} is a combination of {formulas.listed(involved)};"

@@ -40,8 +40,8 @@ class Frame:
     def at(self, point: int) -> dict[str, Any]:
         """Say where a point is, in tables of peaks; a node of the sheet by its coordinates."""
         number = self.number if "vertex" in self.number else {}
-        where = {**number, **self.position, "subfield": self.subfield}
-        return {name: values[point] for name, values in where.items()}
+        position = {**number, **self.position, "subfield": self.subfield}
+        return {name: values[point] for name, values in position.items()}
 
     @classmethod
     def of_sheet(cls, x: Float, y: Float, subfield: NDArray[np.str_]) -> "Frame":
@@ -52,10 +52,10 @@ class Frame:
         return cls({"node_x": i + 1, "node_y": j + 1}, position, subfield.ravel())
 
 
-def frame_of(cohort: Cohort, one: FittedMaps) -> Frame:
+def frame_of(cohort: Cohort, fitted: FittedMaps) -> Frame:
     """Locate points, and name the subfield in which most participants have them."""
-    subfield = np.array([*one.maps.names, MISSING])[one.subfield]
-    if (mesh := one.maps.mesh) is None:
+    subfield = np.array([*fitted.maps.names, MISSING])[fitted.subfield]
+    if (mesh := fitted.maps.mesh) is None:
         return Frame.of_sheet(cohort.x, cohort.y, subfield)
     position = {f"surface_{axis}": mesh.points[:, i] for i, axis in enumerate("xyz")}
     return Frame({"vertex": np.arange(len(mesh.points))}, position, subfield.ravel())
@@ -63,11 +63,11 @@ def frame_of(cohort: Cohort, one: FittedMaps) -> Frame:
 
 def test_columns(test: PointTest) -> dict[str, Float]:
     """Columns of a test in tables of points; of an F test without estimate."""
-    none = np.full(test.p.shape, np.nan)
+    missing = np.full(test.p.shape, np.nan)
     single = test.kind == "t"
     return {
-        "estimate": test.estimate[0] if single else none,
-        "se": test.se[0] if single else none,
+        "estimate": test.estimate[0] if single else missing,
+        "se": test.se[0] if single else missing,
         "statistic": test.statistic,
         "df": test.df,
         "p": test.p,
@@ -86,14 +86,16 @@ def effect_columns(test: PointTest) -> dict[str, str | Float]:
     }
 
 
-def point_columns(test: PointTest, found: "Discoveries", frame: Frame, n: Int) -> dict[str, object]:
+def point_columns(
+    test: PointTest, discoveries: "Discoveries", frame: Frame, n: Int
+) -> dict[str, object]:
     """Columns of a map of statistics, with the participants (points,) of each point."""
     return {
         **frame.columns,
         "n": n,
         **test_columns(test),
-        "p_corrected": found.adjusted,
-        "significant": found.rejected,
+        "p_corrected": discoveries.adjusted,
+        "significant": discoveries.rejected,
         "cohen_d": test.cohen_d,
         "cohen_d_low": test.cohen_d_limits[0],
         "cohen_d_high": test.cohen_d_limits[1],
@@ -103,26 +105,32 @@ def point_columns(test: PointTest, found: "Discoveries", frame: Frame, n: Int) -
     }
 
 
-def overview_row(name: str, key: "MapKey", found: "Discoveries") -> dict[str, object]:
+def overview_row(name: str, key: "MapKey", discoveries: "Discoveries") -> dict[str, object]:
     """Say of a map in the file ``name`` how many points survive, and at which p."""
     return {
         "measure": key.measure,
         "contrast": key.contrast,
         "hemi": key.hemi,
         "file": name,
-        "n_tests": found.n_tests,
-        "n_significant": int(found.rejected.sum()),
-        "p_cutoff": found.cutoff,
-        "lenient": found.lenient,
+        "n_tests": discoveries.n_tests,
+        "n_significant": int(discoveries.rejected.sum()),
+        "p_cutoff": discoveries.cutoff,
+        "lenient": discoveries.lenient,
     }
 
 
-def peak_table(test: PointTest, found: "Discoveries", frame: Frame, edges: Int) -> pd.DataFrame:
+def peak_table(
+    test: PointTest, discoveries: "Discoveries", frame: Frame, edges: Int
+) -> pd.DataFrame:
     """List the peak of each significant cluster, largest first; of the whole map if there is none.
 
     Effect sizes are Cohen's d for t, else partial eta squared.
     """
-    values = {**test_columns(test), "p_corrected": found.adjusted.ravel(), **effect_columns(test)}
+    values = {
+        **test_columns(test),
+        "p_corrected": discoveries.adjusted.ravel(),
+        **effect_columns(test),
+    }
     del values["estimate"], values["se"]
     return pd.DataFrame(
         [
@@ -136,7 +144,9 @@ def peak_table(test: PointTest, found: "Discoveries", frame: Frame, edges: Int) 
                 },
                 **one.columns,
             }
-            for one in find_clusters(found.rejected.ravel(), test.statistic, frame.subfield, edges)
+            for one in find_clusters(
+                discoveries.rejected.ravel(), test.statistic, frame.subfield, edges
+            )
         ]
     )
 
@@ -172,8 +182,8 @@ def find_clusters(
         for number in range(1, count + 1):
             members = np.flatnonzero(labels == number)
             peak = int(members[np.argmax(np.abs(statistic[members]))])
-            own = subfield[members]
-            names, counts = np.unique(own[own != MISSING], return_counts=True)
+            codes = subfield[members]
+            names, counts = np.unique(codes[codes != MISSING], return_counts=True)
             shares = dict(zip(names.tolist(), (counts / len(members)).tolist(), strict=True))
             clusters.append(Cluster(len(members), peak, shares))
     if not clusters and np.isfinite(statistic).any():

@@ -125,14 +125,14 @@ def encode(name: str, draw: Drawing) -> list[tuple[str, bytes]]:
     encoded = []
     with rc_context(_STYLE):
         for number, figure in enumerate(draw(), start=1):
-            own = name if number == 1 else f"{name}_{number}"
+            title = name if number == 1 else f"{name}_{number}"
             for kind, metadata in _METADATA.items():
                 buffer = io.BytesIO()
-                how: Any = {"pil_kwargs": {"compress_level": 4}} if kind == "png" else {}
+                options: Any = {"pil_kwargs": {"compress_level": 4}} if kind == "png" else {}
                 figure.savefig(
-                    buffer, format=kind, dpi=panels.DOTS_PER_INCH, metadata=metadata, **how
+                    buffer, format=kind, dpi=panels.DOTS_PER_INCH, metadata=metadata, **options
                 )
-                encoded.append((f"{own}.{kind}", buffer.getvalue()))
+                encoded.append((f"{title}.{kind}", buffer.getvalue()))
                 figure.set_layout_engine(None)  # that of the first is for all: it takes long
     return encoded
 
@@ -182,9 +182,9 @@ def draw_calibration(analysis: Analysis) -> "list[Figure]":
     """Draw predicted chances, cross-validated, against what happened; of large groups only."""
 
     def line(axis: "Axes", result: ClassifierResult, color: str) -> str:
-        found = result.calibration
-        axis.plot(found.predicted, found.observed, "o-", color=color, markersize=3)
-        return f"{found.slope:.2f}, {found.brier:.2f}"
+        calibration = result.calibration
+        axis.plot(calibration.predicted, calibration.observed, "o-", color=color, markersize=3)
+        return f"{calibration.slope:.2f}, {calibration.brier:.2f}"
 
     judged = [one for one in analysis.pairs if one[2].comparison.full.calibration.judged]
     labels = "predicted chance, cross-validated", "share of cases"
@@ -194,7 +194,7 @@ def draw_calibration(analysis: Analysis) -> "list[Figure]":
 def _draw_pairs(
     analysis: Analysis,
     labels: tuple[str, str],
-    what: str,
+    title: str,
     line: "Callable[[Axes, ClassifierResult, str], str]",
 ) -> "list[Figure]":
     """Draw a row for each pair of groups, with its legend beside it: the first added measure."""
@@ -223,15 +223,15 @@ def _draw_pairs(
         method = "\n(separated: Firth's method)" if pair.comparison.separated else ""
         from matplotlib.lines import Line2D  # noqa: PLC0415  (slow to load)
 
-        nothing = Line2D([], [], linestyle="none")
+        blank = Line2D([], [], linestyle="none")
         row[-1].legend(
             [
                 handle
                 for color, lines in zip(COLORS, texts.values(), strict=False)
-                for handle in (Line2D([], [], color=color), *[nothing] * len(lines))
+                for handle in (Line2D([], [], color=color), *[blank] * len(lines))
             ],
             [text for name, lines in texts.items() for text in (name, *lines)],
-            title=f"{control} against {case}{method}\n{what}",
+            title=f"{control} against {case}{method}\n{title}",
             loc="upper left", borderaxespad=0, alignment="left", handlelength=1.2, labelspacing=0.2,
         )  # fmt: skip
     _name([axis for axis in axes.flat if axis.axison])
@@ -249,22 +249,22 @@ def draw_registration(cohort: Cohort, analysis: Analysis) -> "list[Figure]":
     label = with_brackets("curvature", cohort.units.get("curvature", "1"))
     for (before, after, shifts), (hemi, side) in zip(axes, analysis.sides.items(), strict=True):
         members = members_of(analysis, cohort.table.iloc[side.registered.rows])
-        for axis, source, when in (
+        for axis, source, state in (
             (before, cohort.sides[hemi], "before"),
             (after, side.registered, "after"),
         ):
-            curves = (profiles_of(source.maps, "curvature", own) for own in members.values())
+            curves = (profiles_of(source.maps, "curvature", member) for member in members.values())
             _curves(axis, cohort.x, members, curves)
-            axis.set_title(f"{SIDES[hemi]}, {when} registration")
+            axis.set_title(f"{SIDES[hemi]}, {state} registration")
             axis.set_ylabel(label)
         after.sharey(before)
         moved = side.registration.shifts
-        every = -(-len(moved) // _MOST_LINES)
-        for color, own in zip(cycle(COLORS), members.values(), strict=False):
-            shifts.plot(cohort.x, moved[own][::every].T, color=color, alpha=0.25, linewidth=0.4)
-        _curves(shifts, cohort.x, members, (moved[own] for own in members.values()))
+        step = -(-len(moved) // _MOST_LINES)
+        for color, member in zip(cycle(COLORS), members.values(), strict=False):
+            shifts.plot(cohort.x, moved[member][::step].T, color=color, alpha=0.25, linewidth=0.4)
+        _curves(shifts, cohort.x, members, (moved[member] for member in members.values()))
         shifts.axhline(0, color="black", linewidth=0.5)
-        shifts.set_title(f"{SIDES[hemi]}, warps" + (f" (1 of {every} drawn)" if every > 1 else ""))
+        shifts.set_title(f"{SIDES[hemi]}, warps" + (f" (1 of {step} drawn)" if step > 1 else ""))
         shifts.set_ylabel("shift to lateral [nodes]")
         for axis in (before, after, shifts):
             mark_medial(axis, cohort)
@@ -276,8 +276,8 @@ def draw_registration(cohort: Cohort, analysis: Analysis) -> "list[Figure]":
 def _curves(axis: "Axes", x: Float, names: Iterable[str], groups: Iterable[Float]) -> None:
     """Draw the mean of each group and twice its standard error to both sides."""
     for color, name, values in zip(cycle(COLORS), names, groups, strict=False):
-        known, mean, sd = describe_known([values])
-        error = 2 * sd / np.sqrt(np.maximum(known.sum(axis=0), 1))
+        finite, mean, sd = describe_known([values])
+        error = 2 * sd / np.sqrt(np.maximum(finite.sum(axis=0), 1))
         axis.plot(x, mean, color=color, label=f"{name} (n = {len(values)})", linewidth=1.2)
         axis.fill_between(x, mean - error, mean + error, color=color, alpha=0.25, linewidth=0)
 
@@ -327,14 +327,14 @@ def _plane(middle: Float, node: int, *, left: bool) -> Float:
     return np.stack([lateral, superior if superior[2] > 0 else -superior])
 
 
-def _mark_subfields(axis: "Axes", layers: Float, one: FittedMaps, node: int) -> None:
+def _mark_subfields(axis: "Axes", layers: Float, fitted: FittedMaps, node: int) -> None:
     """Draw borders of subfields across the mean wall, and name them inside it."""
-    fields = one.subfield[:, node]
+    fields = fitted.subfield[:, node]
     inner, middle, outer = layers
     for i in np.flatnonzero(fields[1:] != fields[:-1]):
         ends = [(layer[i] + layer[i + 1]) / 2 for layer in (inner, outer)]
         axis.plot(*np.transpose(ends), color="0.3", linewidth=0.6)
-    for number, name in enumerate(one.maps.names):
+    for number, name in enumerate(fitted.maps.names):
         nodes = np.flatnonzero(fields == number)
         if len(nodes):
             x, y = middle[nodes[len(nodes) // 2]]
@@ -344,19 +344,19 @@ def _mark_subfields(axis: "Axes", layers: Float, one: FittedMaps, node: int) -> 
 
 def draw_sites(cohort: Cohort, analysis: Analysis) -> "list[Figure]":
     """Draw means and SDs of the residuals of sites over points, before and after harmonization."""
-    done = analysis.harmonization
-    if done is None:
+    harmonization = analysis.harmonization
+    if harmonization is None:
         raise ValueError("nothing was harmonized")
-    shown_sites = [site for site in done.plan.sites if site in done.plan.counts]
+    shown_sites = [site for site in harmonization.plan.sites if site in harmonization.plan.counts]
     height = 2 * (20 + 5 * len(shown_sites))
-    figure, axes = _panels(2, len(done.maps), (panels.TWO_COLUMNS, height))
-    for j, ((hemi, measure), (effects, moments)) in enumerate(done.maps.items()):
+    figure, axes = _panels(2, len(harmonization.maps), (panels.TWO_COLUMNS, height))
+    for j, ((hemi, measure), (effects, moments)) in enumerate(harmonization.maps.items()):
         states = {"before": moments, "after": moments.after(effects)}
         unit = cohort.units.get(measure, "1")
-        for number, (name, one) in enumerate(states.items()):
-            for axis, values in ((axes[0, j], one.mean * effects.sd), (axes[1, j], one.sd)):
+        for number, (name, state) in enumerate(states.items()):
+            for axis, values in ((axes[0, j], state.mean * effects.sd), (axes[1, j], state.sd)):
                 for row, site in enumerate(shown_sites):
-                    _spread(axis, values[done.plan.sites.index(site)], row, number, name)
+                    _spread(axis, values[harmonization.plan.sites.index(site)], row, number, name)
         for axis, label, ideal in (
             (axes[0, j], f"mean, {display_name(measure)} [{unit}]", 0.0),
             (axes[1, j], "SD, over that of all", 1.0),
@@ -375,10 +375,10 @@ def draw_sites(cohort: Cohort, analysis: Analysis) -> "list[Figure]":
 
 def _spread(axis: "Axes", values: Float, row: int, number: int, name: str) -> None:
     """Draw the 5th to the 95th percentile, the quartiles and the median of points as lines."""
-    known = values[np.isfinite(values)]
-    if not known.size:
+    finite = values[np.isfinite(values)]
+    if not finite.size:
         return
-    low, first, middle, third, high = np.percentile(known, [5, 25, 50, 75, 95])
+    low, first, middle, third, high = np.percentile(finite, [5, 25, 50, 75, 95])
     y, color = row - 0.16 + 0.32 * number, ("0.6", COLORS[0])[number]
     axis.plot([low, high], [y, y], color=color, linewidth=1.0)
     axis.plot([first, third], [y, y], color=color, linewidth=4.5, label=name, solid_capstyle="butt")
@@ -395,25 +395,33 @@ def draw_norms(lines: pd.DataFrame, dots: pd.DataFrame) -> "list[Figure]":
     figure, axes = _panels(len(sexes), len(sides), (width, 60.0 * len(sexes)))
     measure, unit = lines[["measure", "unit"]].iloc[0]
     names = [name for name in lines.columns if re.fullmatch(r"p\d+", name)]
-    shown = np.concatenate([lines[names].to_numpy().ravel(), dots["value"]])
-    low, high = np.nanmin(shown), np.nanmax(shown)
+    limits = np.concatenate([lines[names].to_numpy().ravel(), dots["value"]])
+    low, high = np.nanmin(limits), np.nanmax(limits)
     margin = 0.03 * (high - low)
     for row, sex in zip(axes, sexes, strict=True):
         for axis, hemi in zip(row, sides, strict=True):
-            own = lines[(lines["hemi"] == hemi) & (lines["sex"] == sex)]
-            age, color = own["age"], HEMISPHERE_COLORS[hemi]
+            lines_here = lines[(lines["hemi"] == hemi) & (lines["sex"] == sex)]
+            age, color = lines_here["age"], HEMISPHERE_COLORS[hemi]
             for first, last in ((0, -1), (1, -2)):
-                edges = own[names[first]], own[names[last]]
+                edges = lines_here[names[first]], lines_here[names[last]]
                 axis.fill_between(age, *edges, color=color, alpha=0.15, linewidth=0)
             for name in names:
                 middle = name == names[len(names) // 2]
-                axis.plot(age, own[name], color=color, linewidth=1.4 if middle else 0.6)
-                end = (1.01, own[name].iloc[-1])
+                axis.plot(age, lines_here[name], color=color, linewidth=1.4 if middle else 0.6)
+                end = (1.01, lines_here[name].iloc[-1])
                 axis.annotate(name[1:], end, xycoords=("axes fraction", "data"), va="center")
-            some = dots[(dots["hemi"] == hemi) & (dots["sex"] == sex)]
+            dots_here = dots[(dots["hemi"] == hemi) & (dots["sex"] == sex)]
             for control, face in ((False, "black"), (True, "none")):
-                one = some[some["adapted"] == control]
-                axis.plot(one["age"], one["value"], "o", color="black", mfc=face, ms=2.5, mew=0.5)
+                dots_of_control = dots_here[dots_here["adapted"] == control]
+                axis.plot(
+                    dots_of_control["age"],
+                    dots_of_control["value"],
+                    "o",
+                    color="black",
+                    mfc=face,
+                    ms=2.5,
+                    mew=0.5,
+                )
             axis.set_title(SIDES[hemi] if sex == MISSING else f"{SIDES[hemi]}, {sex}")
             axis.set_xlabel("age [years]")
             axis.set_xlim(age.min(), age.max())
@@ -424,17 +432,17 @@ def draw_norms(lines: pd.DataFrame, dots: pd.DataFrame) -> "list[Figure]":
 
 
 def norm_rows(
-    found: Mapping[str, tuple[Float, Float]], age: float, measure: str, unit: str
+    centers: Mapping[str, tuple[Float, Float]], age: float, measure: str, unit: str
 ) -> Iterator[panels.Row]:
     """Show mean and SD of norms by side, at an age."""
     kind = kind_of(measure)
-    for i, (what, colors) in enumerate({"mean": kind.colors, "SD": "magma"}.items()):
-        values = {hemi: pair[i].ravel() for hemi, pair in found.items()}
+    for i, (quantity, colors) in enumerate({"mean": kind.colors, "SD": "magma"}.items()):
+        values = {hemi: pair[i].ravel() for hemi, pair in centers.items()}
         scale = panels.spanned(colors, values)
-        if kind.limits and what == "mean":
+        if kind.limits and quantity == "mean":
             scale = {"cmap": colors, "vmin": kind.limits[0], "vmax": kind.limits[1]}
-        title = f"{what[0].upper()}{what[1:]} at {age:g} years"
-        label = with_brackets(f"{what},\n{display_name(measure)}", unit)
+        title = f"{quantity[0].upper()}{quantity[1:]} at {age:g} years"
+        label = with_brackets(f"{quantity},\n{display_name(measure)}", unit)
         yield panels.Row(
             kind="expected", index=i, title=title, label=label, scale=scale, values=values
         )
@@ -454,10 +462,10 @@ def deviation_rows(scored: Mapping[str, ScoredMaps], measure: str) -> Iterator[p
         for hemi, own in z.items()
     }
     reach = max(1.0, *(np.nanmax(np.abs(one), initial=0.0) for one in means.values()))
-    most = max(20.0, *(np.nanmax(one, initial=0.0) for one in low.values()))
+    highest = max(20.0, *(np.nanmax(one, initial=0.0) for one in low.values()))
     for kind, title, label, colors, ends, values in (
         ("effect", "Mean deviation", "mean z", "RdBu_r", (-reach, reach), means),
-        ("error", "Below the 5th centile", "participants [%]", "magma", (0.0, most), low),
+        ("error", "Below the 5th centile", "participants [%]", "magma", (0.0, highest), low),
     ):
         scale: dict[str, Any] = {"cmap": colors, "vmin": ends[0], "vmax": ends[1]}
         yield panels.Row(kind=kind, index=0, title=title, label=label, scale=scale, values=values)

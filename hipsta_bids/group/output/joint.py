@@ -53,17 +53,17 @@ class JointMap:
         }
 
 
-def joint_points(one: JointMap) -> pd.DataFrame:
+def joint_points(joint_map: JointMap) -> pd.DataFrame:
     """List all points of a map, with the p-value of each measure by itself."""
-    frame = frame_of(one.cohort, one.place)
+    frame = frame_of(joint_map.cohort, joint_map.place)
     columns = {
         **frame.columns,
-        "n": np.min([fit.fits[measure].n for fit, measure in one.parts.values()], axis=0),
-        "statistic": one.test.statistic,
-        "p": one.test.p_uncorrected,
-        "p_corrected": one.found.adjusted,
-        "significant": one.found.rejected,
-        **{f"p_{title.replace(' ', '_')}": test.p for title, test in one.tests.items()},
+        "n": np.min([fit.fits[measure].n for fit, measure in joint_map.parts.values()], axis=0),
+        "statistic": joint_map.test.statistic,
+        "p": joint_map.test.p_uncorrected,
+        "p_corrected": joint_map.found.adjusted,
+        "significant": joint_map.found.rejected,
+        **{f"p_{title.replace(' ', '_')}": test.p for title, test in joint_map.tests.items()},
     }
     return pd.DataFrame(columns)
 
@@ -71,10 +71,14 @@ def joint_points(one: JointMap) -> pd.DataFrame:
 def joint_peaks(joint: Sequence[JointMap], settings: GroupSettings) -> pd.DataFrame:
     """List clusters with their peaks; of a map without findings its strongest point."""
     rows = []
-    for one in joint:
-        frame, tests, z = frame_of(one.cohort, one.place), one.tests, one.test.statistic
-        edges = edges_of(one.place.maps, settings.multiplicity.neighbors)
-        for cluster in find_clusters(one.found.rejected, z, frame.subfield, edges):
+    for joint_map in joint:
+        frame, tests, z = (
+            frame_of(joint_map.cohort, joint_map.place),
+            joint_map.tests,
+            joint_map.test.statistic,
+        )
+        edges = edges_of(joint_map.place.maps, settings.multiplicity.neighbors)
+        for cluster in find_clusters(joint_map.found.rejected, z, frame.subfield, edges):
             at = cluster.peak
             words = [
                 f"{title} {group_tables.effect_name(_EFFECTS[test.kind])}"
@@ -85,13 +89,13 @@ def joint_peaks(joint: Sequence[JointMap], settings: GroupSettings) -> pd.DataFr
             rows.append(
                 {
                     "measure": group_tables.JOINT,
-                    "contrast": one.key.contrast,
-                    "hemi": one.key.hemi,
+                    "contrast": joint_map.key.contrast,
+                    "hemi": joint_map.key.hemi,
                     **frame.at(at),
                     "test": "z",
                     "statistic": z[at],
-                    "p": one.test.p_uncorrected[at],
-                    "p_corrected": one.found.adjusted[at],
+                    "p": joint_map.test.p_uncorrected[at],
+                    "p_corrected": joint_map.found.adjusted[at],
                     **cluster.columns,
                     "measures": "; ".join(words),
                 }
@@ -104,25 +108,25 @@ def draw_joint(
 ) -> "list[Figure]":
     """Draw combined evidence and corrected p of each contrast."""
     by_contrast: dict[str, dict[str, JointMap]] = {}
-    for one in joint:
-        by_contrast.setdefault(one.key.contrast, {})[one.key.hemi] = one
-    places = {one.key.hemi: one.place for one in joint}
+    for joint_map in joint:
+        by_contrast.setdefault(joint_map.key.contrast, {})[joint_map.key.hemi] = joint_map
+    places = {joint_map.key.hemi: joint_map.place for joint_map in joint}
     blocks = [list(_rows(i, name, own)) for i, (name, own) in enumerate(by_contrast.items())]
     return draw_pages(joint[0].cohort, places, shapes, views, blocks)
 
 
-def _rows(number: int, contrast: str, own: Mapping[str, JointMap]) -> Iterator[Row]:
+def _rows(number: int, contrast: str, maps: Mapping[str, JointMap]) -> Iterator[Row]:
     _, colors, p_colors = display.effect_colors("F")
-    z = {hemi: one.test.statistic for hemi, one in own.items()}
-    survive = {hemi: one.found.rejected for hemi, one in own.items()}
-    logs = {hemi: signed_logarithm(one.found.adjusted, z[hemi]) for hemi, one in own.items()}
+    z = {hemi: one.test.statistic for hemi, one in maps.items()}
+    survive = {hemi: one.found.rejected for hemi, one in maps.items()}
+    logs = {hemi: signed_logarithm(one.found.adjusted, z[hemi]) for hemi, one in maps.items()}
     sides = {
         hemi: "" if hemi == group_tables.BOTH_SIDES else f" {group_tables.SIDES[hemi]}"
-        for hemi in own
+        for hemi in maps
     }
     counts = ", ".join(f"{int(found.sum())}{sides[hemi]}" for hemi, found in survive.items())
     tested = "/".join(dict.fromkeys(str(int(np.isfinite(one).sum())) for one in z.values()))
-    first = next(iter(own.values()))
+    first = next(iter(maps.values()))
     yield Row(
         kind="effect",
         index=number,

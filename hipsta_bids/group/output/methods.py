@@ -56,10 +56,10 @@ class Citations:
 
     def page(self, paragraphs: Sequence[str], region: str = "body") -> str:
         """Return the text with its references; the first paragraph says what was measured."""
-        what = _MEASURED["body"]
-        first = paragraphs[0].replace(what, _MEASURED.get(region, what), 1)
-        known = references()
-        works = "\n".join(f"{i}. {known[key]}" for i, key in enumerate(self._keys, start=1))
+        region_text = _MEASURED["body"]
+        first = paragraphs[0].replace(region_text, _MEASURED.get(region, region_text), 1)
+        bibliography = references()
+        works = "\n".join(f"{i}. {bibliography[key]}" for i, key in enumerate(self._keys, start=1))
         use = "This text may be used freely, as it stands or changed."
         parts = ["# Methods and findings", use, first, *paragraphs[1:], "# References", works]
         return "\n\n".join(parts) + "\n"
@@ -136,11 +136,11 @@ def _sample(
 def _registration(
     analysis: Analysis, settings: group_settings.GroupSettings, cite: Callable[[str], str]
 ) -> str:
-    how = settings.registration
-    if how.align == "none":
+    rules = settings.registration
+    if rules.align == "none":
         return "Maps were not registered to each other."
     method = f"alternating fits of a template and of monotone B-spline warps {cite('registr')}"
-    if how.align == "penalized":
+    if rules.align == "penalized":
         method += ", with a penalty on local stretch that was estimated from the data"
     shares = "; ".join(
         f"{hemi}: {side.registration.explained_before:.0%} to"
@@ -148,7 +148,9 @@ def _registration(
         for hemi, side in analysis.sides.items()
     )
     extreme = sum(int(side.registration.extreme.sum()) for side in analysis.sides.values())
-    own = ", each less its mean and over its standard deviation," if how.standardize else ""
+    standardization = (
+        ", each less its mean and over its standard deviation," if rules.standardize else ""
+    )
     groups = "; ".join(
         f"{hemi}: {side.difference.largest:.2f} nodes, p = {side.difference.p:.2g}"
         for hemi, side in analysis.sides.items()
@@ -156,16 +158,16 @@ def _registration(
     )
     moved = (
         " The largest difference of mean displacement between groups, with its p-value corrected"
-        f" for all positions by {how.group_permutations} permutations of participants, was"
+        f" for all positions by {rules.group_permutations} permutations of participants, was"
         f" {groups}."
         if groups
         else ""
     )
     return (
-        f"Curvature profiles from medial to lateral (means from posterior to anterior){own} were"
-        f" registered by {method}, and the warps were applied to all maps. The share of the"
-        f" variance of the profiles that their mean explains went from {shares}.{moved}"
-        f" Warps out of line with the others: {extreme}."
+        "Curvature profiles from medial to lateral (means from posterior to"
+        f" anterior){standardization} were registered by {method}, and the warps were applied to"
+        " all maps. The share of the variance of the profiles that their mean explains went from"
+        f" {shares}.{moved} Warps out of line with the others: {extreme}."
     )
 
 
@@ -183,20 +185,20 @@ def _rims(analysis: Analysis) -> str:
 
 
 def _harmonization(analysis: Analysis, cite: Callable[[str], str]) -> list[str]:
-    done = analysis.harmonization
-    if done is None:
+    harmonization = analysis.harmonization
+    if harmonization is None:
         return []
-    plan = done.plan
+    plan = harmonization.plan
     counts = ", ".join(f"{site} {n}" for site, n in plan.counts.items())
     sources = f"{cite('johnson')}, {cite('combat')}"
-    kept = f"`{plan.kept.formula}`" if plan.kept.names else "no variable"
+    preserved = f"`{plan.kept.formula}`" if plan.kept.names else "no variable"
     if plan.icv is not None:
-        kept += f", for volumes also {plan.icv}"
+        preserved += f", for volumes also {plan.icv}"
     text = (
         f"Effects of {plan.column} ({counts} participants) were taken out of"
         f"{' the registered' if analysis.sides else ''} maps and summary measures by ComBat"
         f" {sources}: at each point, a shift and a scale of the residuals of a linear model that"
-        f" keeps {kept}. The two were pooled over the points of a map by empirical Bayes, and"
+        f" keeps {preserved}. The two were pooled over the points of a map by empirical Bayes, and"
         " estimated for each summary measure by itself; missing values were left out point by"
         " point."
     )
@@ -206,17 +208,18 @@ def _harmonization(analysis: Analysis, cite: Callable[[str], str]) -> list[str]:
             f" differences within participants {cite('beer')}."
         )
     if plan.saved is not None:
-        known = sum(site in plan.saved.sites for site in plan.counts)
-        text += f" Parameters of {known} of these were those of an earlier analysis"
+        saved_sites = sum(site in plan.saved.sites for site in plan.counts)
+        text += f" Parameters of {saved_sites} of these were those of an earlier analysis"
         text += f"; those of {', '.join(plan.estimated)} were new." if plan.estimated else "."
     if plan.estimated and not analysis.comparison.pair:
-        lost = len(plan.counts) - 1
+        columns_lost = len(plan.counts) - 1
         text += (
             f" As the shifts were estimated from the same participants, {plan.column} is also a"
-            f" factor of the model, which has {lost} degree{'s' if lost > 1 else ''} of freedom"
-            f" less: without, tests would reject too often {cite('nygaard')}."
+            f" factor of the model, which has {columns_lost}"
+            f" degree{'s' if columns_lost > 1 else ''} of freedom less: without, tests would reject"
+            f" too often {cite('nygaard')}."
         )
-    if analysis.pairs and analysis.groups and done.leaks(analysis.groups.column):
+    if analysis.pairs and analysis.groups and harmonization.leaks(analysis.groups.column):
         text += (
             " Classifiers were given the measures before harmonization, since parameters that"
             " were estimated with the groups known would tell something about who is left out."
@@ -230,7 +233,7 @@ def _models(
     names = ", ".join(contrast.name for contrast in analysis.design.contrasts)
     levels = ", ".join(f"{name} {level}" for name, level in analysis.design.references.items())
     errors = " with HC3 standard errors" if settings.glm.covariance == "hc3" else ""
-    kind, what, d = "linear model", "", "estimate over residual standard deviation"
+    kind, subject, d = "linear model", "", "estimate over residual standard deviation"
     if settings.glm.weights != "none":
         errors = (
             " by weighted least squares, with weights 1 / (variance between participants + squared"
@@ -239,11 +242,11 @@ def _models(
         )
     if analysis.comparison.pair:
         first, second = analysis.comparison.pair
-        what = f" to the change from {first} to {second}, with the covariates of {first}"
+        subject = f" to the change from {first} to {second}, with the covariates of {first}"
     if analysis.comparison.longitudinal:
         visits = analysis.row_model.visits
-        own = "intercepts and slopes" if visits is not None and visits.slopes else "intercepts"
-        kind = f"linear mixed model with {own} of participants"
+        effects = "intercepts and slopes" if visits is not None and visits.slopes else "intercepts"
+        kind = f"linear mixed model with {effects} of participants"
         errors = (
             " by restricted maximum likelihood, with Satterthwaite's degrees of freedom"
             f" {cite('mixed')}{_slopes(analysis, cite)}"
@@ -253,8 +256,8 @@ def _models(
     adjusted = any(one.formula != analysis.model.formula for one in analysis.measures)
     volumes = ", volumes also with intracranial volume" if adjusted else ""
     return (
-        f"At each point of the sheet a {kind} `{analysis.model.formula}` was fitted{what}{errors}"
-        f" (reference levels: {levels or 'none'}); contrasts: {names}."
+        f"At each point of the sheet a {kind} `{analysis.model.formula}` was"
+        f" fitted{subject}{errors} (reference levels: {levels or 'none'}); contrasts: {names}."
         f" {corrected} Effect sizes are"
         f" Cohen's d ({d}) or partial eta squared, with"
         f" {settings.glm.confidence:.0%} confidence limits from non-central distributions. Summary"
@@ -284,30 +287,30 @@ def _nonlinear(analysis: Analysis, settings: group_settings.GroupSettings) -> st
     names = [one.name for one in analysis.design.contrasts if one.name.endswith(" nonlinear")]
     if not names or settings.model.age == "linear":
         return ""
-    how = "its square" if settings.model.age == "quadratic" else "a natural cubic spline"
+    curve = "its square" if settings.model.age == "quadratic" else "a natural cubic spline"
     p = [
         test.p for one in analysis.measures for test in one.fit.tests if test.contrast.name in names
     ]
-    found = control_fdr(np.concatenate(p or [np.empty(0)]), settings.multiplicity.alpha)
+    result = control_fdr(np.concatenate(p or [np.empty(0)]), settings.multiplicity.alpha)
     return (
-        f" Age was in the model with {how}; the contrast {names[0]} tests whether that differs from"
-        f" a line, as it did in {int(found.rejected.sum())} of {found.n_tests} tests of summary"
-        " measures (false discovery rate)."
+        f" Age was in the model with {curve}; the contrast {names[0]} tests whether that differs"
+        f" from a line, as it did in {int(result.rejected.sum())} of {result.n_tests} tests of"
+        " summary measures (false discovery rate)."
     )
 
 
 def _correction(
-    how: group_settings.MultiplicitySettings, cite: Callable[[str], str], analysis: Analysis
+    rules: group_settings.MultiplicitySettings, cite: Callable[[str], str], analysis: Analysis
 ) -> str:
-    family = _FAMILIES[how.scope]
-    if how.method in PERMUTATIONS:
+    family = _FAMILIES[rules.scope]
+    if rules.method in PERMUTATIONS:
         statistic = "the largest absolute statistic"
-        if how.method == "permutation-tfce":
+        if rules.method == "permutation-tfce":
             statistic = (
                 f"the largest threshold-free cluster enhancement {cite('tfce')} (extent"
                 f" {TFCE_EXTENT:g}, height {TFCE_HEIGHT:g})"
             )
-        inside = f" within levels of {how.blocks}" if how.blocks else ""
+        inside = f" within levels of {rules.blocks}" if rules.blocks else ""
         shuffled = (
             "the residuals of the model without the contrast (Freedman and Lane's; of signs, where"
             " a mean was tested"
@@ -319,46 +322,46 @@ def _correction(
                 f" repeated visits {cite('repeated')}"
             )
             design = analysis.design
-            blocks = row_blocks(analysis.row_model, analysis.compared.table, how)
+            blocks = row_blocks(analysis.row_model, analysis.compared.table, rules)
             visits = replace(visits, blocks=blocks)
-            end = exchange_text(design.matrix, design.contrasts, visits, how.visits)
+            end = exchange_text(design.matrix, design.contrasts, visits, rules.visits)
         return (
-            f"The family-wise error rate was held at {how.alpha:g} by {statistic} in"
-            f" {how.permutations} permutations{inside} of {shuffled}; seed"
-            f" {how.seed}) {cite('permutation')}, for {family}.{end}"
+            f"The family-wise error rate was held at {rules.alpha:g} by {statistic} in"
+            f" {rules.permutations} permutations{inside} of {shuffled}; seed"
+            f" {rules.seed}) {cite('permutation')}, for {family}.{end}"
         )
-    return f"{discovery_text(how, cite)}."
+    return f"{discovery_text(rules, cite)}."
 
 
-def discovery_text(how: group_settings.MultiplicitySettings, cite: Callable[[str], str]) -> str:
+def discovery_text(rules: group_settings.MultiplicitySettings, cite: Callable[[str], str]) -> str:
     """Word how the false discovery rate was held."""
     return (
-        f"The false discovery rate was held at {how.alpha:g} by {PROCEDURES[how.method]}"
-        f" {cite(how.method)}, for {_FAMILIES[how.scope]}"
+        f"The false discovery rate was held at {rules.alpha:g} by {PROCEDURES[rules.method]}"
+        f" {cite(rules.method)}, for {_FAMILIES[rules.scope]}"
     )
 
 
 def _joint(settings: group_settings.GroupSettings, cite: Callable[[str], str]) -> str:
-    how, joint = settings.multiplicity, settings.joint
+    rules, joint = settings.multiplicity, settings.joint
     by = (
         "minus twice the sum of the logarithms of their two-sided p-values (Fisher)"
         if joint.combine == "fisher"
         else "the smallest of their two-sided p-values (Tippett)"
     )
     statistic = "the combined evidence"
-    if how.method == "permutation-tfce":
+    if rules.method == "permutation-tfce":
         statistic = f"its threshold-free cluster enhancement {cite('tfce')}"
-    family = "" if joint.sides else " of each side" if how.scope == "map" else " of both sides"
+    family = "" if joint.sides else " of each side" if rules.scope == "map" else " of both sides"
     names = " and ".join(name.replace("_", " ") for name in joint.measures)
     return (
         f"Maps of {names}{', of the left and the right side,' if joint.sides else ''} were also"
         f" tested together by non-parametric combination {cite('joint')}. At each point the"
         f" evidence is {by}, as the normal quantile of its two-sided p-value for independent maps."
-        f" In each of {how.permutations} permutations of residuals (Freedman and Lane's; seed"
-        f" {how.seed}) {cite('permutation')} all maps were shuffled alike, so that their"
+        f" In each of {rules.permutations} permutations of residuals (Freedman and Lane's; seed"
+        f" {rules.seed}) {cite('permutation')} all maps were shuffled alike, so that their"
         f" dependence is kept. The largest value of {statistic} in each holds the"
-        f" family-wise error rate at {how.alpha:g} over the points{family}. The null hypothesis of"
-        " a point is that none of the maps has an effect there; the effect sizes of each map say"
+        f" family-wise error rate at {rules.alpha:g} over the points{family}. The null hypothesis"
+        " of a point is that none of the maps has an effect there; the effect sizes of each map say"
         " where a finding comes from."
     )
 
@@ -366,7 +369,7 @@ def _joint(settings: group_settings.GroupSettings, cite: Callable[[str], str]) -
 def norms_text(
     file: NormsFile,
     *,
-    who: str,
+    sample: str,
     coverage: pd.DataFrame | None,
     new: Sequence[str],
     controls: tuple[str, str] | None,
@@ -377,7 +380,7 @@ def norms_text(
     """
     cite = Citations()
     ages = f"{file.knots[0]:g} to {file.knots[-1]:g} years"
-    first = f"Measures of the hippocampus {cite('method')} of {who} were "
+    first = f"Measures of the hippocampus {cite('method')} of {sample} were "
     if coverage is not None:
         first += f"taken as norms for ages of {ages} with hipsta_bids {__version__}."
     else:
@@ -387,8 +390,8 @@ def norms_text(
             f" {file.version})."
         )
     if file.template is not None:
-        whose = "each other" if coverage is not None else "the template of the norms"
-        first += f" Sheets were registered to {whose} by curvature profiles {cite('registr')}."
+        template = "each other" if coverage is not None else "the template of the norms"
+        first += f" Sheets were registered to {template} by curvature profiles {cite('registr')}."
     model = (
         f"Norms have a mean with a natural cubic spline of age ({len(file.knots)} knots) and"
         f" constants for {'sex and ' if file.sexes else ''}site, and an SD whose logarithm is"
@@ -403,10 +406,10 @@ def norms_text(
         of_maps = coverage["n_points"] > 1
         kinds = {"points of maps": coverage[of_maps], "summary measures": coverage[~of_maps]}
         parts = []
-        for what, own in kinds.items():
-            below = [own[name].mean() for name in own.columns if name.startswith("below_")]
-            if len(own):
-                parts.append(f"{', '.join(f'{100 * one:.1f}' for one in below)} % of {what}")
+        for kind, numbers in kinds.items():
+            below = [numbers[name].mean() for name in numbers.columns if name.startswith("below_")]
+            if len(numbers):
+                parts.append(f"{', '.join(f'{100 * one:.1f}' for one in below)} % of {kind}")
         levels = ", ".join(f"{100 * one:g}" for one in LEVELS)
         paragraphs.append(
             f"In {CENTILE_FOLDS}-fold cross-validation {' and '.join(parts)} lay below centiles"
@@ -446,7 +449,7 @@ def _normative(scores: Scores, settings: group_settings.GroupSettings, source: s
 def _classification(
     analysis: Analysis, settings: group_settings.GroupSettings, cite: Citations
 ) -> str:
-    how = settings.classification
+    rules = settings.classification
     delong, firth, snell = map(cite, ("delong", "firth", "snell"))
     separated = sum(pair.comparison.separated for _, _, pair in analysis.pairs)
     by_firth = (
@@ -455,23 +458,23 @@ def _classification(
         else f" No comparison was separated (else Firth's method {firth} is used)."
     )
     return (
-        f"Pairs of groups were told apart by logistic models of {' + '.join(how.base)}, and of the"
-        " same with one measure added; a likelihood-ratio test compares the two, on the same"
+        f"Pairs of groups were told apart by logistic models of {' + '.join(rules.base)}, and of"
+        " the same with one measure added; a likelihood-ratio test compares the two, on the same"
         f" participants. Areas under the curve have DeLong intervals {delong}, and are also given"
-        f" from {how.folds}-fold stratified cross-validation repeated {how.repeats} times (seed"
-        f" {how.seed}).{by_firth} Calibration is judged where both groups have"
-        f" {how.least_calibrated} members or more {snell}."
+        f" from {rules.folds}-fold stratified cross-validation repeated {rules.repeats} times (seed"
+        f" {rules.seed}).{by_firth} Calibration is judged where both groups have"
+        f" {rules.least_calibrated} members or more {snell}."
     )
 
 
 def _findings(analysis: Analysis) -> str:
     parts = []
-    for key, found in analysis.found.items():
-        count = int(found.rejected.sum())
-        text = f"{key.measure}, {key.contrast}, {key.hemi}: {count} of {found.n_tests} points"
-        if count and np.isfinite(found.cutoff):
-            text += f" (p up to {found.cutoff:.2g})"
-        if found.lenient:
+    for key, discoveries in analysis.found.items():
+        count = int(discoveries.rejected.sum())
+        text = f"{key.measure}, {key.contrast}, {key.hemi}: {count} of {discoveries.n_tests} points"
+        if count and np.isfinite(discoveries.cutoff):
+            text += f" (p up to {discoveries.cutoff:.2g})"
+        if discoveries.lenient:
             text += " - this cut-off is above the level, as happens with widespread effects"
         parts.append(text)
     return "Points that survive: " + "; ".join(parts) + "."
@@ -488,7 +491,7 @@ def power_text(
     cite: Cite,
 ) -> str:
     """Word what was asked, and how it was answered; ``source`` words what variances rest on."""
-    plan, how = settings.power, settings.multiplicity
+    plan, rules = settings.power, settings.multiplicity
     months = ", ".join(f"{month:g}" for month in effect.visits)
     question = f"{100 * effect.share:g} % of the change over time is prevented"
     if effect.kind == THINNING:
@@ -501,17 +504,17 @@ def power_text(
             " true slopes between participants plus the variance within participants over the sum"
             f" of squared times {cite('ard')}."
         )
-    lost = f", if {100 * plan.dropout:g} % drop out" if plan.dropout else ""
-    if lost and effect.visits:
-        lost += " at a constant hazard and are analyzed with the visits before"
+    dropout = f", if {100 * plan.dropout:g} % drop out" if plan.dropout else ""
+    if dropout and effect.visits:
+        dropout += " at a constant hazard and are analyzed with the visits before"
     return (
         f"Sample sizes are those of a trial of two arms of equal size in which {question}, with a"
-        f" power of {plan.power:g}{lost}. {end} Means, changes and variances are those of"
+        f" power of {plan.power:g}{dropout}. {end} Means, changes and variances are those of"
         f" {source(cite)}. Power is that of Student's two-sided t test (non-central t), at the"
         f" level {plan.alpha:g} for a summary measure, without correction, since a trial has one"
         f" primary end point. At single points the level is {point_level(settings):.2g}: at that"
-        f" level {PROCEDURES[how.method]} {cite(how.method)} holds the false discovery rate at"
-        f" {how.alpha:g} if"
+        f" level {PROCEDURES[rules.method]} {cite(rules.method)} holds the false discovery rate at"
+        f" {rules.alpha:g} if"
         f" {100 * plan.affected:g} % of the points of a map differ and are found with this power"
         f" on average {cite('jung')} {cite('liu')}. Of many measures the one that needs fewest"
         " does so partly by chance; its number is too small on average."
@@ -519,12 +522,12 @@ def power_text(
 
 
 def retest_text(
-    one: RetestCohort, settings: group_settings.RetestSettings, cite: Callable[[str], str]
+    retest: RetestCohort, settings: group_settings.RetestSettings, cite: Callable[[str], str]
 ) -> str:
     """Word how agreement was measured."""
     return (
-        f"Agreement between {len(one.sessions)} sessions of {len(one.participants)} participants"
-        " was estimated at each point of the maps and for each summary measure. The"
+        f"Agreement between {len(retest.sessions)} sessions of {len(retest.participants)}"
+        " participants was estimated at each point of the maps and for each summary measure. The"
         " within-subject standard deviation is the root of the mean variance of a participant's"
         f" values {cite('bland')}; a change beyond 1.96 √2 times this is unlikely to be measurement"
         f" alone (minimal detectable change {cite('weir')}). The intraclass correlation is"

@@ -88,8 +88,8 @@ class Row:
 
 def spanned(colors: str, values: Mapping[str, Float]) -> Scale:
     """Colors from the 1st to the 99th percentile."""
-    every = display.known(list(values.values()))
-    low, high = np.percentile(every, (1, 99)) if len(every) else (0.0, 1.0)
+    finite = display.known(list(values.values()))
+    low, high = np.percentile(finite, (1, 99)) if len(finite) else (0.0, 1.0)
     return {"cmap": colors, "vmin": float(low), "vmax": float(high if high > low else low + 1)}
 
 
@@ -133,14 +133,16 @@ def _means(
     """Mean maps of the groups, on one scale."""
     means: dict[str, dict[str, Float]] = {}
     counts: dict[str, dict[str, int]] = {}
-    for hemi, one in sides.items():
-        for group, own in members_of(analysis, rows_of(analysis, one)).items():
-            _, means.setdefault(group, {})[hemi], _ = describe_known(one.parts(measure, own))
-            counts.setdefault(group, {})[hemi] = int(own.sum())
+    for hemi, fitted in sides.items():
+        for group, member in members_of(analysis, rows_of(analysis, fitted)).items():
+            _, means.setdefault(group, {})[hemi], _ = describe_known(fitted.parts(measure, member))
+            counts.setdefault(group, {})[hemi] = int(member.sum())
     pair = bool(analysis.comparison.pair)
     kind = display.kind_of(measure, change=pair or set(sides) == {BOTH})
-    low, high = display.scale_of(kind, [one for own in means.values() for one in own.values()])
-    what = "mean change" if pair else "mean"
+    low, high = display.scale_of(
+        kind, [fitted for member in means.values() for fitted in member.values()]
+    )
+    title = "mean change" if pair else "mean"
     for index, (group, values) in enumerate(means.items()):
         n = counts[group]
         by_side = ", ".join(f"{count} {SIDES[hemi]}" for hemi, count in n.items())
@@ -150,15 +152,15 @@ def _means(
         yield Row(
             kind="mean",
             index=index,
-            title=f"{what.capitalize()}, {group} ({how_many})",
+            title=f"{title.capitalize()}, {group} ({how_many})",
             label=with_brackets(
-                f"{what},\n{display_name(measure)}", cohort.units.get(measure, "1")
+                f"{title},\n{display_name(measure)}", cohort.units.get(measure, "1")
             ),
             scale={"cmap": kind.colors, "vmin": low, "vmax": high},
             values=values,
         )
     if parts_of(cohort.y) is not None:  # rims and holes, which differ, have no values
-        known = {hemi: one.fits[measure].n for hemi, one in sides.items()}
+        known = {hemi: fitted.fits[measure].n for hemi, fitted in sides.items()}
         yield Row(
             kind="count",
             index=0,
@@ -197,23 +199,23 @@ def contrasts(
     top = display.significance_reach(list(signed.values()))
     for index, test in enumerate(next(iter(tests.values()))):
         name = test.contrast.name
-        every = [
+        scales = [
             display.Effects(other.kind, other.effect, other.statistic, other.df)
             for own in every_test.values()
             for some in own.values()
             for other in some
             if other.contrast.name == (like or {}).get(name, name)
         ]
-        reach = display.effect_reach(every)
+        reach = display.effect_reach(scales)
         low, colors, p_colors = display.effect_colors(test.kind)
         survive = {hemi: found[name, hemi].rejected for hemi in sides}
         tested = {hemi: int(np.isfinite(found[name, hemi].adjusted).sum()) for hemi in sides}
-        same = len(set(tested.values())) == 1
+        uniform = len(set(tested.values())) == 1
         counts = ", ".join(
-            f"{int(own.sum())} {'' if same else f'of {tested[hemi]} '}{SIDES[hemi]}"
+            f"{int(own.sum())} {'' if uniform else f'of {tested[hemi]} '}{SIDES[hemi]}"
             for hemi, own in survive.items()
         )
-        counts += f" of {max(tested.values())} points" if same else ""
+        counts += f" of {max(tested.values())} points" if uniform else ""
         yield [
             Row(
                 kind="effect",
@@ -246,16 +248,16 @@ class _Surface:
     """(3, 3) of each, by name."""
 
     @classmethod
-    def build(cls, one: FittedMaps, shape: AverageShape | None, hemi: str) -> "_Surface | None":
-        if one.maps.mesh is not None:
-            mesh = one.maps.mesh
-            if _unfolded(one):
+    def build(cls, fitted: FittedMaps, shape: AverageShape | None, hemi: str) -> "_Surface | None":
+        if fitted.maps.mesh is not None:
+            mesh = fitted.maps.mesh
+            if _unfolded(fitted):
                 return None
             along = np.linalg.svd(mesh.points - mesh.points.mean(axis=0), full_matrices=False)[2][0]
             along = along * np.sign(along[1] or 1.0)  # to anterior
         elif shape is not None:
             mesh = shape.middle
-            grid = mesh.points.reshape(*one.maps.shape, 3)
+            grid = mesh.points.reshape(*fitted.maps.shape, 3)
             along = grid[:, -1].mean(axis=0) - grid[:, 0].mean(axis=0)
         else:
             return None
@@ -270,9 +272,9 @@ class _Surface:
         return float(min(_LARGEST * size[1 - i] / span[i] for span in spans for i in (0, 1)))
 
 
-def _unfolded(one: FittedMaps) -> bool:
+def _unfolded(fitted: FittedMaps) -> bool:
     """Whether maps lie on a plane: the sheet's, or that of other programs."""
-    return one.maps.mesh is None or one.maps.mesh.flat
+    return fitted.maps.mesh is None or fitted.maps.mesh.flat
 
 
 @dataclass(frozen=True, eq=False)
@@ -283,11 +285,11 @@ class Seen:
     borders: Bool
 
     @classmethod
-    def build(cls, view: View, one: FittedMaps) -> "Seen":
+    def build(cls, view: View, fitted: FittedMaps) -> "Seen":
         """Draw the lines."""
         lines = np.zeros(view.triangle.shape, dtype=bool)
-        for number in range(len(one.maps.names)):
-            region = view.region(one.subfield.ravel(), number)
+        for number in range(len(fitted.maps.names)):
+            region = view.region(fitted.subfield.ravel(), number)
             lines |= view.border(region, _FIELD_LINE * _POINT)
         return cls(view, lines)
 
@@ -297,10 +299,10 @@ class Seen:
         """Draw a map (points,) in the colors of a scale, with a line round what survives."""
         from matplotlib import colormaps  # noqa: PLC0415  (slow to load)
 
-        shown = self.view.spread(values.ravel())
-        share = (shown - scale["vmin"]) / (scale["vmax"] - scale["vmin"])
+        pixels = self.view.spread(values.ravel())
+        share = (pixels - scale["vmin"]) / (scale["vmax"] - scale["vmin"])
         colors = colormaps[scale["cmap"]](np.nan_to_num(share))[:, :3]
-        colors[~np.isfinite(shown)] = _UNKNOWN
+        colors[~np.isfinite(pixels)] = _UNKNOWN
         lines = self.borders
         if survive is not None:
             inside = self.view.region(survive.ravel().astype(np.int64), 1)
@@ -331,9 +333,9 @@ class _Paper:
     width: int
     height: int
 
-    def text(self, x: float, y: float, text: str, **how: Any) -> None:  # noqa: ANN401  (of matplotlib)
-        how = {"ha": "center", "va": "center", "fontsize": SMALL, **how}
-        self.figure.text(x / self.width, 1 - y / self.height, text, **how)
+    def text(self, x: float, y: float, text: str, **options: Any) -> None:  # noqa: ANN401  (of matplotlib)
+        options = {"ha": "center", "va": "center", "fontsize": SMALL, **options}
+        self.figure.text(x / self.width, 1 - y / self.height, text, **options)
 
     def axes(self, left: float, top: float, width: float, height: float) -> "Axes":
         box = (left / self.width, 1 - (top + height) / self.height)
@@ -358,39 +360,41 @@ def draw_rows(
     views: Views,
 ) -> "Figure":
     """Draw rows of panels; all boxes are whole pixels, so that pictures are not resampled."""
-    found = {hemi: _Surface.build(one, shapes.get(hemi[0]), hemi[0]) for hemi, one in sides.items()}
+    found = {
+        hemi: _Surface.build(fitted, shapes.get(hemi[0]), hemi[0]) for hemi, fitted in sides.items()
+    }
     surfaces = {hemi: surface for hemi, surface in found.items() if surface is not None}
     page_width = TWO_COLUMNS if len(sides) > 1 and surfaces else ONE_COLUMN
     space = (page_width - _LEFT - _RIGHT - _BETWEEN * (len(sides) - 1)) / len(sides)
     n_flat, n_views = int(any(map(_unfolded, sides.values()))), 2 * bool(surfaces)
     unit = (space - _GAP * (n_flat + n_views - 1)) / (n_flat + _VIEW_WIDTH * n_views)
-    most = (_TALLEST - _TOP - _BOTTOM) / len(rows) - _HEAD
-    unit = min(unit, most)
+    tallest = (_TALLEST - _TOP - _BOTTOM) / len(rows) - _HEAD
+    unit = min(unit, tallest)
     upright = _UPRIGHT if parts_of(cohort.y) is None else _LONG
-    height = round(min(unit * upright, most) * MM)
+    height = round(min(unit * upright, tallest) * MM)
     size = height, round(_VIEW_WIDTH * unit * MM)
     scale = min((surface.fitting(size) for surface in surfaces.values()), default=1.0)
     columns: list[_Column] = []
-    for number, (hemi, one) in enumerate(sides.items()):
+    for number, (hemi, fitted) in enumerate(sides.items()):
         left = (_LEFT + number * (space + _BETWEEN)) * MM
-        if _unfolded(one):
-            mesh = one.maps.mesh
+        if _unfolded(fitted):
+            mesh = fitted.maps.mesh
             ends = X_ENDS if mesh is None else (laid_out(mesh)[2][0], "")
             box = round(left), round(unit * MM)
-            columns.append(_Column(hemi=hemi, one=one, box=box, title="unfolded", ends=ends))
+            columns.append(_Column(hemi=hemi, one=fitted, box=box, title="unfolded", ends=ends))
             left += (unit + _GAP) * MM
         for title, axes in surfaces[hemi].axes.items() if hemi in surfaces else ():
-            key = hemi, title, size, id(one)
+            key = hemi, title, size, id(fitted)
             if key not in views:
                 view = look(surfaces[hemi].mesh, axes, scale, size)
-                views[key] = Seen.build(view, one)
+                views[key] = Seen.build(view, fitted)
             # The right side's lateral is to the right in the scanner, and the left one's is not.
             turned = (axes[0, 0] > 0) != (hemi == "R")
             medial, lateral = (f"{word[:3]}." for word in X_ENDS)
             ends = (lateral, medial) if turned else (medial, lateral)
             box = round(left), size[1]
             columns.append(
-                _Column(hemi=hemi, one=one, box=box, title=title, ends=ends, seen=views[key])
+                _Column(hemi=hemi, one=fitted, box=box, title=title, ends=ends, seen=views[key])
             )
             left += size[1] + _GAP * MM
     pixels = (
@@ -411,8 +415,8 @@ def draw_rows(
 def _write_heads(paper: _Paper, columns: Sequence[_Column]) -> None:
     """Name sides and columns."""
     for hemi in dict.fromkeys(column.hemi for column in columns):
-        own = [column.box for column in columns if column.hemi == hemi]
-        middle = (own[0][0] + sum(own[-1])) / 2
+        boxes = [column.box for column in columns if column.hemi == hemi]
+        middle = (boxes[0][0] + sum(boxes[-1])) / 2
         paper.text(middle, 3.4 * MM, SIDES[hemi].capitalize(), fontsize=TITLE, weight="bold")
     for column in columns:
         left, width = column.box
@@ -481,11 +485,11 @@ def _draw_row(
 
 
 def _draw_sheet(
-    axes: "Axes", cohort: Cohort, one: FittedMaps, values: Float, scale: Mapping[str, Any]
+    axes: "Axes", cohort: Cohort, fitted: FittedMaps, values: Float, scale: Mapping[str, Any]
 ) -> None:
     """Draw a map of the sheet, and borders and names of the most frequent subfields."""
     x, y = cohort.x, cohort.y
-    fields = one.subfield
+    fields = fitted.subfield
     edges = _beyond(x), _beyond(y)
     extent = *edges[0][[0, -1]], *edges[1][[0, -1]]
     image = values.reshape(fields.shape).T
@@ -497,14 +501,14 @@ def _draw_sheet(
         if y[0] < end < y[-1]:
             axes.axhline(end, color="black", linewidth=_FIELD_LINE, linestyle=(0, (4, 2)))
     width = axes.bbox.width * 72 / axes.figure.dpi  # points
-    for number, name in enumerate(one.maps.names):
-        own = fields == number
-        if not own.any():
+    for number, name in enumerate(fitted.maps.names):
+        field = fields == number
+        if not field.any():
             continue
-        if not own.all():
-            axes.contour(*edges, np.pad(own, 1, mode="edge").T.astype(np.float64), **line)
-        at = x[np.nonzero(own)[0]].mean()
-        room = own[:, : len(y) // 3].sum() / (len(y) // 3) / len(x) * width
+        if not field.all():
+            axes.contour(*edges, np.pad(field, 1, mode="edge").T.astype(np.float64), **line)
+        at = x[np.nonzero(field)[0]].mean()
+        room = field[:, : len(y) // 3].sum() / (len(y) // 3) / len(x) * width
         upright = len(name) * _LETTER_WIDTH * SMALL > room
         axes.text(
             at, y[0], name, fontsize=SMALL, ha="center", va="bottom", rotation=90 * upright,
@@ -512,20 +516,20 @@ def _draw_sheet(
         )  # fmt: skip
 
 
-def _enclose(axes: "Axes", cohort: Cohort, one: FittedMaps, survive: Bool) -> None:
+def _enclose(axes: "Axes", cohort: Cohort, fitted: FittedMaps, survive: Bool) -> None:
     """Draw a line round the points that survive."""
     if not survive.any():
         return
     line: Any = {"levels": [_HALF], "colors": "black", "linewidths": _FOUND_LINE}
-    if one.maps.mesh is not None:
+    if fitted.maps.mesh is not None:
         from matplotlib.tri import Triangulation  # noqa: PLC0415  (slow to load)
 
-        plane, triangles, _ = laid_out(one.maps.mesh)
-        where = Triangulation(plane[:, 0], plane[:, 1], triangles)
-        axes.tricontour(where, survive.ravel().astype(np.float64), **line)
+        plane, triangles, _ = laid_out(fitted.maps.mesh)
+        grid = Triangulation(plane[:, 0], plane[:, 1], triangles)
+        axes.tricontour(grid, survive.ravel().astype(np.float64), **line)
         return
     # Closed where it meets the edges of the sheet.
-    closed = np.pad(survive.reshape(one.maps.shape), 1).astype(np.float64)
+    closed = np.pad(survive.reshape(fitted.maps.shape), 1).astype(np.float64)
     axes.contour(_beyond(cohort.x), _beyond(cohort.y), closed.T, **line)
 
 

@@ -149,9 +149,9 @@ class SideResult:
 
 def templates_of(sides: Mapping[str, SideResult]) -> dict[str, Any] | None:
     """Write the templates of registration for ``template.json``; ``None`` without registration."""
-    found = {hemi: side.registration.template for hemi, side in sides.items()}
-    known = {hemi: template for hemi, template in found.items() if template is not None}
-    return templates_to_json(known) if known else None
+    templates = {hemi: side.registration.template for hemi, side in sides.items()}
+    registered = {hemi: template for hemi, template in templates.items() if template is not None}
+    return templates_to_json(registered) if registered else None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -194,16 +194,16 @@ class Analysis:
 
 def tested_maps(analysis: Analysis) -> Iterator[tuple[MapKey, PointTest, Discoveries]]:
     """Tests of all maps, with what survives correction."""
-    for hemi, one in analysis.fitted.items():
-        for measure, fit in one.fits.items():
+    for hemi, fitted in analysis.fitted.items():
+        for measure, fit in fitted.fits.items():
             for test in fit.tests:
                 key = MapKey(measure, test.contrast.name, hemi)
                 yield key, test, analysis.found[key]
 
 
-def rows_of(analysis: Analysis, one: FittedMaps) -> pd.DataFrame:
+def rows_of(analysis: Analysis, fitted: FittedMaps) -> pd.DataFrame:
     """Rows of the model's table of the sheets that were used."""
-    return analysis.compared.table.iloc[one.maps.rows[one.used]]
+    return analysis.compared.table.iloc[fitted.maps.rows[fitted.used]]
 
 
 def members_of(analysis: Analysis, table: pd.DataFrame) -> Mapping[str, NDArray[np.bool_]]:
@@ -214,27 +214,27 @@ def members_of(analysis: Analysis, table: pd.DataFrame) -> Mapping[str, NDArray[
     return {level: (names == level).to_numpy() for level in analysis.groups.levels}
 
 
-def profiles_of(maps: Mapping[str, Float], name: str, own: Bool) -> Float:
+def profiles_of(maps: Mapping[str, Float], name: str, rows: Bool) -> Float:
     """(sheets, x) means over y of some sheets of a map."""
     return np.concatenate(
-        [arrays.mean_of_known(part, 2) for part in arrays.parts_of_sheets(maps, name, own)]
+        [arrays.mean_of_known(part, 2) for part in arrays.parts_of_sheets(maps, name, rows)]
     )
 
 
 def digests(registrations: Mapping[str, alignment.Registration]) -> dict[str, str]:
     """Digest of the template by hemisphere, or ``none`` without registration."""
-    found = {}
-    for hemi, one in registrations.items():
-        found[hemi] = "none"
-        if one.template is not None:
-            text = json.dumps(templates_to_json({hemi: one.template}), sort_keys=True)
-            found[hemi] = hashlib.sha256(text.encode()).hexdigest()
-    return found
+    digest_of = {}
+    for hemi, registration in registrations.items():
+        digest_of[hemi] = "none"
+        if registration.template is not None:
+            text = json.dumps(templates_to_json({hemi: registration.template}), sort_keys=True)
+            digest_of[hemi] = hashlib.sha256(text.encode()).hexdigest()
+    return digest_of
 
 
-def harmonization_record(done: Harmonization, groups: Groups | None) -> dict[str, Any]:
+def harmonization_record(harmonization: Harmonization, groups: Groups | None) -> dict[str, Any]:
     """Record what was taken out and kept."""
-    plan = done.plan
+    plan = harmonization.plan
     return {
         "column": plan.column,
         "participants": dict(plan.counts),
@@ -244,7 +244,7 @@ def harmonization_record(done: Harmonization, groups: Groups | None) -> dict[str
         "explained": dict(plan.explained),
         "icv": plan.icv,
         "repeated": plan.visits.participant is not None,
-        "classified": groups is not None and not done.leaks(groups.column),
+        "classified": groups is not None and not harmonization.leaks(groups.column),
     }
 
 
@@ -253,13 +253,13 @@ def effects_of(parts: Sequence[Harmonization], templates: Mapping[str, str]) -> 
     plan = parts[0].plan
     if not plan.kept.portable:
         return None
-    known = plan.saved.sites if plan.saved else {}
+    known_sites = plan.saved.sites if plan.saved else {}
     return SavedEffects(
         column=plan.column,
         formula=plan.kept.formula,
-        levels={name: list(known) for name, known in plan.kept.levels.items()},
+        levels={name: list(known_sites) for name, known_sites in plan.kept.levels.items()},
         columns=list(plan.kept.names),
-        sites={one: known.get(one, plan.counts.get(one, 0)) for one in plan.sites},
+        sites={one: known_sites.get(one, plan.counts.get(one, 0)) for one in plan.sites},
         repeated=plan.visits.participant is not None,
         icv=plan.icv,
         templates=dict(templates),
@@ -283,7 +283,7 @@ class RetestCohort:
         """Arrange values of visits as (participants, sessions, points); NaN where missing."""
         visits = self.cohort.table.iloc[rows]
         filled = np.full((len(self.participants), len(self.sessions), values.shape[1]), np.nan)
-        who = np.searchsorted(self.participants, visits[PARTICIPANT].astype(str))
-        when = np.searchsorted(self.sessions, visits[SESSION].astype(str))
-        filled[who, when] = values
+        participant = np.searchsorted(self.participants, visits[PARTICIPANT].astype(str))
+        session = np.searchsorted(self.sessions, visits[SESSION].astype(str))
+        filled[participant, session] = values
         return filled

@@ -73,7 +73,7 @@ class SavedEffects(TomlTable):
 
     def _effects(self, nested: foreign.Nested) -> dict[Key, SiteEffects]:
         rows = {"slopes": {len(self.columns), len(self.columns) + (self.icv is not None)}}
-        found = {}
+        effects = {}
         for hemi, measures in nested.items():
             for measure, entry in measures.items():
                 try:
@@ -84,15 +84,15 @@ class SavedEffects(TomlTable):
                 own["slopes"] = own["slopes"].reshape(-1, points)  # without columns: (0,)
                 for name, values in own.items():
                     counts = rows.get(name, {len(self.sites)})
-                    known = {(points,)} if name in _FLAT else {(row, points) for row in counts}
-                    if values.shape not in known:
+                    shapes = {(points,)} if name in _FLAT else {(row, points) for row in counts}
+                    if values.shape not in shapes:
                         raise ValueError(f"{name} of {measure}, {hemi}, has {values.shape}")
                     if np.isinf(values).any():
                         raise ValueError(f"{name} of {measure}, {hemi}, is infinite")
                     if name in {"sd", "scale"} and (values <= 0).any():
                         raise ValueError(f"{name} of {measure}, {hemi}, is not positive")
-                found[hemi, measure] = SiteEffects(**own)
-        return found
+                effects[hemi, measure] = SiteEffects(**own)
+        return effects
 
 
 def load_effects(path: Path) -> SavedEffects:
@@ -108,10 +108,10 @@ def load_effects(path: Path) -> SavedEffects:
         raise damaged(str(path), str(error)) from error
 
 
-def damaged(where: str, what: str) -> ModelError:
+def damaged(source: str, problem: str) -> ModelError:
     """Say that a file cannot be used."""
     return ModelError(
-        f"{where}: not a file of harmonization ({what}); use the harmonization.json of another"
+        f"{source}: not a file of harmonization ({problem}); use the harmonization.json of another"
         " analysis"
     )
 
@@ -193,7 +193,7 @@ class NormsFile(TomlTable):
         if not (np.diff(knots) > 0).all():
             raise ValueError("knots of age do not ascend")
         rows = {"mean": len(knots) + max(len(self.sexes) - 1, 0), "spread": 2, "shape": 2}
-        found = {}
+        norms = {}
         for hemi, measures in self.norms.items():
             for measure, entry in measures.items():
                 lengths = {len(row) for _, value in entry for row in value}
@@ -201,11 +201,13 @@ class NormsFile(TomlTable):
                     len(value) != rows.get(name, len(self.sites)) for name, value in entry
                 ):
                     raise ValueError(f"numbers of {measure}, {hemi}, that do not fit each other")
-                own = {name: np.array(value, dtype=np.float64) for name, value in entry}
-                found[str(hemi), measure] = Norms(knots=knots, **{**own, "n": own["n"].astype(int)})
+                values = {name: np.array(value, dtype=np.float64) for name, value in entry}
+                norms[str(hemi), measure] = Norms(
+                    knots=knots, **{**values, "n": values["n"].astype(int)}
+                )
         if self.hash != _digest(self.model_dump()):
             raise ValueError("changed after it was written")
-        return found
+        return norms
 
 
 def save_norms(path: Path, file: NormsFile, norms: Mapping[Key, Norms]) -> None:
@@ -281,19 +283,19 @@ class _SavedTemplate(TomlTable):
         return self
 
 
-def templates_from_json(content: Mapping[str, Any], where: str) -> dict[str, Template]:
+def templates_from_json(content: Mapping[str, Any], source: str) -> dict[str, Template]:
     """Read what :func:`templates_to_json` wrote."""
     try:
-        found = {}
+        templates = {}
         for hemi, entry in content["Hemispheres"].items():
             values = dict(foreign.checked_foreign(entry, _SavedTemplate))
             values |= {name: np.array(values[name], dtype=np.float64) for name in _TEMPLATE_ARRAYS}
             if values[_INFINITE] is None:
                 values[_INFINITE] = np.inf
-            found[str(hemi)] = Template(**values)
+            templates[str(hemi)] = Template(**values)
     except (KeyError, AttributeError, TypeError, ValueError) as error:
-        what = error if isinstance(error, ValueError) else "it has no Hemispheres"
+        problem = error if isinstance(error, ValueError) else "it has no Hemispheres"
         raise ModelError(
-            f"{where}: not a template: {what}; use the template.json of another analysis"
+            f"{source}: not a template: {problem}; use the template.json of another analysis"
         ) from error
-    return found
+    return templates

@@ -57,20 +57,20 @@ def average_shape(
     warps: Float,
     members: Mapping[str, NDArray[np.bool_]],
     *,
-    known: NDArray[np.bool_] | None = None,
+    visible: NDArray[np.bool_] | None = None,
 ) -> AverageShape:
     """Average surfaces at registered nodes, after rigid alignment (generalized Procrustes).
 
     Each middle surface is rotated and moved to the mean of all, iteratively (Gower 1975), and the
     walls with it; nothing is scaled or mirrored. ``layers`` (sheets, 3, x, y, 3) are the surfaces
-    in mm, NaN where missing; ``known`` (sheets, x, y) tells which registered nodes have a value.
+    in mm, NaN where missing; ``visible`` (sheets, x, y) tells which registered nodes have a value.
     """
     n, _, nx, ny, _ = layers.shape
     # Along x, so that all other axes count as one.
     flat = np.moveaxis(layers, 2, 1).reshape(n, nx, -1)
     registered = np.moveaxis(warp_values(flat, warps).reshape(n, nx, len(LAYERS), ny, 3), 1, 2)
-    if known is not None:
-        registered = np.where(known[:, None, :, :, None], registered, np.nan)
+    if visible is not None:
+        registered = np.where(visible[:, None, :, :, None], registered, np.nan)
     middle = registered[:, _MIDDLE].reshape(n, -1, 3)
     rotations, centers, center = align_rigidly(middle)
     moved = registered.reshape(n, -1, 3) - centers[:, None]
@@ -104,8 +104,8 @@ def align_rigidly(points: Float) -> tuple[Float, Float, Float]:
         if np.abs(mean - before).max() < ALIGNMENT_TOLERANCE:
             break
     # Undo the mean rotation, so that the mean is oriented as the shapes were.
-    back = _nearest_rotation(rotations.mean(axis=0))
-    return back.T @ rotations, centers, centers.mean(axis=0)
+    inverse = _nearest_rotation(rotations.mean(axis=0))
+    return inverse.T @ rotations, centers, centers.mean(axis=0)
 
 
 def _nearest_rotation(matrix: Float) -> Float:
@@ -117,16 +117,16 @@ def _nearest_rotation(matrix: Float) -> Float:
 
 def _read_layers(places: Sequence[ResultPlace], shape: tuple[int, int]) -> tuple[list[int], Float]:
     """Read the surfaces (sheets, 3, x, y, 3) in mm of the sheets that have all of them."""
-    found, layers = [], []
+    read_rows, layers = [], []
     for i, place in enumerate(places):
         try:
             surfaces = [gifti.read_mesh(place.path(key)).points for key in _KEYS]
         except InputError:  # maps and statistics do without it
             continue
         if all(surface.shape == (shape[0] * shape[1], 3) for surface in surfaces):
-            found.append(i)
+            read_rows.append(i)
             layers.append(np.stack(surfaces).reshape(len(_KEYS), *shape, 3))
-    return found, np.array(layers, dtype=np.float64).reshape(-1, len(_KEYS), *shape, 3)
+    return read_rows, np.array(layers, dtype=np.float64).reshape(-1, len(_KEYS), *shape, 3)
 
 
 def average_shapes(
@@ -139,21 +139,21 @@ def average_shapes(
     for hemi, side in analysis.sides.items() if records else ():
         visits = cohort.table.iloc[side.registered.rows]
         first = np.flatnonzero(~visits[PARTICIPANT].duplicated().to_numpy())
-        most = min(len(first), settings.shapes.most)
-        chosen = first[np.linspace(0, len(first) - 1, most).round().astype(np.int64)]
-        keys = [(str(name), hemi) for name in visits.index[chosen]]
-        chosen = chosen[[key in place_of for key in keys]]
+        count = min(len(first), settings.shapes.most)
+        rows = first[np.linspace(0, len(first) - 1, count).round().astype(np.int64)]
+        keys = [(str(name), hemi) for name in visits.index[rows]]
+        rows = rows[[key in place_of for key in keys]]
         places = [place_of[key] for key in keys if key in place_of]
         read, layers = _read_layers(places, side.registered.shape)
         if not read:
             continue
-        own = chosen[read]
-        members = members_of(analysis, visits.iloc[own])
-        warps = side.registration.warps[own]
-        known = None
+        rows_read = rows[read]
+        members = members_of(analysis, visits.iloc[rows_read])
+        warps = side.registration.warps[rows_read]
+        visible = None
         if parts_of(cohort.y) is not None:  # nodes without values have positions for display alone
-            known = np.isfinite(next(iter(side.registered.maps.values()))[own])
-        shapes[hemi] = average_shape(layers, warps, members, known=known)
+            visible = np.isfinite(next(iter(side.registered.maps.values()))[rows_read])
+        shapes[hemi] = average_shape(layers, warps, members, visible=visible)
     return shapes
 
 

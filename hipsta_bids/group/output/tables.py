@@ -100,10 +100,10 @@ def _stacked(blocks: Iterable[Columns]) -> pd.DataFrame:
 
 
 def _statistics(cohort: Cohort, analysis: results.Analysis) -> Iterator[Named]:
-    for key, test, found in results.tested_maps(analysis):
-        one = analysis.fitted[key.hemi]
+    for key, test, discoveries in results.tested_maps(analysis):
+        fitted = analysis.fitted[key.hemi]
         values = columns.point_columns(
-            test, found, columns.frame_of(cohort, one), one.fits[key.measure].n
+            test, discoveries, columns.frame_of(cohort, fitted), fitted.fits[key.measure].n
         )
         yield map_name(key.hemi, key.measure, key.contrast), pd.DataFrame(values)
 
@@ -111,23 +111,23 @@ def _statistics(cohort: Cohort, analysis: results.Analysis) -> Iterator[Named]:
 def _peaks(
     cohort: Cohort, analysis: results.Analysis, settings: GroupSettings
 ) -> Iterator[Columns]:
-    for key, test, found in results.tested_maps(analysis):
-        one = analysis.fitted[key.hemi]
-        edges = edges_of(one.maps, settings.multiplicity.neighbors)
-        peaks = columns.peak_table(test, found, columns.frame_of(cohort, one), edges)
+    for key, test, discoveries in results.tested_maps(analysis):
+        fitted = analysis.fitted[key.hemi]
+        edges = edges_of(fitted.maps, settings.multiplicity.neighbors)
+        peaks = columns.peak_table(test, discoveries, columns.frame_of(cohort, fitted), edges)
         yield {"measure": key.measure, "hemi": key.hemi, **peaks}
 
 
 def _means(cohort: Cohort, analysis: results.Analysis) -> Iterator[Columns]:
     """Means and standard deviations of groups at each point of the maps that were fitted."""
-    for hemi, one in analysis.fitted.items():
-        frame = columns.frame_of(cohort, one)
-        rows = results.rows_of(analysis, one)
+    for hemi, fitted in analysis.fitted.items():
+        frame = columns.frame_of(cohort, fitted)
+        rows = results.rows_of(analysis, fitted)
         people = rows[PARTICIPANT].to_numpy()
         members = results.members_of(analysis, rows)
-        for measure in one.fits:
-            for group, own in members.items():
-                known, mean, sd = describe_known(one.parts(measure, own))
+        for measure in fitted.fits:
+            for group, member in members.items():
+                finite, mean, sd = describe_known(fitted.parts(measure, member))
                 yield {
                     "measure": measure,
                     "unit": cohort.units.get(measure, "1"),
@@ -135,7 +135,7 @@ def _means(cohort: Cohort, analysis: results.Analysis) -> Iterator[Columns]:
                     "group": group,
                     **frame.number,
                     **frame.position,
-                    "n": participants_with(known, people[own]),
+                    "n": participants_with(finite, people[member]),
                     "mean": mean,
                     "sd": sd,
                 }
@@ -146,10 +146,10 @@ def _profiles(cohort: Cohort, analysis: results.Analysis) -> Iterator[Columns]:
         for registered, source in ((False, cohort.sides[hemi]), (True, side.registered)):
             members = results.members_of(analysis, cohort.table.iloc[source.rows])
             for measure in source.maps:
-                for group, own in members.items():
-                    values = results.profiles_of(source.maps, measure, own)
-                    known, mean, sd = describe_known([values])
-                    count = known.sum(axis=0)
+                for group, member in members.items():
+                    values = results.profiles_of(source.maps, measure, member)
+                    finite, mean, sd = describe_known([values])
+                    count = finite.sum(axis=0)
                     yield {
                         "measure": measure,
                         "unit": cohort.units.get(measure, "1"),
@@ -174,17 +174,17 @@ def _overview(analysis: results.Analysis) -> pd.DataFrame:
 
 
 def _measures(cohort: Cohort, analysis: results.Analysis) -> Iterator[Columns]:
-    for one in analysis.measures:
-        for test in one.fit.tests:
+    for fit in analysis.measures:
+        for test in fit.fit.tests:
             yield {
-                "hemi": one.hemi,
-                "measure": one.measures,
-                "unit": [cohort.units.get(name, "1") for name in one.measures],
-                "model": one.formula,
+                "hemi": fit.hemi,
+                "measure": fit.measures,
+                "unit": [cohort.units.get(name, "1") for name in fit.measures],
+                "model": fit.formula,
                 "contrast": test.contrast.name,
                 "test": test.kind,
-                "n": one.participants,
-                "visits": one.fit.n,
+                "n": fit.participants,
+                "visits": fit.fit.n,
                 **columns.test_columns(test),
                 "p_fdr": np.nan,
                 **columns.effect_columns(test),
@@ -193,11 +193,11 @@ def _measures(cohort: Cohort, analysis: results.Analysis) -> Iterator[Columns]:
 
 def with_fdr(table: pd.DataFrame, settings: GroupSettings) -> pd.DataFrame:
     """Correct the tests of one contrast for the number of measures, sides and models."""
-    how = settings.multiplicity
-    method = "bh" if how.method == "bh" else "fdr2"
+    rules = settings.multiplicity
+    method = "bh" if rules.method == "bh" else "fdr2"
     for _, rows in table.groupby("contrast", sort=False):
-        found = control_fdr(rows["p"].to_numpy(dtype=np.float64), how.alpha, method)
-        table.loc[rows.index, "p_fdr"] = found.adjusted
+        discoveries = control_fdr(rows["p"].to_numpy(dtype=np.float64), rules.alpha, method)
+        table.loc[rows.index, "p_fdr"] = discoveries.adjusted
     return table
 
 
@@ -211,15 +211,15 @@ def _descriptives(analysis: results.Analysis) -> Iterator[Columns]:
         values = summary_values(cohort, hemi, analysis.measured.summaries)
         values = values.iloc[first]
         for group, rows in members.items():
-            own = values[rows]
+            values_here = values[rows]
             yield {
                 "hemi": hemi,
                 "group": group,
-                "measure": own.columns,
-                "unit": [cohort.units.get(str(name), "1") for name in own.columns],
-                "n": own.notna().sum().to_numpy(),
-                "mean": own.mean().to_numpy(),
-                "sd": own.std().to_numpy(),
+                "measure": values_here.columns,
+                "unit": [cohort.units.get(str(name), "1") for name in values_here.columns],
+                "n": values_here.notna().sum().to_numpy(),
+                "mean": values_here.mean().to_numpy(),
+                "sd": values_here.std().to_numpy(),
             }
 
 
@@ -250,27 +250,31 @@ def registration_tables(cohort: Cohort, sides: Mapping[str, results.SideResult])
     yield "warps", _stacked(_warps(cohort, sides))
 
 
-def _difference(found: ShiftDifference | None) -> Columns:
-    if found is None:
+def _difference(difference: ShiftDifference | None) -> Columns:
+    if difference is None:
         return {}
-    return {"difference": found.largest, "difference_node": found.node + 1, "difference_p": found.p}
+    return {
+        "difference": difference.largest,
+        "difference_node": difference.node + 1,
+        "difference_p": difference.p,
+    }
 
 
 def _alignment(analysis: results.Analysis) -> pd.DataFrame:
     """One row per map: points that survive with and without registration."""
     rows = []
-    for key, found in analysis.found.items():
-        other = analysis.unregistered.get(key)
-        if other is not None:
+    for key, discoveries in analysis.found.items():
+        before = analysis.unregistered.get(key)
+        if before is not None:
             rows.append(
                 {
                     "measure": key.measure,
                     "contrast": key.contrast,
                     "hemi": key.hemi,
-                    "n_tests": found.n_tests,
-                    "n_significant": int(found.rejected.sum()),
-                    "n_unregistered": int(other.rejected.sum()),
-                    "n_both": int((found.rejected & other.rejected).sum()),
+                    "n_tests": discoveries.n_tests,
+                    "n_significant": int(discoveries.rejected.sum()),
+                    "n_unregistered": int(before.rejected.sum()),
+                    "n_both": int((discoveries.rejected & before.rejected).sum()),
                 }
             )
     return pd.DataFrame(rows)
@@ -304,17 +308,17 @@ def _shifts(analysis: results.Analysis) -> Iterator[Columns]:
 
 
 def _sites(name: str, cohort: Cohort, analysis: results.Analysis) -> Iterator[Named]:
-    done = analysis.harmonization
-    if done is not None and (rows := list(_site_rows(done, cohort.units))):
+    harmonization = analysis.harmonization
+    if harmonization is not None and (rows := list(_site_rows(harmonization, cohort.units))):
         yield name, pd.DataFrame(rows)
 
 
-def _site_rows(done: results.Harmonization, units: Mapping[str, str]) -> Iterator[Columns]:
+def _site_rows(harmonization: results.Harmonization, units: Mapping[str, str]) -> Iterator[Columns]:
     """List shifts and scales of sites: means over the points of a map, or of a summary measure."""
-    for kind, part in (("map", done.maps), ("summary", done.summaries)):
+    for kind, part in (("map", harmonization.maps), ("summary", harmonization.summaries)):
         for (hemi, measure), (effects, moments) in part.items():
             shift, after = effects.shift * effects.sd, moments.after(effects)
-            for number, site in enumerate(done.plan.sites):
+            for number, site in enumerate(harmonization.plan.sites):
                 if moments.n[number].any():
                     yield {
                         "measure": measure,
@@ -322,7 +326,7 @@ def _site_rows(done: results.Harmonization, units: Mapping[str, str]) -> Iterato
                         "kind": kind,
                         "hemi": hemi,
                         "site": site,
-                        "estimated": site in done.plan.estimated,
+                        "estimated": site in harmonization.plan.estimated,
                         "n": int(moments.n[number].max()),
                         "site_shift": _mean_known(shift[number]),
                         "site_shift_rms": _root_mean_square(shift[number]),
@@ -345,9 +349,9 @@ def _root_mean_square(values: Float) -> float:
 def _curves(analysis: results.Analysis, curve: CurveOf) -> Iterator[Columns]:
     """Curves of both models of each comparison."""
     for hemi, measure, pair in analysis.pairs:
-        what = {"hemi": hemi, "control": pair.control, "case": pair.case, "added": measure}
+        labels = {"hemi": hemi, "control": pair.control, "case": pair.case, "added": measure}
         for classifier, result in (("base", pair.comparison.base), ("full", pair.comparison.full)):
-            yield {**what, "classifier": classifier, **curve(result)}
+            yield {**labels, "classifier": classifier, **curve(result)}
 
 
 def _roc(result: ClassifierResult) -> Columns:
@@ -355,14 +359,14 @@ def _roc(result: ClassifierResult) -> Columns:
 
 
 def _calibration(result: ClassifierResult) -> Columns:
-    found = result.calibration
-    return {"predicted": found.predicted, "observed": found.observed}
+    calibration = result.calibration
+    return {"predicted": calibration.predicted, "observed": calibration.observed}
 
 
 def _classification(analysis: results.Analysis, settings: GroupSettings) -> pd.DataFrame:
     rows: list[dict[str, object]] = []
     for hemi, measure, pair in analysis.pairs:
-        found = pair.comparison
+        comparison = pair.comparison
         rows.append(
             {
                 "hemi": hemi,
@@ -370,28 +374,28 @@ def _classification(analysis: results.Analysis, settings: GroupSettings) -> pd.D
                 "case": pair.case,
                 "base": " + ".join(settings.classification.base),
                 "added": measure,
-                "n": found.n,
-                "n_cases": found.n_cases,
+                "n": comparison.n,
+                "n_cases": comparison.n_cases,
                 "n_incomplete": pair.n_incomplete,
-                **_areas("base", found.base),
-                **_areas("full", found.full),
-                "calibration_intercept": found.full.calibration.intercept,
-                "calibration_slope": found.full.calibration.slope,
-                "brier": found.full.calibration.brier,
-                "likelihood_ratio": found.likelihood_ratio,
-                "lr_df": found.df,
-                "p": found.p,
-                "separated": found.separated,
+                **_areas("base", comparison.base),
+                **_areas("full", comparison.full),
+                "calibration_intercept": comparison.full.calibration.intercept,
+                "calibration_slope": comparison.full.calibration.slope,
+                "brier": comparison.full.calibration.brier,
+                "likelihood_ratio": comparison.likelihood_ratio,
+                "lr_df": comparison.df,
+                "p": comparison.p,
+                "separated": comparison.separated,
             }
         )
     return pd.DataFrame(rows)
 
 
-def _areas(which: str, result: ClassifierResult) -> dict[str, float]:
+def _areas(name: str, result: ClassifierResult) -> dict[str, float]:
     return {
-        f"auc_{which}": result.auc.area,
-        f"auc_{which}_low": result.auc.low,
-        f"auc_{which}_high": result.auc.high,
-        f"auc_{which}_cv": result.cross_validation.auc,
-        f"auc_{which}_cv_sd": result.cross_validation.auc_sd,
+        f"auc_{name}": result.auc.area,
+        f"auc_{name}_low": result.auc.low,
+        f"auc_{name}_high": result.auc.high,
+        f"auc_{name}_cv": result.cross_validation.auc,
+        f"auc_{name}_cv_sd": result.cross_validation.auc_sd,
     }

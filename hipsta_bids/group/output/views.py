@@ -78,8 +78,8 @@ class View:
         """(rows, columns) line round a region, of a width in pixels shown, on the same fold."""
         hidden = self.outline | ~self.seen
         line = np.zeros(region.shape, dtype=bool)
-        for here, there in (_DOWN, _RIGHT):
-            line[here] |= (region[here] != region[there]) & ~hidden[here] & ~hidden[there]
+        for first, second in (_DOWN, _RIGHT):
+            line[first] |= (region[first] != region[second]) & ~hidden[first] & ~hidden[second]
         return _thick(line, width) & self.seen
 
     def picture(self, colors: Float, lines: Bool) -> NDArray[np.uint8]:
@@ -120,14 +120,16 @@ def look(mesh: Mesh, axes: Float, scale: float, shape: tuple[int, int]) -> View:
     picture in pixels, whose middle is the surface's.
     """
     rows, columns = (n * _FINER for n in shape)
-    seen = mesh.points @ axes.T * (scale * _FINER)
-    seen -= (seen.min(axis=0) + seen.max(axis=0)) / 2
-    flat = np.stack([seen[:, 0] + columns / 2, rows / 2 - seen[:, 1]], axis=1)[mesh.triangles]
+    projected = mesh.points @ axes.T * (scale * _FINER)
+    projected -= (projected.min(axis=0) + projected.max(axis=0)) / 2
+    flat = np.stack([projected[:, 0] + columns / 2, rows / 2 - projected[:, 1]], axis=1)[
+        mesh.triangles
+    ]
     nearest = np.full(rows * columns, -np.inf)
     triangle = np.full(rows * columns, -1, dtype=np.int64)
     weights = np.zeros((rows * columns, 3))
     for numbers, pixels, own in _covered(flat, rows, columns):
-        depth = np.einsum("pc,pc->p", seen[mesh.triangles[numbers], 2], own)
+        depth = np.einsum("pc,pc->p", projected[mesh.triangles[numbers], 2], own)
         # Of those given to one pixel the last stays: the nearest.
         order = np.argsort(depth, kind="stable")
         order = order[depth[order] > nearest[pixels[order]]]
@@ -178,10 +180,10 @@ def _cross(a: Float, b: Float) -> Float:
 def _normals(mesh: Mesh) -> Float:
     """(points, 3) normals, of the triangles round each point weighted by their areas."""
     a, b, c = (mesh.points[mesh.triangles[:, corner]] for corner in range(3))
-    own = np.cross(b - a, c - a)
+    face_normals = np.cross(b - a, c - a)
     total = np.zeros_like(mesh.points)
     for corner in range(3):
-        np.add.at(total, mesh.triangles[:, corner], own)
+        np.add.at(total, mesh.triangles[:, corner], face_normals)
     return total
 
 
@@ -217,17 +219,17 @@ def _thick(line: Bool, width: float) -> Bool:
 def draw_mesh(axes: "Axes", mesh: Mesh, values: Float, scale: Mapping[str, Any]) -> None:
     """Draw a map on a flat surface, in its own coordinates."""
     plane, triangles, words = laid_out(mesh)
-    known = np.isfinite(values.ravel()[triangles]).all(axis=1)
+    finite = np.isfinite(values.ravel()[triangles]).all(axis=1)
     axes.set_aspect("equal")
     axes.set_ylabel(words[1], labelpad=2)
     (left, bottom), (right, top) = plane.min(axis=0), plane.max(axis=0)
-    if known.any():
-        some = triangles[known]
-        colors = values.ravel()[some].mean(axis=1)
+    if finite.any():
+        faces = triangles[finite]
+        colors = values.ravel()[faces].mean(axis=1)
         axes.tripcolor(
             plane[:, 0],
             plane[:, 1],
-            triangles=some,
+            triangles=faces,
             facecolors=colors,
             **scale,
             edgecolors="none",

@@ -62,15 +62,15 @@ def model_folder(root: Path, name: str) -> contextlib.AbstractContextManager[Pat
 def whole_folder(path: Path) -> Iterator[Path]:
     """Make a folder to write into, which is renamed to its final name if all went well."""
     parent, name = path.parent, path.name
-    aside = parent / f".{name}.{os.getpid()}.tmp"
+    scratch = parent / f".{name}.{os.getpid()}.tmp"
     files.make_folder(parent)
     try:
-        aside.mkdir()
+        scratch.mkdir()
         try:
-            yield aside
-            _replace(aside, path)
+            yield scratch
+            _replace(scratch, path)
         except BaseException:
-            shutil.rmtree(aside, ignore_errors=True)
+            shutil.rmtree(scratch, ignore_errors=True)
             raise
         # What runs that were killed have left.
         for left in parent.glob(f".{name}.*.tmp"):
@@ -79,12 +79,12 @@ def whole_folder(path: Path) -> Iterator[Path]:
         raise files.output_error(path, error) from error
 
 
-def _replace(aside: Path, final: Path) -> None:
+def _replace(scratch: Path, final: Path) -> None:
     """Rename over an earlier folder, which cannot be done in one step."""
     old = final.with_name(f".{final.name}.old.{os.getpid()}.tmp")
     if final.exists():
         final.rename(old)
-    aside.rename(final)
+    scratch.rename(final)
     shutil.rmtree(old, ignore_errors=True)
 
 
@@ -363,9 +363,9 @@ def _subfields(side: SideMaps, part: slice) -> pa.Array:
 
 def _write_surfaces(folder: Path, cohort: Cohort, analysis: results.Analysis) -> None:
     """Write the surfaces to draw statistics on."""
-    for hemi, one in analysis.fitted.items():
+    for hemi, fitted in analysis.fitted.items():
         if hemi in cohort.sides:
-            write_surface(folder, cohort, one, hemi)
+            write_surface(folder, cohort, fitted, hemi)
 
 
 #: Maps of one contrast by the value of ``stat-``.
@@ -388,7 +388,7 @@ def stats_of(
 
 def write_stats(folder: Path, maps: Mapping[MapKey, _Stats]) -> None:
     """Write maps of statistics as GIFTI, and those of both sides as one CIFTI file."""
-    together: dict[str, dict[str, _Stats]] = {}
+    grouped: dict[str, dict[str, _Stats]] = {}
     for key, stats in maps.items():
         for stat, values in stats.items():
             stem = tables.map_name(key.hemi, key.measure, key.contrast)
@@ -399,11 +399,11 @@ def write_stats(folder: Path, maps: Mapping[MapKey, _Stats]) -> None:
             files.write_bytes(folder / f"{stem}.shape.gii", content)
         if key.hemi in {"L", "R"}:
             name = tables.map_name("", key.measure, key.contrast)
-            together.setdefault(name, {})[key.hemi] = stats
-    for name, sides in together.items():
+            grouped.setdefault(name, {})[key.hemi] = stats
+    for name, sides in grouped.items():
         names = list(next(iter(sides.values())))
-        both = {hemi: np.stack([own[stat] for stat in names]) for hemi, own in sides.items()}
-        files.write_bytes(folder / f"{name}.dscalar.nii", gifti.cifti_bytes(both, names))
+        stacked = {hemi: np.stack([own[stat] for stat in names]) for hemi, own in sides.items()}
+        files.write_bytes(folder / f"{name}.dscalar.nii", gifti.cifti_bytes(stacked, names))
 
 
 def _write_joint(folder: Path, joint: Sequence[JointMap], settings: GroupSettings) -> None:
@@ -413,31 +413,36 @@ def _write_joint(folder: Path, joint: Sequence[JointMap], settings: GroupSetting
     write_table(
         folder, f"{JOINT}_peaks", joint_peaks(joint, settings), meaning=tables.JOINT_COLUMNS
     )
-    for one in joint:
-        name = tables.map_name(one.key.hemi, one.key.measure, one.key.contrast)
+    for joint_map in joint:
+        name = tables.map_name(joint_map.key.hemi, joint_map.key.measure, joint_map.key.contrast)
         parts = {
             f"p_{title.replace(' ', '_')}": f"p-value of {title} alone, not corrected"
-            for title in one.parts
+            for title in joint_map.parts
         }
-        write_table(folder, name, joint_points(one), meaning={**tables.JOINT_COLUMNS, **parts})
+        write_table(
+            folder, name, joint_points(joint_map), meaning={**tables.JOINT_COLUMNS, **parts}
+        )
     write_stats(
         folder,
-        {one.key: {"z": one.test.statistic, "pcorrected": one.found.adjusted} for one in joint},
+        {
+            joint_map.key: {"z": joint_map.test.statistic, "pcorrected": joint_map.found.adjusted}
+            for joint_map in joint
+        },
     )
 
 
-def write_surface(folder: Path, cohort: Cohort, one: FittedMaps, hemi: str) -> None:
+def write_surface(folder: Path, cohort: Cohort, fitted: FittedMaps, hemi: str) -> None:
     """Write the unfolded sheet, or the surface of other programs' maps."""
-    if one.maps.mesh is not None:
-        space, secondary = next(iter(one.maps.maps)), None
-        points, triangles = one.maps.mesh.points, one.maps.mesh.triangles.astype(np.int32)
+    if fitted.maps.mesh is not None:
+        space, secondary = next(iter(fitted.maps.maps)), None
+        points, triangles = fitted.maps.mesh.points, fitted.maps.mesh.triangles.astype(np.int32)
     else:
         space, secondary = "unfold", "MidThickness"
         nx, ny = len(cohort.x), len(cohort.y)
         points = np.zeros((nx * ny, 3))
         points[:, 0], points[:, 1] = np.repeat(cohort.x, ny), np.tile(cohort.y, nx)
         triangles = gifti.sheet_triangles(nx, ny)
-    flat = one.maps.mesh is None or one.maps.mesh.flat
+    flat = fitted.maps.mesh is None or fitted.maps.mesh.flat
     content = gifti.surface_bytes(points, triangles, hemi=hemi, secondary=secondary, unfolded=flat)
     files.write_bytes(folder / f"hemi-{hemi}_space-{space}_midthickness.surf.gii", content)
 
@@ -454,8 +459,8 @@ def write_scores(
     """Write each participant's scores as maps; those of the sheet also as one Parquet file."""
     for hemi, side in sides.items():
         names = [str(name) for name in table.index[side.rows]]
-        for measure, found in side.scores.items():
-            content = gifti.maps_bytes(found.w.T, hemi=hemi, names=names, series=False)
+        for measure, scored in side.scores.items():
+            content = gifti.maps_bytes(scored.w.T, hemi=hemi, names=names, series=False)
             name = (
                 f"hemi-{hemi}_stat-{letter}_desc-{tables.entity_label(measure)}_statmap.shape.gii"
             )

@@ -140,7 +140,7 @@ def analyze_cohort(
         model,
         design,
         settings,
-        only=measures.summaries,
+        names=measures.summaries,
         references=references,
         icv=icv,
         rows_of=make_rows,
@@ -210,7 +210,7 @@ def analyze_points(
 
 def _check_weights(comparison: designs.Comparison, settings: GroupSettings) -> None:
     """Refuse weights where there is no rule for them."""
-    others = {
+    excluded_by = {
         "--longitudinal": comparison.longitudinal,
         "--paired": comparison.pair,
         "--asymmetry": comparison.asymmetry,
@@ -218,7 +218,7 @@ def _check_weights(comparison: designs.Comparison, settings: GroupSettings) -> N
         "permutations": settings.multiplicity.method in inference.PERMUTATIONS,
         "--joint": settings.joint.measures,
     }
-    wrong = [name for name, given in others.items() if given]
+    wrong = [name for name, given in excluded_by.items() if given]
     if settings.glm.weights != "none" and wrong:
         raise ModelError(
             f"--weights {settings.glm.weights}: not together with {', '.join(wrong)}; leave one out"
@@ -241,10 +241,14 @@ def _fit_cohort(
     dict[inference.MapKey, inference.Discoveries],
 ]:
     """Harmonize, compare sessions, and fit each hemisphere, and left minus right if asked for."""
-    done, maps = None, measures.maps
+    harmonization, maps = None, measures.maps
     if plan is not None:
-        done = harmonize.harmonize_cohort(cohort, plan, settings, measures, registrations or {})
-    compared = data.compare_sessions(cohort if done is None else done.cohort, comparison)
+        harmonization = harmonize.harmonize_cohort(
+            cohort, plan, settings, measures, registrations or {}
+        )
+    compared = data.compare_sessions(
+        cohort if harmonization is None else harmonization.cohort, comparison
+    )
     fitted = {
         hemi: fit_maps(hemi, side.only(maps), rows, settings)
         for hemi, side in each("models", list(compared.sides.items()) if maps else [])
@@ -252,10 +256,17 @@ def _fit_cohort(
     if comparison.asymmetry and maps:
         # A change may be zero or of any sign: nothing to divide by.
         relative = () if comparison.pair else settings.asymmetry.relative
-        both = data.asymmetry_maps(compared, maps, relative)
+        difference = data.asymmetry_maps(compared, maps, relative)
         contrasts = with_mean(rows.design)
-        fitted[designs.BOTH] = fit_maps(designs.BOTH, both, rows, settings, contrasts=contrasts)
-    return done, compared, fitted, inference.correct(fitted, rows, compared.table, settings)
+        fitted[designs.BOTH] = fit_maps(
+            designs.BOTH, difference, rows, settings, contrasts=contrasts
+        )
+    return (
+        harmonization,
+        compared,
+        fitted,
+        inference.correct(fitted, rows, compared.table, settings),
+    )
 
 
 def register_side(
@@ -277,15 +288,15 @@ def register_side(
     difference = None
     if groups is not None:
         names = cohort.table[groups.column].iloc[side.rows]
-        known = names.notna().to_numpy()
-        grouped = replace(result, warps=result.warps[known])
-        members = names[known].astype(str).to_numpy(dtype=np.str_)
+        has_group = names.notna().to_numpy()
+        grouped = replace(result, warps=result.warps[has_group])
+        members = names[has_group].astype(str).to_numpy(dtype=np.str_)
         shifts = registration.shift_by_group(grouped, members)
         if result.template is not None:
             difference = registration.shift_difference(
                 grouped,
                 members,
-                cohort.table[PARTICIPANT].iloc[side.rows][known].to_numpy(),
+                cohort.table[PARTICIPANT].iloc[side.rows][has_group].to_numpy(),
                 permutations=settings.registration.group_permutations,
                 seed=settings.multiplicity.seed,
             )
@@ -300,17 +311,17 @@ def register_side(
 
 def _register_maps(side: arrays.SideMaps, warps: arrays.Float, rims: bool) -> arrays.SideMaps:
     """Carry all maps of sheets; a point beside ``rims`` that came to be known of few is none."""
-    kept = len(warps) <= arrays.MOST_KEPT
+    is_small = len(warps) <= arrays.MOST_KEPT
     maps, errors = (arrays.WarpedMaps(one, warps, warp_values) for one in (side.maps, side.errors))
     labels = arrays.WarpedLabels(side.subfield[:], warps, warp_labels)
-    registered = dict(maps) if kept or rims else maps
+    registered = dict(maps) if is_small or rims else maps
     for values in registered.values() if rims else ():
         leave_rare(values)
     return replace(
         side,
         maps=registered,
-        errors=dict(errors) if kept else errors,
-        subfield=labels[:] if kept else labels,
+        errors=dict(errors) if is_small else errors,
+        subfield=labels[:] if is_small else labels,
     )
 
 
@@ -324,46 +335,52 @@ def unequal_spread(analysis: results.Analysis, settings: GlmSettings) -> Iterato
     ordinary = (settings.covariance, settings.weights) == ("ordinary", "none")
     if not (named and ordinary) or analysis.comparison.longitudinal:
         return
-    for hemi, one in analysis.fitted.items():
-        members = results.members_of(analysis, results.rows_of(analysis, one))
+    for hemi, fitted in analysis.fitted.items():
+        members = results.members_of(analysis, results.rows_of(analysis, fitted))
         sizes = {group: int(own.sum()) for group, own in members.items() if own.sum() > 1}
-        for measure in one.fits:
-            sds = {g: arrays.describe_known(one.parts(measure, members[g]))[2] for g in sizes}
-            (first, n), *others = sizes.items()
-            for group, m in others:
-                squares, other = sds[first] ** 2, sds[group] ** 2
-                pooled = ((n - 1) * squares + (m - 1) * other) / (n + m - 2) * (1 / n + 1 / m)
-                ratio = float(np.nansum(squares / n + other / m) / np.nansum(pooled))
+        for measure in fitted.fits:
+            sds = {g: arrays.describe_known(fitted.parts(measure, members[g]))[2] for g in sizes}
+            (first, n), *remaining = sizes.items()
+            for group, m in remaining:
+                squares, squares_of_group = sds[first] ** 2, sds[group] ** 2
+                pooled = (
+                    ((n - 1) * squares + (m - 1) * squares_of_group) / (n + m - 2) * (1 / n + 1 / m)
+                )
+                ratio = float(np.nansum(squares / n + squares_of_group / m) / np.nansum(pooled))
                 if ratio > max(_UNEQUAL, worst.get(group, (0.0,))[0]):
                     worst[group] = ratio, f"{first} ({n}) and {group} ({m}), {measure}, {hemi}"
-    for ratio, where in worst.values():
+    for ratio, place_text in worst.values():
         share = 2 * special.ndtr(special.ndtri(0.025) / np.sqrt(ratio))
         yield (
-            f"{where}: the smaller group varies more, so that about {share:.0%} of tests of nothing"
+            f"{place_text}: the smaller group varies more, so that about {share:.0%} of tests of"
+            " nothing"
             ' have p below 0.05; glm.covariance = "hc3" in --settings allows for that if each group'
             " has 20 or more"
         )
 
 
 def check_joint(
-    known: Sequence[str], comparison: designs.Comparison, settings: GroupSettings
+    available: Sequence[str], comparison: designs.Comparison, settings: GroupSettings
 ) -> None:
     """Refuse measures that cannot be tested together, before anything is fitted."""
-    known = [*known, *(designs.asymmetry_name(name) for name in known if comparison.asymmetry)]
+    available = [
+        *available,
+        *(designs.asymmetry_name(name) for name in available if comparison.asymmetry),
+    ]
     names, sides = settings.joint.measures, settings.joint.sides
-    what = None
-    if unknown := [name for name in names if name not in known]:
-        what = f"no map is called {unknown[0]!r}; there are {', '.join(known)}"
-    elif names and group_tables.JOINT in known:
-        what = (
+    problem = None
+    if unknown := [name for name in names if name not in available]:
+        problem = f"no map is called {unknown[0]!r}; there are {', '.join(available)}"
+    elif names and group_tables.JOINT in available:
+        problem = (
             f"a map is called {group_tables.JOINT}, as its results would be; give it another name"
         )
     elif len(set(names)) < len(names):
-        what = "a measure is named twice; leave it out"
+        problem = "a measure is named twice; leave it out"
     elif len(names) < 1 + (not sides) and (names or sides):
-        what = "name two measures, or one and --joint-sides"
-    if what is not None:
-        raise ModelError(f"--joint {' '.join(names)}".strip() + f": {what}")
+        problem = "name two measures, or one and --joint-sides"
+    if problem is not None:
+        raise ModelError(f"--joint {' '.join(names)}".strip() + f": {problem}")
 
 
 def combine_maps(
@@ -407,22 +424,24 @@ def combine_maps(
     if not groups:
         raise ModelError(f"--joint {' '.join(names)}: no side has them all; leave one out")
     model = analyses[0].row_model
-    found = inference.correct_joint(groups, contrasts, model, analyses[0].compared.table, settings)
+    tests_found = inference.correct_joint(
+        groups, contrasts, model, analyses[0].compared.table, settings
+    )
     return {
         key: JointMap(key=key, parts=groups[key], cohort=cohort, test=test, found=own)
-        for key, (test, own) in found.items()
+        for key, (test, own) in tests_found.items()
     }
 
 
 def _check_points(names: Sequence[str], parts: Sequence[FittedMaps]) -> None:
     """Refuse maps whose points do not correspond."""
-    first, *others = [one.maps for one in parts]
-    same = [
+    first, *remaining = [one.maps for one in parts]
+    equal = [
         one.shape == first.shape
         and np.array_equal(edges_of(one, 4), edges_of(first, 4))  # the triangles of meshes
-        for one in others
+        for one in remaining
     ]
-    if not all(same):
+    if not all(equal):
         counts = ", ".join(str(np.prod(one.maps.shape)) for one in parts)
         raise ModelError(
             f"--joint {' '.join(names)}: maps lie on different surfaces ({counts} points); choose"

@@ -56,34 +56,35 @@ def run_meta(options: MetaOptions, settings: GroupSettings) -> tuple[Path, list[
             f"{folder}: is no earlier meta-analysis; choose another output folder",
             reason="not-writable",
         )
-    with write.whole_folder(folder) as aside:
+    with write.whole_folder(folder) as scratch:
         for name, table in meta_tables(meta):
-            write.write_table(aside, name, table, described=name != "sites", meaning=META_COLUMNS)
-        _write_maps(aside, meta)
-        notes += write.write_figures(aside, _figures(meta))
-        files.write_text(aside / "methods.md", _methods(meta))
-        files.write_json(aside / "meta.json", _record(meta, options, notes))
+            write.write_table(scratch, name, table, described=name != "sites", meaning=META_COLUMNS)
+        _write_maps(scratch, meta)
+        notes += write.write_figures(scratch, _figures(meta))
+        files.write_text(scratch / "methods.md", _methods(meta))
+        files.write_json(scratch / "meta.json", _record(meta, options, notes))
     write_meta_report(options.out_dir)
     return options.out_dir / META_REPORT, notes
 
 
-def _read(given: Sequence[tuple[str | None, Path]]) -> list[SiteSummary]:
+def _read(paths: Sequence[tuple[str | None, Path]]) -> list[SiteSummary]:
     """Read summaries, and refuse any that would count twice."""
     sites: list[SiteSummary] = []
-    seen: dict[str, str] = {}
-    for name, path in given:
+    path_of: dict[str, str] = {}
+    for name, path in paths:
         site = read_summary(path)
         content = site.model_dump_json(exclude={"site"})
         site = site if name is None else site.model_copy(update={"site": name})
-        if content in seen:
+        if content in path_of:
             raise UsageError(
-                f"meta: {site.site} and {seen[content]} are the same summary; give each site once"
+                f"meta: {site.site} and {path_of[content]} are the same summary; give each site"
+                " once"
             )
-        if site.site in seen.values():
+        if site.site in path_of.values():
             raise UsageError(
                 f"meta: two sites are called {site.site}; name them, as a={path} b=..."
             )
-        seen[content] = site.site
+        path_of[content] = site.site
         sites.append(site)
     if len(sites) < 2:  # noqa: PLR2004 -- sites
         raise UsageError("meta: give the summaries of two sites or more")
@@ -123,8 +124,8 @@ def _figures(meta: Meta) -> Iterator[tuple[str, Drawing]]:
     for measure in dict.fromkeys(item.model.measures[0] for item in maps):
         sides = {hemi: one for hemi, one in places.items() if measure in tests[hemi]}
         blocks = list(contrasts(tests, meta.found, measure, like))
-        own = [item for item in maps if item.model.measures[0] == measure]
-        for number, contrast in enumerate(dict.fromkeys(item.contrast for item in own)):
+        items = [item for item in maps if item.model.measures[0] == measure]
+        for number, contrast in enumerate(dict.fromkeys(item.contrast for item in items)):
             row = Row(
                 kind="heterogeneity",
                 index=number,
@@ -133,7 +134,7 @@ def _figures(meta: Meta) -> Iterator[tuple[str, Drawing]]:
                 scale={"cmap": "cividis", "vmin": 0.0, "vmax": 100.0},
                 values={
                     item.model.hemi: 100 * item.result.random.i2
-                    for item in own
+                    for item in items
                     if item.contrast == contrast
                 },
             )
@@ -143,19 +144,19 @@ def _figures(meta: Meta) -> Iterator[tuple[str, Drawing]]:
 
 def _place(meta: Meta, hemi: str, cohort: Cohort) -> FittedMaps:
     """Locate the points of maps of one hemisphere, of which there are no sheets."""
-    shape, nobody = (len(cohort.x), len(cohort.y)), np.zeros(0, dtype=np.int64)
+    shape, no_rows = (len(cohort.x), len(cohort.y)), np.zeros(0, dtype=np.int64)
     words = meta.frame[hemi].subfield
     names = tuple(name for name in dict.fromkeys(words) if name != files.MISSING)
     subfield = np.array([names.index(word) if word in names else -1 for word in words])
     maps = SideMaps(
-        rows=nobody,
+        rows=no_rows,
         maps={},
         subfield=np.zeros((0, *shape), dtype=np.int8),
         names=names,
         summary=pd.DataFrame(),
     )
     return FittedMaps(
-        maps=maps, used=nobody, rows=nobody, subfield=subfield.reshape(shape), fits={}
+        maps=maps, used=no_rows, rows=no_rows, subfield=subfield.reshape(shape), fits={}
     )
 
 
@@ -191,7 +192,7 @@ def _record(meta: Meta, options: MetaOptions, notes: Sequence[str]) -> dict[str,
 
 def _methods(meta: Meta) -> str:
     """Word what was done and what came out."""
-    how, sites = meta.settings.meta, meta.sites
+    rules, sites = meta.settings.meta, meta.sites
     cite = Citations()
     counts = Counter[str]()
     for site in sites:
@@ -203,7 +204,7 @@ def _methods(meta: Meta) -> str:
         else "All sites registered their maps to one template of curvature profiles (hash"
         f" {sites[0].template_hash})."
     )
-    joint = how.model == "joint"
+    joint = rules.model == "joint"
     fixed = "The fixed effect is the mean of the sites' estimates, weighted by inverse variances."
     if joint:
         fixed = (
@@ -211,7 +212,7 @@ def _methods(meta: Meta) -> str:
             f" from the sites' coefficients and their covariances {cite('join')}; contrasts that"
             " include the constant are combined by inverse variances."
         )
-    if how.random == "dl":
+    if rules.random == "dl":
         random = f"the moments of DerSimonian and Laird {cite('dl')}, tests are normal"
     elif joint:
         random = (
@@ -225,7 +226,7 @@ def _methods(meta: Meta) -> str:
             f" Hartung {cite('knapp-hartung')}, with standard errors not smaller than without their"
             f" correction {cite('modified')}"
         )
-    what = (
+    measure_text = (
         f"Measures of the hippocampus {cite('method')} of {meta.people} participants{groups} at"
         f" {len(sites)} sites were combined with hipsta_bids {__version__}; no values of"
         f" participants left a site. Each site fitted the linear model"
@@ -241,10 +242,10 @@ def _methods(meta: Meta) -> str:
     errors = (
         f"{discovery_text(meta.settings.multiplicity, cite)}, and for all summary measures of a"
         " contrast together. Effect sizes are Cohen's d: the estimate over"
-        f" the residual standard deviation within sites, with {how.confidence:.0%} confidence"
+        f" the residual standard deviation within sites, with {rules.confidence:.0%} confidence"
         " limits."
     )
-    paragraphs = [f"{what} {aligned}", effects, errors]
+    paragraphs = [f"{measure_text} {aligned}", effects, errors]
     survivors = [
         f"{key.measure}, {key.contrast}, {key.hemi}: {int(found.rejected.sum())} of"
         f" {found.n_tests} points"

@@ -79,8 +79,8 @@ class ModelSummary(TomlTable):
     @property
     def title(self) -> str:
         """Name in messages."""
-        what = self.measures[0] if self.kind == "map" else f"summary measures ({self.formula})"
-        return f"{what}, {self.hemi}"
+        subject = self.measures[0] if self.kind == "map" else f"summary measures ({self.formula})"
+        return f"{subject}, {self.hemi}"
 
     @property
     def intercept(self) -> int | None:
@@ -123,13 +123,13 @@ class ModelSummary(TomlTable):
     def _wrong_contrast(self, fit: SiteFit) -> str | None:
         for name, row in self.contrasts.items():
             weights = np.array(row, dtype=np.float64)
-            for kept, made in (
+            for saved, computed in (
                 (self.estimate[name], fit.estimate(weights)),
                 (self.se[name], fit.se(weights)),
             ):
-                size = _ROUNDING * float(np.abs(np.nan_to_num(made)).max(initial=0.0))
-                known = np.array(kept, dtype=np.float64)
-                if not np.allclose(known, made, rtol=_ROUNDING, atol=size, equal_nan=True):
+                size = _ROUNDING * float(np.abs(np.nan_to_num(computed)).max(initial=0.0))
+                expected = np.array(saved, dtype=np.float64)
+                if not np.allclose(expected, computed, rtol=_ROUNDING, atol=size, equal_nan=True):
                     return f"estimates of {name} that are not those of its coefficients"
         return None
 
@@ -228,11 +228,11 @@ def summarize(
     for formula in dict.fromkeys((analysis.model.formula, *(m.formula for m in analysis.measures))):
         # Anew, since contrasts may hold means over all participants.
         spec = replace(analysis.model, formula=formula)
-        made = build_design(table, spec, settings.design, analysis.design.references)
-        if len(made.rows) == len(rows):
-            designs[formula] = replace(made, contrasts=with_mean(made))
+        rebuilt = build_design(table, spec, settings.design, analysis.design.references)
+        if len(rebuilt.rows) == len(rows):
+            designs[formula] = replace(rebuilt, contrasts=with_mean(rebuilt))
         else:
-            lacking = len(rows) - len(made.rows)
+            lacking = len(rows) - len(rebuilt.rows)
             notes.append(f"{SUMMARY}: without {formula}: {lacking} participants lack a variable")
     people = {name: typed(table[name]) for name in analysis.design.references}
     factors = {
@@ -250,11 +250,12 @@ def summarize(
         )
     for model in models:
         model["units"] = [cohort.units.get(name, "1") for name in model["measures"]]
-        if lost := model["sd"].count(None):
-            what = "points" if model["kind"] == "map" else "measures"
+        if missing := model["sd"].count(None):
+            points_text = "points" if model["kind"] == "map" else "measures"
             notes.append(
-                f"{SUMMARY}: {model['measures'][0] if what == 'points' else 'summaries'},"
-                f" {model['hemi']}: without {lost} {what} that are not known of all participants"
+                f"{SUMMARY}: {model['measures'][0] if points_text == 'points' else 'summaries'},"
+                f" {model['hemi']}: without {missing} {points_text} that are not known of all"
+                " participants"
             )
     numbers = {
         name: typed(table[name]).astype(np.float64)
@@ -303,9 +304,9 @@ def _check_model(analysis: Analysis, settings: GroupSettings) -> None:
         problem = "of harmonized values cannot be combined; leave --harmonize out"
     elif settings.glm.covariance != "ordinary" or settings.glm.weights != "none":
         problem = "with HC3 standard errors or weights cannot be combined; leave these out"
-    elif found := _OF_THE_SAMPLE.search(analysis.model.formula):
+    elif match := _OF_THE_SAMPLE.search(analysis.model.formula):
         problem = (
-            f"with {found[1]}() has other columns at each site; write numbers that are the same"
+            f"with {match[1]}() has other columns at each site; write numbers that are the same"
             " everywhere, as I((age - 65) / 10)"
         )
     elif not any(contrast.n_rows == 1 for contrast in analysis.design.contrasts):
@@ -380,9 +381,9 @@ def _models(
         }
 
 
-def _subfields(one: FittedMaps) -> list[str | None]:
-    names = [*one.maps.names, None]
-    return [names[number] for number in one.subfield.ravel().tolist()]
+def _subfields(fitted: FittedMaps) -> list[str | None]:
+    names = [*fitted.maps.names, None]
+    return [names[number] for number in fitted.subfield.ravel().tolist()]
 
 
 def _model(
@@ -393,10 +394,10 @@ def _model(
     contrasts = [one for one in design.contrasts if one.n_rows == 1 and one.name in names]
     complete = np.isfinite(values).all(axis=0)
     fit = fit_points(np.where(complete, values, 0.0), design.matrix, contrasts, settings.glm)
-    there = complete & np.isfinite(fit.sigma)
+    usable = complete & np.isfinite(fit.sigma)
 
     def known(numbers: Float) -> list[Any]:
-        return rounded(np.where(there, numbers, np.nan))  # type: ignore[no-any-return]
+        return rounded(np.where(usable, numbers, np.nan))  # type: ignore[no-any-return]
 
     return {
         "columns": list(design.columns),

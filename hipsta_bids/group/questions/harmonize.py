@@ -50,11 +50,11 @@ def plan_sites(
     if comparison.pair:
         _check_constant(cohort.table, column)
     if saved:
-        kept = _saved_columns(cohort.table, saved)
+        preserved = _saved_columns(cohort.table, saved)
     else:
-        kept = _own_columns(cohort, column, model, settings, (references, comparison))
+        preserved = _own_columns(cohort, column, model, settings, (references, comparison))
     labels = formulas.level_labels(cohort.table[column])
-    usable = labels.notna().to_numpy() & np.isfinite(kept.matrix).all(axis=1)
+    usable = labels.notna().to_numpy() & np.isfinite(preserved.matrix).all(axis=1)
     old = tuple(saved.sites) if saved else ()
     present = set(labels[usable])
     new = tuple(sorted(present - set(old)))
@@ -62,13 +62,13 @@ def plan_sites(
     people = cohort.table[PARTICIPANT].to_numpy()
     counts = {one: len(set(people[usable & (labels == one).to_numpy()])) for one in sites}
     counts = {one: n for one, n in counts.items() if n}
-    _check_sizes(column, new, counts, settings, alone=saved is None)
+    _check_sizes(column, new, counts, settings, is_single=saved is None)
     site = np.where(usable, pd.Categorical(labels, categories=sites).codes, -1).astype(np.int64)
     member = np.eye(len(sites))[site[usable]]
-    explained = _explained(column, member, kept, usable, refuse=saved is None)
-    several = pd.Series(people[usable]).duplicated().any() if saved is None else saved.repeated
+    explained = _explained(column, member, preserved, usable, refuse=saved is None)
+    repeated = pd.Series(people[usable]).duplicated().any() if saved is None else saved.repeated
     volume = saved.icv if saved else icv
-    volume, values = _icv(cohort.table, usable, volume, kept.formula)
+    volume, values = _icv(cohort.table, usable, volume, preserved.formula)
     if saved and saved.icv and volume is None:
         raise ModelError(
             f"{saved.file}: volumes kept {saved.icv} there, which not all have here; complete it"
@@ -80,10 +80,10 @@ def plan_sites(
         counts=counts,
         visits=combat.Visits(
             site=site,
-            columns=kept.matrix,
-            participant=np.unique(people, return_inverse=True)[1] if several else None,
+            columns=preserved.matrix,
+            participant=np.unique(people, return_inverse=True)[1] if repeated else None,
         ),
-        kept=kept,
+        kept=preserved,
         icv=volume,
         icv_values=values,
         explained=explained,
@@ -117,20 +117,20 @@ def _own_columns(
     references, comparison = context
     table = modeled_table(cohort.table, comparison)
     formula = without_variable(model.formula, column).removeprefix("1 + ")
-    known = closed_formula(formula).names
+    variables = closed_formula(formula).names
     spec = replace(model, formula=formula, contrasts=(), dummy=None)
-    chosen = {name: text for name, text in references.items() if name in known}
-    design = build_design(table, spec, settings.design, chosen)
-    own = [i for i, name in enumerate(design.columns) if name != formulas.INTERCEPT]
-    names = tuple(design.columns[i] for i in own)
+    levels = {name: text for name, text in references.items() if name in variables}
+    design = build_design(table, spec, settings.design, levels)
+    positions = [i for i, name in enumerate(design.columns) if name != formulas.INTERCEPT]
+    names = tuple(design.columns[i] for i in positions)
     values = np.full((len(table), len(names)), np.nan)
-    values[design.rows] = design.matrix[:, own]
+    values[design.rows] = design.matrix[:, positions]
     portable = not comparison.pair and _is_portable(table, formula, design)
     if comparison.pair:
         session = comparison.pair[1]
         values = values[table.index.get_indexer(pd.Index(cohort.table[PARTICIPANT]))]
-        later = (cohort.table[SESSION] == session).to_numpy(np.float64)[:, None]
-        values = np.hstack([values, later, later * values])
+        is_later = (cohort.table[SESSION] == session).to_numpy(np.float64)[:, None]
+        values = np.hstack([values, is_later, is_later * values])
         names = (*names, session, *(f"{name} x {session}" for name in names))
     return Kept(
         matrix=values, names=names, formula=formula, levels=design.levels, portable=portable
@@ -151,10 +151,10 @@ def _check_terms(model: formulas.ModelSpec, column: str) -> None:
 def _check_constant(table: pd.DataFrame, column: str) -> None:
     """Refuse changes between two sessions of people who changed the site."""
     pairs = table[[PARTICIPANT, column]].drop_duplicates()[PARTICIPANT]
-    several = pairs[pairs.duplicated()].unique()
-    if len(several):
+    changing = pairs[pairs.duplicated()].unique()
+    if len(changing):
         raise ModelError(
-            f"--harmonize {column}: {formulas.listed(several)} changed {column} between the"
+            f"--harmonize {column}: {formulas.listed(changing)} changed {column} between the"
             f" sessions, so that changes depend on effects of {column} that the model of changes"
             " cannot have; use --longitudinal"
         )
@@ -166,10 +166,10 @@ def _check_sizes(
     counts: Mapping[str, int],
     settings: GroupSettings,
     *,
-    alone: bool,
+    is_single: bool,
 ) -> None:
     least = settings.harmonization.least_participants
-    if alone and len(new) < 2:  # noqa: PLR2004 -- one is like all
+    if is_single and len(new) < 2:  # noqa: PLR2004 -- one is like all
         raise ModelError(
             f"--harmonize {column}: all participants with the variables of the model have"
             f" {column} {formulas.listed(new) or 'n/a'}; leave it out"
@@ -185,23 +185,23 @@ def _check_sizes(
 def _explained(
     column: str,
     member: Float,
-    kept: Kept,
+    preserved: Kept,
     usable: Bool,
     *,
     refuse: bool,
 ) -> dict[str, float]:
     """Share of the variance of each column that sites explain; refuses what they explain wholly."""
-    there = member[:, member.any(axis=0)]
-    basis = np.linalg.qr(there)[0]
-    found: dict[str, float] = {}
-    for name, values in zip(kept.names, kept.matrix[usable].T, strict=True):
+    dummies = member[:, member.any(axis=0)]
+    basis = np.linalg.qr(dummies)[0]
+    shares: dict[str, float] = {}
+    for name, values in zip(preserved.names, preserved.matrix[usable].T, strict=True):
         around = values - values.mean()
         total = float(around @ around)
-        inside = around - there @ np.linalg.lstsq(there, around, rcond=None)[0]
-        found[name] = 1 - float(inside @ inside) / total if total > 0 else 0.0
-        rest = values - basis @ (basis.T @ values)
-        rest -= basis @ (basis.T @ rest)
-        length = float(np.linalg.norm(rest))
+        inside = around - dummies @ np.linalg.lstsq(dummies, around, rcond=None)[0]
+        shares[name] = 1 - float(inside @ inside) / total if total > 0 else 0.0
+        residual = values - basis @ (basis.T @ values)
+        residual -= basis @ (basis.T @ residual)
+        length = float(np.linalg.norm(residual))
         if length <= DEPENDENCE * float(np.linalg.norm(values)):
             if refuse:
                 raise ModelError(
@@ -210,17 +210,17 @@ def _explained(
                     " that have all groups, or leave --harmonize out"
                 )
             continue
-        basis = np.column_stack([basis, rest / length])
-    return found
+        basis = np.column_stack([basis, residual / length])
+    return shares
 
 
 def _is_portable(table: pd.DataFrame, formula: str, design: Design) -> bool:
     """Tell whether columns of some people alone are the same as among all; splines' are not."""
     half = design.rows[::2]
     matrix, names, _ = formulas.columns_of(table.iloc[half], formula, design.levels, "")
-    own = [name for name in design.columns if name != formulas.INTERCEPT]
-    among = design.matrix[::2][:, [design.columns.index(name) for name in own]]
-    return list(names) == own and bool(np.allclose(matrix, among, rtol=1e-9, atol=1e-12))
+    columns = [name for name in design.columns if name != formulas.INTERCEPT]
+    among = design.matrix[::2][:, [design.columns.index(name) for name in columns]]
+    return list(names) == columns and bool(np.allclose(matrix, among, rtol=1e-9, atol=1e-12))
 
 
 def _icv(
@@ -238,8 +238,8 @@ def _icv(
     if not pd.api.types.is_numeric_dtype(column):
         return None, values
     values = column.to_numpy(np.float64)
-    own = values[usable]
-    return (icv if np.isfinite(own).all() and np.ptp(own) > 0 else None), values
+    values_used = values[usable]
+    return (icv if np.isfinite(values_used).all() and np.ptp(values_used) > 0 else None), values
 
 
 def without_tests_of_sites(
@@ -255,18 +255,18 @@ def without_tests_of_sites(
     if comparison.pair or not plan.estimated:
         return design
     member = np.eye(len(plan.sites))[plan.visits.site[design.rows]]
-    both = np.hstack([design.matrix, member])
-    if np.linalg.matrix_rank(both) > np.linalg.matrix_rank(design.matrix):
+    joined = np.hstack([design.matrix, member])
+    if np.linalg.matrix_rank(joined) > np.linalg.matrix_rank(design.matrix):
         raise ModelError(
             f"--harmonize {plan.column}: the model has to have {plan.column} as a factor, since"
             " its effects are estimated from the same participants; add"
             f" + C({plan.column}) to the formula"
         )
-    taken = np.linalg.pinv(design.matrix) @ (member - member.mean(axis=0))
+    weights = np.linalg.pinv(design.matrix) @ (member - member.mean(axis=0))
     about = [
         one.name
         for one in design.contrasts
-        if np.abs(one.weights @ taken).max() > _UNTOUCHED * np.abs(one.weights).max()
+        if np.abs(one.weights @ weights).max() > _UNTOUCHED * np.abs(one.weights).max()
     ]
     named = {spec.name for spec in model.contrasts}
     if about and (named.intersection(about) or len(about) == len(design.contrasts)):
@@ -274,8 +274,8 @@ def without_tests_of_sites(
             f"--harmonize {plan.column}: contrast {about[0]} is about what it takes out;"
             " harmonize sites or scanners, and choose contrasts of others by --contrast"
         )
-    kept = tuple(one for one in design.contrasts if one.name not in about)
-    return replace(design, contrasts=kept)
+    contrasts = tuple(one for one in design.contrasts if one.name not in about)
+    return replace(design, contrasts=contrasts)
 
 
 def harmonize_cohort(
@@ -296,25 +296,29 @@ def harmonize_cohort(
         changed, errors = dict(side.maps), dict(side.errors)
         for measure in measures.maps:
             values = side.maps[measure].reshape(len(side.rows), -1)
-            found = _effects(values, visits, plan, settings, (hemi, measure))
-            maps[hemi, measure] = found
-            changed[measure] = combat.harmonize(values, visits, found[0]).reshape(
+            effects = _effects(values, visits, plan, settings, (hemi, measure))
+            maps[hemi, measure] = effects
+            changed[measure] = combat.harmonize(values, visits, effects[0]).reshape(
                 side.maps[measure].shape
             )
             if measure in errors:
-                scale = found[0].scale[visits.site].reshape(errors[measure].shape)
+                scale = effects[0].scale[visits.site].reshape(errors[measure].shape)
                 errors[measure] = errors[measure] / scale
         summary = side.summary.astype(np.float64)
         for name in summary.columns:
             values = summary[[name]].to_numpy()
-            own = _with_icv(visits, plan, side.rows) if name.startswith("volume") else visits
+            visits_of_map = (
+                _with_icv(visits, plan, side.rows) if name.startswith("volume") else visits
+            )
             if plan.saved and (hemi, name) not in plan.saved.effects_on_summaries:
                 unknown.add(name)
                 summary[name] = np.nan
             elif len(np.unique(values[np.isfinite(values)])) > 1:
-                found = _effects(values, own, plan, settings, (hemi, name), summary=True)
-                summaries[hemi, name] = found
-                summary[name] = combat.harmonize(values, own, found[0])[:, 0]
+                effects = _effects(
+                    values, visits_of_map, plan, settings, (hemi, name), summary=True
+                )
+                summaries[hemi, name] = effects
+                summary[name] = combat.harmonize(values, visits_of_map, effects[0])[:, 0]
         sides[hemi] = replace(side, maps=changed, errors=errors, summary=summary)
     return Harmonization(
         plan=plan,
@@ -345,18 +349,18 @@ def _effects(
     pooled = settings.harmonization.pooling and not summary
     if plan.saved is None:
         return combat.fit_effects(values, visits, len(plan.sites), settings, pooled=pooled)
-    known = plan.saved.effects_on_summaries if summary else plan.saved.effects_on_maps
-    if key not in known:
+    saved_effects = plan.saved.effects_on_summaries if summary else plan.saved.effects_on_maps
+    if key not in saved_effects:
         raise ModelError(
             f"{plan.saved.file}: has no map of {key[1]} of hemisphere {key[0]}; choose others by"
             " --measures, or harmonize anew"
         )
-    if len(known[key].mean) != values.shape[1]:
+    if len(saved_effects[key].mean) != values.shape[1]:
         raise ModelError(
-            f"{plan.saved.file}: its map of {key[1]} has {len(known[key].mean)} points, those of"
-            f" these participants {values.shape[1]}; use the same grid"
+            f"{plan.saved.file}: its map of {key[1]} has {len(saved_effects[key].mean)} points,"
+            f" those of these participants {values.shape[1]}; use the same grid"
         )
-    return combat.extend_effects(known[key], values, visits, pooled=pooled)
+    return combat.extend_effects(saved_effects[key], values, visits, pooled=pooled)
 
 
 def _notes(plan: SitePlan, settings: GroupSettings, unknown: set[str]) -> Iterator[str]:
@@ -376,9 +380,11 @@ def _check_templates(saved: SavedEffects, registrations: Mapping[str, Registrati
     """Refuse parameters of points that are others here."""
     for hemi, digest in digests(registrations).items():
         if saved.templates.get(hemi) != digest:
-            none = saved.templates.get(hemi) == "none"
-            how = "--align none" if none else "--template with the template.json beside it"
+            is_unregistered = saved.templates.get(hemi) == "none"
+            remedy = (
+                "--align none" if is_unregistered else "--template with the template.json beside it"
+            )
             raise ModelError(
                 f"{saved.file}: hemisphere {hemi} was registered to another template there; give"
-                f" {how}"
+                f" {remedy}"
             )

@@ -103,9 +103,9 @@ class GroupFit:
         rows = []
         for i, side in enumerate(self.sides):
             for j, test in enumerate(self._tests(side)):
-                found = self._found(side, test)
+                discoveries = self._found(side, test)
                 effects = self.maps["effect"][i, j]
-                known = np.isfinite(effects).any()
+                is_tested = np.isfinite(effects).any()
                 rows.append(
                     {
                         "side": side,
@@ -113,10 +113,10 @@ class GroupFit:
                         "test": test.kind,
                         "participants": len(self.fitted[side].rows),
                         "points": int(np.isfinite(test.p).sum()),
-                        "significant": int(found.rejected.sum()),
-                        "alpha": found.alpha,
+                        "significant": int(discoveries.rejected.sum()),
+                        "alpha": discoveries.alpha,
                         "largest_effect": effects.flat[np.nanargmax(np.abs(effects))]
-                        if known
+                        if is_tested
                         else np.nan,
                     }
                 )
@@ -237,8 +237,8 @@ def group(
     _, spec, _, levels = choose_model(request, table, settings)
     design = build_design(table, spec, settings.design, levels)
     model = RowModel(design)
-    own = {side: _side(values, measure, triangles) for side, values in sides.items()}
-    fitted = {side: fit_maps(side, one, model, settings) for side, one in own.items()}
+    side_maps = {side: _side(values, measure, triangles) for side, values in sides.items()}
+    fitted = {side: fit_maps(side, one, model, settings) for side, one in side_maps.items()}
     return GroupFit(
         measure=measure,
         unit=unit,
@@ -300,8 +300,8 @@ def _of_labeled(
         )
     names = maps.coords["participant"].to_numpy().tolist() if "participant" in maps.coords else None
     if "side" in maps.dims:
-        found = [str(one) for one in maps.coords["side"].to_numpy()]
-        arrays = {one: maps.sel(side=one) for one in found}
+        side_names = [str(one) for one in maps.coords["side"].to_numpy()]
+        arrays = {one: maps.sel(side=one) for one in side_names}
     else:
         arrays = {side: maps}
     order = [name for name in ("x", "y") if name in maps.dims]

@@ -116,23 +116,23 @@ def _score_people(
     file, norms = load_norms(path)
     known = len(file.sites)
     measures = options.measures or tuple({m: 0 for _, m in norms})
-    every = Comparison(longitudinal=True)  # each visit has a score
-    options = replace(options, measures=measures, comparison=every)
+    comparison = Comparison(longitudinal=True)  # each visit has a score
+    options = replace(options, measures=measures, comparison=comparison)
     settings = settings.changed(registration=file.registration)
     study = studies.Study.read(options, among, settings)
     notes, table = _check(file, path, study.inputs), study.cohort.table
-    again = table.duplicated([PARTICIPANT, *({file.site} & set(table.columns))])
-    if again.any() and FIRST_AGE not in table:
+    repeated = table.duplicated([PARTICIPANT, *({file.site} & set(table.columns))])
+    if repeated.any() and FIRST_AGE not in table:
         notes.append(
             f"{file.age} is the same in all sessions of a participant; give that of each session in"
             " sessions.tsv, as later visits are scored for too young an age"
         )
     people = _people(study, file)
     if not people.known.any():
-        why = "; ".join(dict.fromkeys(message for _, message in study.left_out.values()))
-        raise ModelError(f"{path}: nobody here can be scored: {why}")
-    everyone = studies.members(table, controls, "--controls")
-    references = everyone & (controls is not None) & ~again.to_numpy()
+        reasons = "; ".join(dict.fromkeys(message for _, message in study.left_out.values()))
+        raise ModelError(f"{path}: nobody here can be scored: {reasons}")
+    controls_kept = studies.members(table, controls, "--controls")
+    references = controls_kept & (controls is not None) & ~repeated.to_numpy()
     file = _with_new_sites(study, path, file, people, references, controls=controls)
     templates = None if file.template is None else templates_from_json(file.template, str(path))
     _, tables, cohorts, found = _registered(study, templates)
@@ -162,10 +162,10 @@ def _registered(
     """Register maps, and collect them and summary measures of each side and of the mean of both."""
     inputs = study.inputs
     template, cohorts, tables = study.register(templates)
-    wanted = {*inputs.measures.maps, *inputs.others}
+    names = {*inputs.measures.maps, *inputs.others}
     for name, cohort in cohorts.items():
         sides = {
-            hemi: side.only([name for name in side.maps if name in wanted])
+            hemi: side.only([name for name in side.maps if name in names])
             for hemi, side in cohort.sides.items()
         }
         cohorts[name] = replace(cohort, sides=sides)
@@ -176,65 +176,65 @@ def _registered(
     return template, tables, cohorts, found
 
 
-def _write(study: studies.Study, made: _Made, notes: Iterable[str]) -> studies.GroupResult:
+def _write(study: studies.Study, scoring: _Made, notes: Iterable[str]) -> studies.GroupResult:
     """Write all results; charts are of the measures that the settings name."""
-    file, people, cohort = made.file, made.people, study.cohort
+    file, people, cohort = scoring.file, scoring.people, study.cohort
     settings = study.settings
     charts = [
         file.centiles(norms).assign(hemi=hemi, measure=name, unit=cohort.units.get(name, "1"))
-        for (hemi, name), norms in made.norms.items()
+        for (hemi, name), norms in scoring.norms.items()
         if name in settings.norms.charts and hemi != BOTH
     ]
     if charts:
         table = pd.concat(charts, ignore_index=True)
         first = ["hemi", "measure", "unit"]
-        made.tables["centiles"] = table[[*first, *table.columns.drop(first)]]
+        scoring.tables["centiles"] = table[[*first, *table.columns.drop(first)]]
     among = f" ({' '.join(study.among)})" if study.among else ""
     visits = cohort.table[people.known]
-    once = ~visits[PARTICIPANT].duplicated().to_numpy()
-    who = f"{once.sum()} participants{among}"
+    is_first = ~visits[PARTICIPANT].duplicated().to_numpy()
+    sample = f"{is_first.sum()} participants{among}"
     text = norms_text(
         file,
-        who=who if once.all() else f"{who}, at {len(once)} visits,",
-        coverage=made.tables.get("coverage"),
-        new=list(file.sites)[made.known :],
-        controls=made.controls,
+        sample=sample if is_first.all() else f"{sample}, at {len(is_first)} visits,",
+        coverage=scoring.tables.get("coverage"),
+        new=list(file.sites)[scoring.known :],
+        controls=scoring.controls,
     )
 
     def fill(folder: Path) -> list[str]:
-        save_norms(folder / "norms.json", file, made.norms)
-        for surface, one in made.cohorts.items():
+        save_norms(folder / "norms.json", file, scoring.norms)
+        for surface, one in scoring.cohorts.items():
             for hemi, side in one.sides.items():
                 if side.maps:
                     write.write_surface(folder, one, points_of(side), hemi)
-            if found := made.scored.get(surface):
+            if found := scoring.scored.get(surface):
                 write.write_scores(folder, one, one.table, found, letter="z", sheets=not surface)
         files.write_text(folder / "methods.md", text)
-        return write.write_figures(folder, _figures(made))
+        return write.write_figures(folder, _figures(scoring))
 
-    counts = np.bincount(people.site[people.known][once], minlength=len(file.sites)).tolist()
+    counts = np.bincount(people.site[people.known][is_first], minlength=len(file.sites)).tolist()
     record = {
         "hemispheres": {hemi: len(side.rows) for hemi, side in cohort.sides.items()},
         "norms": {
-            "file": made.path and str(made.path),
+            "file": scoring.path and str(scoring.path),
             "participants": file.participants,
             "ages": [file.knots[0], file.knots[-1]],
             "sites": [
-                {"site": site, "n": n, "here": counts[i], "new": i >= made.known}
+                {"site": site, "n": n, "here": counts[i], "new": i >= scoring.known}
                 for i, (site, n) in enumerate(file.sites.items())
             ],
-            "controls": made.controls,
+            "controls": scoring.controls,
             "folds": normative.CENTILE_FOLDS,
         },
         "among": study.among,
     }
-    name = studies.folder_of(["norms" if made.path is None else "scores"], study.among)
+    name = studies.folder_of(["norms" if scoring.path is None else "scores"], study.among)
     notes = [*notes]
     if later := sum(one.reason == "later-session" for one in study.inputs.exclusions):
         notes.append(f"{later} later sessions are not in the norms, which take first ones")
     if file.site not in cohort.table:
         notes.append(f"no column {file.site!r}: all are taken to be at one, {_NO_SITE!r}")
-    return study.write(name, notes, visits=visits, tables=made.tables, record=record, fill=fill)
+    return study.write(name, notes, visits=visits, tables=scoring.tables, record=record, fill=fill)
 
 
 def _protocol(inputs: studies.GroupInputs) -> tuple[str, str]:
@@ -249,13 +249,13 @@ def _planned(study: studies.Study) -> tuple[NormsFile, normative.People]:
     Refuses a cohort that is too small, or whose sexes are those of sites.
     """
     cohort, inputs, settings = study.cohort, study.inputs, study.settings
-    how, found, table = settings.norms, inputs.found, cohort.table
-    check_names([how.age], table.columns)
-    sites, complete = _site_labels(table, how.site), np.ones(len(table), dtype=bool)
-    sexes = level_labels(table[how.sex]) if how.sex in table else None
+    rules, found, table = settings.norms, inputs.found, cohort.table
+    check_names([rules.age], table.columns)
+    sites, complete = _site_labels(table, rules.site), np.ones(len(table), dtype=bool)
+    sexes = level_labels(table[rules.sex]) if rules.sex in table else None
     for labels in (sites, sexes):
         complete &= True if labels is None else labels.notna().to_numpy()
-    knots = normative.choose_knots(_ages(table, how.age)[complete], how)
+    knots = normative.choose_knots(_ages(table, rules.age)[complete], rules)
     file = NormsFile(
         description="norms of maps and summary measures by age, sex and site",
         format=1,
@@ -269,9 +269,9 @@ def _planned(study: studies.Study) -> tuple[NormsFile, normative.People]:
         template=None,
         x=cohort.x.tolist(),
         y=cohort.y.tolist(),
-        age=how.age,
-        sex=how.sex,
-        site=how.site,
+        age=rules.age,
+        sex=rules.sex,
+        site=rules.site,
         knots=knots.tolist(),
         sexes=[] if sexes is None else sorted(set(sexes.dropna())),
         sites=dict.fromkeys(sorted(set(sites.dropna())), 1),
@@ -279,21 +279,21 @@ def _planned(study: studies.Study) -> tuple[NormsFile, normative.People]:
         norms={},
     )
     people = _people(study, file)
-    known = people.known
-    numbers = np.bincount(people.site[known], minlength=len(file.sites)).tolist()
+    is_known = people.known
+    numbers = np.bincount(people.site[is_known], minlength=len(file.sites)).tolist()
     counts = dict(zip(file.sites, numbers, strict=True))
-    if small := [f"{site} ({n})" for site, n in counts.items() if n < how.least_site]:
+    if small := [f"{site} ({n})" for site, n in counts.items() if n < rules.least_site]:
         raise ModelError(
             f"--fit-norms: too few participants at {file.site} {listed(small)}; each needs"
-            f" {how.least_site}: leave these out by --exclude, or join those of one scanner"
+            f" {rules.least_site}: leave these out by --exclude, or join those of one scanner"
         )
-    both = np.hstack([np.eye(len(counts))[people.site[known]], people.sex[known]])
-    if np.linalg.matrix_rank(both) < both.shape[1]:
+    joined = np.hstack([np.eye(len(counts))[people.site[is_known]], people.sex[is_known]])
+    if np.linalg.matrix_rank(joined) < joined.shape[1]:
         raise ModelError(
             f"--fit-norms: {file.sex} does not vary within {file.site}, so that their effects"
             " cannot be told apart; add sites with both"
         )
-    return file.model_copy(update={"sites": counts, "participants": int(known.sum())}), people
+    return file.model_copy(update={"sites": counts, "participants": int(is_known.sum())}), people
 
 
 def _ages(table: pd.DataFrame, column: str) -> Float:
@@ -326,9 +326,11 @@ def _people(study: studies.Study, file: NormsFile) -> normative.People:
         problems["norms-sex", f"{file.sex} is none of {listed(file.sexes)}"] = strange.to_numpy()
         for i, level in enumerate(file.sexes[1:]):
             sex[:, i] = levels == level
-    problems |= {("incomplete", f"{name} is missing"): where for name, where in lacks.items()}
-    for why, where in problems.items():
-        study.left_out.update(dict.fromkeys(map(str, table.index[where]), why))
+    problems |= {
+        ("incomplete", f"{name} is missing"): is_problem for name, is_problem in lacks.items()
+    }
+    for reason, is_problem in problems.items():
+        study.left_out.update(dict.fromkeys(map(str, table.index[is_problem]), reason))
     usable = ~np.any(list(problems.values()), axis=0)
     sites = [*file.sites, *sorted(set(labels[usable]) - set(file.sites))]
     site = np.where(usable, pd.Categorical(labels, categories=sites).codes, -1).astype(np.int64)
@@ -338,28 +340,28 @@ def _people(study: studies.Study, file: NormsFile) -> normative.People:
 def _check(file: NormsFile, path: Path, inputs: studies.GroupInputs) -> list[str]:
     """Refuse people who were measured in another way; note what may differ."""
     cohort, found = inputs.cohort, inputs.found
-    same = all(
+    is_same_grid = all(
         len(a) == len(b) and np.allclose(a, b) for a, b in ((file.x, cohort.x), (file.y, cohort.y))
     )
-    here = f"{len(cohort.x)} by {len(cohort.y)} nodes"
-    there = here if same else f"others, {len(file.x)} by {len(file.y)} nodes"
+    grid_text = f"{len(cohort.x)} by {len(cohort.y)} nodes"
+    file_text = grid_text if is_same_grid else f"others, {len(file.x)} by {len(file.y)} nodes"
     seg, region = _protocol(inputs)
-    for what, own, wanted in (
+    for subject, value, expected in (
         ("segmentation protocol", seg, file.seg),
         ("region", region, file.region),
         ("hash of the participant level's settings", found.settings_hash, file.settings_hash),
-        ("grid of the sheet", here, there),
+        ("grid of the sheet", grid_text, file_text),
     ):
-        if own != wanted:
+        if value != expected:
             raise ModelError(
-                f"{path}: {what}: {wanted}, but here {own}; measure people as the reference"
+                f"{path}: {subject}: {expected}, but here {value}; measure people as the reference"
                 " cohort of the norms was"
             )
-    known = {measure for measures in file.norms.values() for measure in measures}
-    asked = [*inputs.measures.maps, *inputs.others, *(inputs.measures.summaries or ())]
-    if unknown := [name for name in asked if name not in known]:
+    available = {measure for measures in file.norms.values() for measure in measures}
+    requested = [*inputs.measures.maps, *inputs.others, *(inputs.measures.summaries or ())]
+    if unknown := [name for name in requested if name not in available]:
         raise ModelError(
-            f"{path}: has no norms of {listed(unknown)}, only of {listed(sorted(known))};"
+            f"{path}: has no norms of {listed(unknown)}, only of {listed(sorted(available))};"
             " choose by --measures"
         )
     if set(found.versions) - set(file.versions):
@@ -385,42 +387,44 @@ def _with_new_sites(
     least, sites = settings.norms.least_controls, dict(file.sites)
     labels = _site_labels(table, file.site).to_numpy()
     for number in range(len(sites), int(people.site.max(initial=-1)) + 1):
-        own = people.site == number
-        site, count = str(labels[own][0]), int((own & references).sum())
+        members = people.site == number
+        site, count = str(labels[members][0]), int((members & references).sum())
         if count < least:
-            which = "=".join(controls) if controls else "(--controls COLUMN=LEVEL)"
+            controls_text = "=".join(controls) if controls else "(--controls COLUMN=LEVEL)"
             raise ModelError(
                 f"{path}: {file.site} {site!r} is none of the norms'"
-                f" ({listed(list(file.sites))}) and has {count} controls {which} within the range"
-                f" of ages; {least} are needed to tell a site from its people"
+                f" ({listed(list(file.sites))}) and has {count} controls {controls_text} within the"
+                f" range of ages; {least} are needed to tell a site from its people"
             )
         sites[site] = count
     return file.model_copy(update={"sites": sites})
 
 
 def _fit(
-    values: Values, people: normative.People, file: NormsFile, how: NormSettings
+    values: Values, people: normative.People, file: NormsFile, rules: NormSettings
 ) -> tuple[dict[Key, normative.Norms], pd.DataFrame]:
     """Fit all norms, and tell by cross-validation how many lie below each centile."""
     n_sites, knots = len(file.sites), np.array(file.knots)
     # Folds are spread evenly over sites.
-    order = np.lexsort((np.random.default_rng(how.seed).random(len(people.site)), people.site))
+    order = np.lexsort((np.random.default_rng(rules.seed).random(len(people.site)), people.site))
     fold = np.empty(len(order), dtype=np.int64)
     fold[order] = np.arange(len(order)) % normative.CENTILE_FOLDS
     norms, rows = {}, []
-    for (hemi, measure), (visits, own) in values.items():
-        who = people.take(visits)
-        fitted = normative.fit_norms(own, who, n_sites, knots, how)
-        known = np.isfinite(fitted.mean).all(axis=0)
-        if not known.any():
+    for (hemi, measure), (visits, numbers) in values.items():
+        people_here = people.take(visits)
+        fitted = normative.fit_norms(numbers, people_here, n_sites, knots, rules)
+        is_fitted = np.isfinite(fitted.mean).all(axis=0)
+        if not is_fitted.any():
             continue  # constant, or of too few people
         norms[hemi, measure] = fitted
-        some = own[:, :: -(-own.shape[1] // CHECKED_POINTS)]
-        z = np.full(some.shape, np.nan)
+        sampled = numbers[:, :: -(-numbers.shape[1] // CHECKED_POINTS)]
+        z = np.full(sampled.shape, np.nan)
         for left in range(normative.CENTILE_FOLDS):
             out = fold[visits] == left
-            rest = normative.fit_norms(some[~out], who.take(~out), n_sites, knots, how)
-            z[out] = rest.score(some[out], who.take(out))
+            fold_norms = normative.fit_norms(
+                sampled[~out], people_here.take(~out), n_sites, knots, rules
+            )
+            z[out] = fold_norms.score(sampled[out], people_here.take(out))
         scores = z[np.isfinite(z)]
         below = {
             f"below_{100 * one:g}": np.mean(scores < special.ndtri(one)) for one in normative.LEVELS
@@ -430,8 +434,8 @@ def _fit(
                 "hemi": hemi,
                 "measure": measure,
                 "n": int(fitted.n.sum(axis=0).max()),
-                "n_points": int(known.sum()),
-                "transformed": float(np.any(fitted.shape[:, known] != 0, axis=0).mean()),
+                "n_points": int(is_fitted.sum()),
+                "transformed": float(np.any(fitted.shape[:, is_fitted] != 0, axis=0).mean()),
                 **below,
             }
         )
@@ -452,8 +456,8 @@ def _score_maps(
         for measure in side.maps:
             if (hemi, measure) not in norms:
                 continue
-            one = norms[hemi, measure]
-            z = one.score(values[hemi, measure][1], people.take(side.rows))
+            norm = norms[hemi, measure]
+            z = norm.score(values[hemi, measure][1], people.take(side.rows))
             scores[measure] = normative.NormativeScores(z, 2 * special.ndtr(-np.abs(z)))
         if scores:
             scored[hemi] = ScoredMaps(
@@ -466,51 +470,55 @@ def _score_maps(
     return scored
 
 
-def _score_rows(made: _Made, adapted: Bool, settings: GroupSettings) -> Iterator[pd.DataFrame]:
+def _score_rows(scoring: _Made, adapted: Bool, settings: GroupSettings) -> Iterator[pd.DataFrame]:
     """List scores: of maps over regions, of summary measures also centiles."""
     maps = set()
-    for name, found in made.scored.items():
-        maps |= {(hemi, measure) for hemi, one in found.items() for measure in one.scores}
-        for rows in map_rows(made.cohorts[name], found, settings):
+    for name, scored in scoring.scored.items():
+        maps |= {(hemi, measure) for hemi, one in scored.items() for measure in one.scores}
+        for rows in map_rows(scoring.cohorts[name], scored, settings):
             table = rows.drop(columns="p").rename(columns={"w": "z", "reference": "adapted"})
             yield table[table["z"].notna()].assign(centile=np.nan)
-    for (hemi, measure), (visits, own) in made.found.items():
+    for (hemi, measure), (visits, numbers) in scoring.found.items():
         if (hemi, measure) not in maps:
-            known = visits[made.people.known[visits] & np.isfinite(own[:, 0])]
-            z = made.norms[hemi, measure].score(own[known], made.people.take(known))[:, 0]
-            columns = {"adapted": adapted[known], "z": z, "low": np.nan, "high": np.nan}
-            what = {"hemi": hemi, "measure": measure, "region": None, **columns}
-            yield score_rows(made.cohorts[""], known, **what, centile=100 * special.ndtr(z))
+            rows_known = visits[scoring.people.known[visits] & np.isfinite(numbers[:, 0])]
+            z = scoring.norms[hemi, measure].score(
+                numbers[rows_known], scoring.people.take(rows_known)
+            )[:, 0]
+            columns = {"adapted": adapted[rows_known], "z": z, "low": np.nan, "high": np.nan}
+            labels = {"hemi": hemi, "measure": measure, "region": None, **columns}
+            yield score_rows(
+                scoring.cohorts[""], rows_known, **labels, centile=100 * special.ndtr(z)
+            )
 
 
-def _figures(made: _Made) -> Iterator[tuple[str, Drawing]]:
+def _figures(scoring: _Made) -> Iterator[tuple[str, Drawing]]:
     """List charts of summary measures, and maps."""
-    if "centiles" in made.tables:
-        for measure, own in made.tables["centiles"].groupby("measure", sort=False):
-            yield f"{measure}_norms", partial(draw_norms, own, _dots(made, own))
-    for surface, cohort in made.cohorts.items():
+    if "centiles" in scoring.tables:
+        for measure, centiles in scoring.tables["centiles"].groupby("measure", sort=False):
+            yield f"{measure}_norms", partial(draw_norms, centiles, _dots(scoring, centiles))
+    for surface, cohort in scoring.cohorts.items():
         for measure in dict.fromkeys(n for side in cohort.sides.values() for n in side.maps):
-            sides = {h: one for h, one in cohort.sides.items() if (h, measure) in made.norms}
+            sides = {h: one for h, one in cohort.sides.items() if (h, measure) in scoring.norms}
             places = {hemi: points_of(one) for hemi, one in sides.items()}
             unit = cohort.units.get(measure, "1")
-            middle = made.file.middle
-            means = {hemi: made.norms[hemi, measure].expected(middle) for hemi in sides}
+            middle = scoring.file.middle
+            means = {hemi: scoring.norms[hemi, measure].expected(middle) for hemi in sides}
             rows = norm_rows(means, float(middle.age[0]), measure, unit)
-            if made.adapted is not None:
-                rows = deviation_rows(made.scored[surface], measure)
+            if scoring.adapted is not None:
+                rows = deviation_rows(scoring.scored[surface], measure)
             yield f"{measure}_normmaps", partial(draw_maps, cohort, places, list(rows))
 
 
-def _dots(made: _Made, lines: pd.DataFrame) -> pd.DataFrame:
+def _dots(scoring: _Made, lines: pd.DataFrame) -> pd.DataFrame:
     """Collect values of new people as they would be at the average site."""
-    sexes, blocks = made.file.sexes or [files.MISSING], []
+    sexes, blocks = scoring.file.sexes or [files.MISSING], []
     for key in lines[["hemi", "measure"]].drop_duplicates().itertuples(index=False, name=None):
-        rows, own = made.found[key]
-        rows, own = (rows, own) if made.adapted is not None else (rows[:0], own[:0])
-        who = made.people.take(rows)
-        level = (who.sex @ np.arange(1, len(sexes))).astype(np.int64)
-        what = {"hemi": key[0], "sex": np.array(sexes)[level], "age": who.age}
-        moved = made.norms[key].average_site(own, who)[:, 0]
-        adapted = np.zeros(0, bool) if made.adapted is None else made.adapted
-        blocks.append(pd.DataFrame({**what, "value": moved, "adapted": adapted}))
+        rows, numbers = scoring.found[key]
+        rows, numbers = (rows, numbers) if scoring.adapted is not None else (rows[:0], numbers[:0])
+        people_here = scoring.people.take(rows)
+        level = (people_here.sex @ np.arange(1, len(sexes))).astype(np.int64)
+        labels = {"hemi": key[0], "sex": np.array(sexes)[level], "age": people_here.age}
+        moved = scoring.norms[key].average_site(numbers, people_here)[:, 0]
+        adapted = np.zeros(0, bool) if scoring.adapted is None else scoring.adapted
+        blocks.append(pd.DataFrame({**labels, "value": moved, "adapted": adapted}))
     return pd.concat(blocks, ignore_index=True).dropna()

@@ -35,18 +35,21 @@ def retest_cohort(cohort: Cohort, least: int) -> RetestCohort:
     table = cohort.table
     counts = table[SESSION].fillna("").value_counts().sort_index()
     sessions = tuple(str(name) for name in counts.index if name)
-    own = table[PARTICIPANT].map(table.groupby(PARTICIPANT)[SESSION].nunique())
-    complete = (own == len(sessions)).to_numpy()
+    session_counts = table[PARTICIPANT].map(table.groupby(PARTICIPANT)[SESSION].nunique())
+    complete = (session_counts == len(sessions)).to_numpy()
     n = int(table.loc[complete, PARTICIPANT].nunique())
-    found = listed([f"{name or 'without a name'} ({count})" for name, count in counts.items()])
+    sessions_text = listed(
+        [f"{name or 'without a name'} ({count})" for name, count in counts.items()]
+    )
     if len(sessions) < 2:  # noqa: PLR2004 -- two sessions
         raise ModelError(
-            f"--retest: there is no second session, only {found}; measure repeated sessions first"
+            f"--retest: there is no second session, only {sessions_text}; measure repeated sessions"
+            " first"
         )
     if n < least:
         raise ModelError(
-            f"--retest: {n} participants have all of the sessions {found}, at least {least} are"
-            " needed; name sessions that more have by --session-label"
+            f"--retest: {n} participants have all of the sessions {sessions_text}, at least {least}"
+            " are needed; name sessions that more have by --session-label"
         )
     lacking = {
         str(visit): "the participant lacks one of the sessions " + " ".join(sessions)
@@ -90,11 +93,11 @@ class Retested:
     """Rows of the table of which summary measures are taken; all."""
 
     def __init__(
-        self, retest: RetestCohort, settings: GroupSettings, *, several: bool = False
+        self, retest: RetestCohort, settings: GroupSettings, *, has_visits: bool = False
     ) -> None:
-        """Take variances of one visit of a trial, or of ``several`` visits."""
+        """Take variances of one visit of a trial, or of several."""
         self.retest = retest
-        self._several, self._settings = several, settings.retest
+        self._has_visits, self._settings = has_visits, settings.retest
 
     def describe(self, layer: Layer) -> Described:
         """Describe the agreement of sessions at each point, and mean and variance."""
@@ -105,11 +108,11 @@ class Retested:
             least=self._settings.min_participants,
         )
         # Of one visit, the variance between and within; of several, that within.
-        freedom = agreed.n * (len(self.retest.sessions) - 1) if self._several else agreed.n - 1
+        freedom = agreed.n * (len(self.retest.sessions) - 1) if self._has_visits else agreed.n - 1
         reference = Reference(
             n=agreed.n,
             mean=agreed.mean,
-            variance=agreed.within**2 + (0.0 if self._several else agreed.between**2),
+            variance=agreed.within**2 + (0.0 if self._has_visits else agreed.between**2),
             freedom=np.maximum(freedom, 1.0),
         )
         return Described(
@@ -123,7 +126,7 @@ class Retested:
     def words(self, cite: Callable[[str], str]) -> str:
         """Name what means and variances rest on."""
         text = f"these repeated sessions {cite('bland')}"
-        if self._several:
+        if self._has_visits:
             text += (
                 "; true changes were taken to be the same in all participants, so that the numbers"
                 " are lower limits"
@@ -185,9 +188,9 @@ class Modeled:
             rows = layer.rows[points.used]
         else:
             rows, data = layer.rows, layer.data
-            known = np.flatnonzero(np.isfinite(data[:, 0]))
+            rows_known = np.flatnonzero(np.isfinite(data[:, 0]))
             contrasts = self.model.design.contrasts
-            fit = self.model.fit_measures(data[known], known, contrasts, self._settings)
+            fit = self.model.fit_measures(data[rows_known], rows_known, contrasts, self._settings)
         return Described(
             layer=layer,
             tables={},
@@ -198,8 +201,8 @@ class Modeled:
 
     def _reference(self, rows: Int, values: Float, fit: PointwiseFit) -> Reference:
         """At one visit with the residual variance; over time with changes and both variances."""
-        who = self._table[PARTICIPANT].iloc[rows].to_numpy()
-        n = participants_with(np.isfinite(values), who)
+        participants = self._table[PARTICIPANT].iloc[rows].to_numpy()
+        n = participants_with(np.isfinite(values), participants)
         plain = Reference(
             n=n,
             mean=mean_of_known(values, 0),

@@ -39,11 +39,11 @@ def score_cohort(
     tell("w-scores")
     factor, level = normative
     formula = without_variable(model.formula, factor)
-    known = closed_formula(formula).names
+    variables = closed_formula(formula).names
     check_names([factor], cohort.table.columns)
-    chosen = {name: text for name, text in references.items() if name in known}
+    levels = {name: text for name, text in references.items() if name in variables}
     spec = replace(model, formula=formula, contrasts=(), dummy=None)
-    design = build_design(cohort.table, spec, settings.design, chosen)
+    design = build_design(cohort.table, spec, settings.design, levels)
     column = cohort.table[factor].astype(object).iloc[design.rows]
     reference = (column.astype(str) == level).to_numpy()
     if not reference.any():
@@ -53,18 +53,21 @@ def score_cohort(
         )
     sides = {}
     for hemi, side in cohort.sides.items() if measures.maps else ():
-        _, used, rows = np.intersect1d(side.rows, design.rows, return_indices=True)
-        matrix, own = design.matrix[rows], reference[rows]
+        _, positions, rows = np.intersect1d(side.rows, design.rows, return_indices=True)
+        matrix, is_reference = design.matrix[rows], reference[rows]
         sides[hemi] = ScoredMaps(
             rows=design.rows[rows],
-            reference=own,
+            reference=is_reference,
             scores={
                 name: w_scores(
-                    side.maps[name][used].reshape(len(used), -1), matrix, own, settings.glm
+                    side.maps[name][positions].reshape(len(positions), -1),
+                    matrix,
+                    is_reference,
+                    settings.glm,
                 )
                 for name in measures.maps
             },
-            subfield=most_frequent(side.subfield[used], len(side.names)),
+            subfield=most_frequent(side.subfield[positions], len(side.names)),
             names=side.names,
         )
     parts = list(map_rows(cohort, sides, settings))
@@ -75,11 +78,16 @@ def score_cohort(
         if values.columns.empty:
             continue
         numbers = values.to_numpy(dtype=np.float64)
-        found = w_scores(numbers, design.matrix, reference, settings.glm)
+        scores_of = w_scores(numbers, design.matrix, reference, settings.glm)
         for i, measure in enumerate(map(str, values.columns)):
-            what = {"hemi": hemi, "measure": measure, "region": None, "reference": reference}
-            numbers_of = {"w": found.w[:, i], "p": found.p[:, i], "low": np.nan, "high": np.nan}
-            parts.append(score_rows(cohort, design.rows, **what, **numbers_of))
+            labels = {"hemi": hemi, "measure": measure, "region": None, "reference": reference}
+            numbers_of = {
+                "w": scores_of.w[:, i],
+                "p": scores_of.p[:, i],
+                "low": np.nan,
+                "high": np.nan,
+            }
+            parts.append(score_rows(cohort, design.rows, **labels, **numbers_of))
     return Scores(
         factor=factor,
         level=level,
@@ -109,12 +117,12 @@ def map_rows(
         fields = side.subfield.ravel()
         regions = {WHOLE: np.ones(len(fields), dtype=bool)}
         regions |= {name: fields == i for i, name in enumerate(side.names)}
-        for measure, found in side.scores.items():
-            out = found.p < alpha
+        for measure, scored in side.scores.items():
+            out = scored.p < alpha
             for region, points in regions.items():
                 if not points.any():
                     continue
-                w = found.w[:, points]
+                w = scored.w[:, points]
                 count = np.isfinite(w).sum(axis=1).astype(np.float64)
                 count[count == 0] = np.nan
                 yield score_rows(

@@ -63,22 +63,22 @@ class Meta:
 
     def tests(self, item: Item) -> Iterator[tuple[MapKey, PointTest, Combined]]:
         """A combined estimate as tests; Cohen's d is over the residual SD within sites."""
-        sd, none = item.result.sd, np.full(len(item.result.sd), np.nan)
-        for effects, one in item.result.models.items():
-            limits = one.limits(self.settings.meta.confidence)
+        sd, missing = item.result.sd, np.full(len(item.result.sd), np.nan)
+        for effects, effects_of_kind in item.result.models.items():
+            limits = effects_of_kind.limits(self.settings.meta.confidence)
             test = PointTest(
                 contrast=Contrast(item.label(effects), np.ones(1)),
-                statistic=one.statistic,
-                p=one.p,
-                df=one.df,
-                estimate=one.estimate[None],
-                se=one.se[None],
-                cohen_d=one.estimate / sd,
+                statistic=effects_of_kind.statistic,
+                p=effects_of_kind.p,
+                df=effects_of_kind.df,
+                estimate=effects_of_kind.estimate[None],
+                se=effects_of_kind.se[None],
+                cohen_d=effects_of_kind.estimate / sd,
                 cohen_d_limits=np.stack(limits) / sd,
-                eta_squared=none,
-                eta_squared_limits=np.stack([none, none]),
+                eta_squared=missing,
+                eta_squared_limits=np.stack([missing, missing]),
             )
-            yield item.key(effects), test, one
+            yield item.key(effects), test, effects_of_kind
 
     def of(self, kind: str) -> Iterator[Item]:
         """Contrasts of maps, or of summary measures."""
@@ -128,8 +128,8 @@ def check_agreement(sites: Sequence[SiteSummary]) -> list[str]:
                 words = [", ".join(f"{weight:.6g}" for weight in row) for row in rows]
                 item = f"{title}: weights of {name} on {', '.join(model.columns)}"
                 _agree(sites, item, words, _BY_COLUMNS)
-    several = len({site.version for site in sites}) > 1
-    return ["sites used several versions of hipsta_bids, see sites.tsv"] if several else []
+    is_mixed = len({site.version for site in sites}) > 1
+    return ["sites used several versions of hipsta_bids, see sites.tsv"] if is_mixed else []
 
 
 def _agree(
@@ -139,18 +139,18 @@ def _agree(
     remedy: str = "all sites need the same",
 ) -> None:
     usual = Counter(values).most_common(1)[0][0]
-    for site, own in zip(sites, values, strict=True):
-        if own != usual:
-            other = sites[values.index(usual)].site
+    for site, value in zip(sites, values, strict=True):
+        if value != usual:
+            usual_site = sites[values.index(usual)].site
             raise ModelError(
-                f"site {site.site}: {item}: {shorten(own, _LONGEST)}, but at {other}"
+                f"site {site.site}: {item}: {shorten(value, _LONGEST)}, but at {usual_site}"
                 f" {shorten(usual, _LONGEST)}; {remedy}"
             )
 
 
 def _agree_on_measures(sites: Sequence[SiteSummary]) -> None:
     """Refuse sites that lack a map or summary measure of others."""
-    own = [
+    names_of = [
         [
             f"{name}, {model.hemi} ({'map' if model.kind == 'map' else model.formula})"
             for model in site.models
@@ -158,9 +158,9 @@ def _agree_on_measures(sites: Sequence[SiteSummary]) -> None:
         ]
         for site in sites
     ]
-    every = list(dict.fromkeys(name for names in own for name in names))
-    for site, names in zip(sites, own, strict=True):
-        if lacking := [name for name in every if name not in names]:
+    all_names = list(dict.fromkeys(name for names in names_of for name in names))
+    for site, names in zip(sites, names_of, strict=True):
+        if lacking := [name for name in all_names if name not in names]:
             raise ModelError(
                 f"site {site.site}: lacks {listed(lacking)}; give all sites the same --measures"
             )
@@ -191,14 +191,14 @@ def analyze_sites(sites: list[SiteSummary], settings: GroupSettings) -> Meta:
         for contrast in model.contrasts
     ]
     maps = [item for item in items if item.model.kind == "map"]
-    found = discover(
+    discoveries = discover(
         {item.key(name): one.p for item in maps for name, one in item.result.models.items()},
         settings.multiplicity,
     )
     frames: dict[str, columns.Frame] = {
         item.model.hemi: _frame(sites, item.number) for item in reversed(maps)
     }
-    return Meta(sites=sites, items=items, found=found, frame=frames, settings=settings)
+    return Meta(sites=sites, items=items, found=discoveries, frame=frames, settings=settings)
 
 
 def _frame(sites: Sequence[SiteSummary], number: int) -> columns.Frame:
@@ -225,24 +225,24 @@ def meta_tables(meta: Meta) -> Iterator[tuple[str, pd.DataFrame]]:
     rows, peaks, forests = [], [], []
     for item in meta.of("map"):
         frame = meta.frame[item.model.hemi]
-        own = []
-        for key, test, one in meta.tests(item):
-            found = meta.found[key]
+        tables_of_side = []
+        for key, test, combined in meta.tests(item):
+            discoveries = meta.found[key]
             stem = tables.map_name(key.hemi, key.measure, key.contrast)
-            rows.append(columns.overview_row(stem, key, found))
-            low, high = one.limits(confidence)
+            rows.append(columns.overview_row(stem, key, discoveries))
+            low, high = combined.limits(confidence)
             values = {
-                **columns.point_columns(test, found, frame, meta.counts(item).astype(int)),
+                **columns.point_columns(test, discoveries, frame, meta.counts(item).astype(int)),
                 "n_sites": item.result.random.sites.astype(int),
                 "estimate_low": low,
                 "estimate_high": high,
                 **_between(item),
             }
             yield stem, pd.DataFrame(values)
-            table = columns.peak_table(test, found, frame, edges)
+            table = columns.peak_table(test, discoveries, frame, edges)
             peaks.append(table.assign(measure=key.measure, hemi=key.hemi))
-            own.append(table)
-        forests += [_forest(meta, item, point) for point in _points(own, frame)]
+            tables_of_side.append(table)
+        forests += [_forest(meta, item, point) for point in _points(tables_of_side, frame)]
     if rows:
         yield "maps", pd.DataFrame(rows)
         table = pd.concat(peaks, ignore_index=True)
@@ -250,8 +250,8 @@ def meta_tables(meta: Meta) -> Iterator[tuple[str, pd.DataFrame]]:
     if list(meta.of("summary")):
         yield "measures", _summaries(meta)
     for item in meta.of("summary"):
-        known = np.flatnonzero(np.isfinite(item.result.random.estimate))
-        forests += [_forest(meta, item, int(point)) for point in known]
+        tested = np.flatnonzero(np.isfinite(item.result.random.estimate))
+        forests += [_forest(meta, item, int(point)) for point in tested]
     if forests:
         yield (
             "forest",
@@ -284,25 +284,25 @@ def _points(peaks: Sequence[pd.DataFrame], frame: columns.Frame) -> list[int]:
     table = pd.concat(peaks, ignore_index=True)
     if not len(table):
         return []
-    own = table[table["extent"] > 0] if (table["extent"] > 0).any() else table.tail(1)
-    own = own.reindex(own["statistic"].abs().sort_values(ascending=False, kind="stable").index)
+    rows = table[table["extent"] > 0] if (table["extent"] > 0).any() else table.tail(1)
+    rows = rows.reindex(rows["statistic"].abs().sort_values(ascending=False, kind="stable").index)
     x, y = (frame.position[axis].tolist() for axis in "xy")
     at = {place: point for point, place in enumerate(zip(x, y, strict=True))}
     nodes = np.stack([frame.number["node_x"], frame.number["node_y"]])
-    kept: list[int] = []
-    for place in zip(own["x"].tolist(), own["y"].tolist(), strict=True):
-        away = np.abs(nodes[:, kept] - nodes[:, [at[place]]]).max(axis=0)
+    nodes_kept: list[int] = []
+    for place in zip(rows["x"].tolist(), rows["y"].tolist(), strict=True):
+        distance = np.abs(nodes[:, nodes_kept] - nodes[:, [at[place]]]).max(axis=0)
         # Both models have the same cluster's peak there, or nearly.
-        if (away > _SAME_PEAK).all():
-            kept.append(at[place])
-    return kept[:_MOST_PEAKS]
+        if (distance > _SAME_PEAK).all():
+            nodes_kept.append(at[place])
+    return nodes_kept[:_MOST_PEAKS]
 
 
 def _forest(meta: Meta, item: Item, point: int) -> pd.DataFrame:
     """Everything in a forest plot: a row per site, and one per combined estimate."""
     result, confidence = item.result, meta.settings.meta.confidence
     is_map = item.model.kind == "map"
-    what: dict[str, Any] = {
+    labels: dict[str, Any] = {
         "measure": item.model.measures[0 if is_map else point],
         "unit": item.model.units[0 if is_map else point],
         "hemi": item.model.hemi,
@@ -311,37 +311,39 @@ def _forest(meta: Meta, item: Item, point: int) -> pd.DataFrame:
     }
     if is_map:
         frame = meta.frame[item.model.hemi]
-        what |= {name: own[point] for name, own in frame.position.items()}
-        what["subfield"] = frame.subfield[point]
+        labels |= {name: site_effect[point] for name, site_effect in frame.position.items()}
+        labels["subfield"] = frame.subfield[point]
     rows: list[dict[str, Any]] = []
     for number, site in enumerate(meta.sites):
         df = np.full(result.sd.shape, site.models[item.number].df, dtype=np.float64)
-        own = Combined(estimate=result.estimates[number], se=result.ses[number], df=df)
+        site_effect = Combined(estimate=result.estimates[number], se=result.ses[number], df=df)
         row = {"site": site.site, "kind": "site", "n": site.participants}
-        row |= _row(own, point, confidence) | {"weight": result.random.weights[number, point]}
+        row |= _row(site_effect, point, confidence) | {
+            "weight": result.random.weights[number, point]
+        }
         if result.without:
-            rest = _row(result.without[number].random, point, confidence)
-            del rest["se"]
-            row |= {f"without_{k.removeprefix('estimate_')}": v for k, v in rest.items()}
+            row_without = _row(result.without[number].random, point, confidence)
+            del row_without["se"]
+            row |= {f"without_{k.removeprefix('estimate_')}": v for k, v in row_without.items()}
         rows.append(row)
     n = int(meta.counts(item)[point])
-    for name, one in result.models.items():
-        rows.append({"site": name, "kind": name, "n": n, **_row(one, point, confidence)})
+    for name, combined in result.models.items():
+        rows.append({"site": name, "kind": name, "n": n, **_row(combined, point, confidence)})
     rows[-1] |= {name: values[point] for name, values in _between(item).items()}
     low, high = result.random.prediction(confidence)
     limits = {"estimate_low": low[point], "estimate_high": high[point]}
     rows.append({"site": _PREDICTION, "kind": _PREDICTION, **limits})
-    return pd.DataFrame([{**what, **row} for row in rows])
+    return pd.DataFrame([{**labels, **row} for row in rows])
 
 
-def _row(one: Combined, point: int, confidence: float) -> dict[str, float]:
-    low, high = one.limits(confidence)
+def _row(combined: Combined, point: int, confidence: float) -> dict[str, float]:
+    low, high = combined.limits(confidence)
     return {
-        "estimate": one.estimate[point],
-        "se": one.se[point],
+        "estimate": combined.estimate[point],
+        "se": combined.se[point],
         "estimate_low": low[point],
         "estimate_high": high[point],
-        "p": one.p[point],
+        "p": combined.p[point],
     }
 
 
@@ -350,9 +352,9 @@ def _summaries(meta: Meta) -> pd.DataFrame:
     confidence, least = meta.settings.meta.confidence, meta.settings.meta.min_sites
     parts = []
     for item in meta.of("summary"):
-        other = combine(item.result.estimates, item.result.ses**2, "dl", least=least)
-        for key, test, one in meta.tests(item):
-            low, high = one.limits(confidence)
+        two_stage = combine(item.result.estimates, item.result.ses**2, "dl", least=least)
+        for key, test, combined in meta.tests(item):
+            low, high = combined.limits(confidence)
             parts.append(
                 pd.DataFrame(
                     {
@@ -371,9 +373,9 @@ def _summaries(meta: Meta) -> pd.DataFrame:
                         "estimate_high": high,
                         **columns.effect_columns(test),
                         **_between(item),
-                        "estimate_dl": other.estimate,
-                        "se_dl": other.se,
-                        "p_dl": other.p,
+                        "estimate_dl": two_stage.estimate,
+                        "se_dl": two_stage.se,
+                        "p_dl": two_stage.p,
                     }
                 )
             )
@@ -386,23 +388,25 @@ def _left_out(meta: Meta) -> Iterator[dict[str, Any]]:
     """Count what survives without each site, and how far estimates move."""
     maps = [item for item in meta.of("map") if item.result.without]
     for number, site in enumerate(meta.sites if maps else ()):
-        rest = {
+        without = {
             item.key(name): one
             for item in maps
             for name, one in item.result.without[number].models.items()
         }
-        found = discover({key: one.p for key, one in rest.items()}, meta.settings.multiplicity)
+        discoveries = discover(
+            {key: one.p for key, one in without.items()}, meta.settings.multiplicity
+        )
         for item in maps:
             for name, all_sites in item.result.models.items():
                 key = item.key(name)
-                moved = np.abs(rest[key].estimate - all_sites.estimate) / item.result.sd
-                both = found[key].rejected & meta.found[key].rejected
+                moved = np.abs(without[key].estimate - all_sites.estimate) / item.result.sd
+                overlap = discoveries[key].rejected & meta.found[key].rejected
                 yield {
                     "measure": key.measure,
                     "contrast": key.contrast,
                     "hemi": key.hemi,
                     "site": site.site,
-                    "n_significant": int(found[key].rejected.sum()),
-                    "n_kept": int(both.sum()),
+                    "n_significant": int(discoveries[key].rejected.sum()),
+                    "n_kept": int(overlap.sum()),
                     "largest_change": float(np.nan_to_num(moved).max(initial=0.0)),
                 }

@@ -39,7 +39,7 @@ ERROR_WINDOW = 5
 
 
 #: Hemispheres that notes name.
-_SHOWN = 4
+_MOST_NOTES = 4
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -245,13 +245,15 @@ def _read_maps(
 
 
 def _damaged(measured: read.Measured) -> tuple[str, ...]:
-    shown = [
+    lines = [
         f"{one.participant}{f' {one.session}' if one.session else ''}, hemisphere {one.hemi}, is"
         f" left out: {one.message}; measure it again"
-        for one in measured.damaged[:_SHOWN]
+        for one in measured.damaged[:_MOST_NOTES]
     ]
-    more = len(measured.damaged) - _SHOWN
-    return (*shown, f"{more} more are left out alike, see excluded.tsv") if more > 0 else (*shown,)
+    n_left = len(measured.damaged) - _MOST_NOTES
+    return (
+        (*lines, f"{n_left} more are left out alike, see excluded.tsv") if n_left > 0 else (*lines,)
+    )
 
 
 def with_page(options: GroupOptions, result: GroupResult) -> GroupResult:
@@ -307,13 +309,13 @@ def members(table: pd.DataFrame, among: tuple[str, str] | None, option: str = "-
     column, level = among
     check_names([column], table.columns)
     values = table[column].map(lambda value: None if value is None else str(value))
-    keep = (values == level).to_numpy()
-    if not keep.any():
+    is_member = (values == level).to_numpy()
+    if not is_member.any():
         raise ModelError(
             f"{option} {column}={level}: no participant has it; there are"
             f" {listed(sorted(values.dropna().unique()))}"
         )
-    return np.asarray(keep, dtype=bool)
+    return np.asarray(is_member, dtype=bool)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -340,7 +342,7 @@ class Study:
         tell("reading")
         inputs = read_inputs(options, settings)
         keep = members(inputs.cohort.table, among)
-        why = "not-asked", "another level than --among"
+        reason = "not-asked", "another level than --among"
         return cls(
             options=options,
             settings=settings,
@@ -348,7 +350,7 @@ class Study:
             among=among,
             keep=keep,
             cohort=inputs.cohort.take(keep),
-            left_out=dict.fromkeys(map(str, inputs.cohort.table.index[~keep]), why),
+            left_out=dict.fromkeys(map(str, inputs.cohort.table.index[~keep]), reason),
         )
 
     def register(
@@ -382,14 +384,14 @@ class Study:
         """Write what these questions share, and a page; ``fill`` writes all else, and notes."""
         excluded = collect.exclude_visits(self.inputs.cohort.table, self.left_out)
         excluded = [*self.inputs.exclusions, *excluded]
-        told, people = [*self.inputs.notes, *notes], int(visits[PARTICIPANT].nunique())
+        all_notes, people = [*self.inputs.notes, *notes], int(visits[PARTICIPANT].nunique())
 
         def everything(folder: Path) -> dict[str, Any]:
             for title, table in tables.items():
                 write.write_table(folder, title, table)
             write.write_exclusions(folder, excluded)
             write.write_table(folder, "covariates", visits, described=False)
-            told.extend(fill(folder))
+            all_notes.extend(fill(folder))
             return {"participants": people, "rows": len(visits), **record}
 
         result = write_folder(
@@ -397,7 +399,7 @@ class Study:
             name,
             self.inputs,
             self.settings,
-            notes=told,
+            notes=all_notes,
             counts=(people, len(excluded)),
             fill=everything,
         )

@@ -26,7 +26,7 @@ def fit_summaries(
     design: Design,
     settings: GroupSettings,
     *,
-    only: Sequence[str] | None,
+    names: Sequence[str] | None,
     references: Mapping[str, str],
     icv: str | None,
     rows_of: Callable[[Design], RowModel] = RowModel,
@@ -37,21 +37,21 @@ def fit_summaries(
     def fit(formula: str, model: RowModel, start: str = "") -> None:
         rows = model.design.rows
         for hemi in hemispheres(cohort):
-            values = summary_values(cohort, hemi, only).iloc[rows]
+            values = summary_values(cohort, hemi, names).iloc[rows]
             named = values.columns.astype(str).str.startswith(start)
             values = values.loc[:, named & (values.max() > values.min()).to_numpy()]
             if not values.columns.size:
                 continue
             present = np.flatnonzero(values.notna().any(axis=1).to_numpy())
             maps: Float = values.to_numpy(dtype=np.float64)[present]
-            who = cohort.table[PARTICIPANT].iloc[rows[present]].to_numpy()
+            participants = cohort.table[PARTICIPANT].iloc[rows[present]].to_numpy()
             fits.append(
                 MeasureFit(
                     hemi=hemi,
                     measures=tuple(values.columns),
                     formula=formula,
                     fit=model.fit_measures(maps, present, model.design.contrasts, settings),
-                    participants=participants_with(np.isfinite(maps), who),
+                    participants=participants_with(np.isfinite(maps), participants),
                 )
             )
 

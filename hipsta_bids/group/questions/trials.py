@@ -75,7 +75,7 @@ def run_trial(
     tell("points and measures")
     source: reference.Source
     if repeated is not None:
-        source = reference.Retested(repeated, settings, several=visits)
+        source = reference.Retested(repeated, settings, has_visits=visits)
     else:
         source = reference.Modeled(cohort, options.model, settings, inputs.time)
         for variable, lacking in source.model.design.dropped.items():
@@ -131,8 +131,8 @@ def _sample_sizes(
     Such a map has none, a summary measure keeps its row.
     """
     moments, single = result.reference, result.layer.surface == SUMMARY
-    known = result.data[np.isfinite(result.data)]
-    if effect.kind == trials.THINNING and known.min(initial=1.0) <= 0:
+    finite = result.data[np.isfinite(result.data)]
+    if effect.kind == trials.THINNING and finite.min(initial=1.0) <= 0:
         if not single:
             return {}
         moments = replace(moments, mean=np.full_like(moments.mean, np.nan))
@@ -166,8 +166,8 @@ def _notes(
             "sample sizes rest on the variance of measurement alone; trials need more, as people"
             " differ in how they change"
         )
-    if later := sum(exclusion.reason == "later-session" for exclusion in inputs.exclusions):
-        yield f"{later} later sessions are not in it; --visits takes all"
+    if n_later := sum(exclusion.reason == "later-session" for exclusion in inputs.exclusions):
+        yield f"{n_later} later sessions are not in it; --visits takes all"
 
 
 def _methods(

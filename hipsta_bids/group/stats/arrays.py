@@ -54,22 +54,22 @@ class WarpedLabels:
         """Sheets, x, y."""
         return self.source.shape
 
-    def __getitem__(self, own: slice | Bool | Int) -> NDArray[np.int8]:
-        return self.carry(self.source[own], self.warps[own])
+    def __getitem__(self, rows: slice | Bool | Int) -> NDArray[np.int8]:
+        return self.carry(self.source[rows], self.warps[rows])
 
 
-def some_sheets(maps: Mapping[str, Float], own: slice | Bool) -> Mapping[str, Float]:
+def some_sheets(maps: Mapping[str, Float], rows: slice | Bool) -> Mapping[str, Float]:
     """Keep some sheets of maps."""
     if isinstance(maps, WarpedMaps):
-        return WarpedMaps(some_sheets(maps.source, own), maps.warps[own], maps.carry)
-    return {name: values[own] for name, values in maps.items()}
+        return WarpedMaps(some_sheets(maps.source, rows), maps.warps[rows], maps.carry)
+    return {name: values[rows] for name, values in maps.items()}
 
 
-def sheets_of(maps: Mapping[str, Float], name: str, own: Bool | Int) -> Float:
+def sheets_of(maps: Mapping[str, Float], name: str, rows: Bool | Int) -> Float:
     """Take some sheets of one map; only these are registered, if need be."""
     if isinstance(maps, WarpedMaps):
-        return maps.carry(maps.source[name][own], maps.warps[own])
-    return maps[name][own]
+        return maps.carry(maps.source[name][rows], maps.warps[rows])
+    return maps[name][rows]
 
 
 def parts_of_sheets(maps: Mapping[str, Float], name: str, own: Bool | Int) -> Iterator[Float]:
@@ -120,20 +120,20 @@ class SideMaps:
 
     def take(self, keep: NDArray[np.bool_]) -> "SideMaps":
         """Keep some rows of the cohort's table, which are renumbered."""
-        own = self.sheets(keep[self.rows])
-        return replace(own, rows=(np.cumsum(keep) - 1)[own.rows])
+        side = self.sheets(keep[self.rows])
+        return replace(side, rows=(np.cumsum(keep) - 1)[side.rows])
 
-    def sheets(self, own: NDArray[np.bool_]) -> "SideMaps":
+    def sheets(self, keep: NDArray[np.bool_]) -> "SideMaps":
         """Keep some sheets; of all, no copy is made."""
-        if own.all():
+        if keep.all():
             return self
         return replace(
             self,
-            rows=self.rows[own],
-            maps=some_sheets(self.maps, own),
-            errors=some_sheets(self.errors, own),
-            subfield=self.subfield[own],
-            summary=self.summary[own].reset_index(drop=True),
+            rows=self.rows[keep],
+            maps=some_sheets(self.maps, keep),
+            errors=some_sheets(self.errors, keep),
+            subfield=self.subfield[keep],
+            summary=self.summary[keep].reset_index(drop=True),
         )
 
 
@@ -145,9 +145,9 @@ def return_memory() -> None:
 
 def mean_of_known(values: Float, axis: int) -> Float:
     """Mean without what is missing; NaN where nothing is known."""
-    known = np.isfinite(values)
-    count = known.sum(axis=axis)
-    total = values.sum(axis=axis, dtype=np.float64, where=known)
+    finite = np.isfinite(values)
+    count = finite.sum(axis=axis)
+    total = values.sum(axis=axis, dtype=np.float64, where=finite)
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
@@ -156,19 +156,21 @@ def describe_known(parts: Iterable[Float]) -> tuple[Bool, Float, Float]:
 
     Means and sums of squares of parts are put together as by Chan et al. (1983).
     """
-    known, count, mean, squares = [], np.zeros(1, np.int64), np.zeros(1), np.zeros(1)
+    finite, count, mean, squares = [], np.zeros(1, np.int64), np.zeros(1), np.zeros(1)
     for values in parts:
-        known.append(np.isfinite(values))
-        n = known[-1].sum(axis=0)
-        both = np.maximum(count + n, 1)
-        own = np.nan_to_num(mean_of_known(values, 0))
-        squares = squares + np.sum((values - own) ** 2, axis=0, dtype=np.float64, where=known[-1])
-        squares += (own - mean) ** 2 * count * n / both
-        mean = mean + (own - mean) * n / both
+        finite.append(np.isfinite(values))
+        n = finite[-1].sum(axis=0)
+        total = np.maximum(count + n, 1)
+        block_mean = np.nan_to_num(mean_of_known(values, 0))
+        squares = squares + np.sum(
+            (values - block_mean) ** 2, axis=0, dtype=np.float64, where=finite[-1]
+        )
+        squares += (block_mean - mean) ** 2 * count * n / total
+        mean = mean + (block_mean - mean) * n / total
         count = count + n
     spread = np.sqrt(squares / np.maximum(count - 1, 1))
     return (
-        np.concatenate(known),
+        np.concatenate(finite),
         np.where(count > 0, mean, np.nan),
         np.where(count > 1, spread, np.nan),
     )

@@ -60,8 +60,10 @@ def roc_curve(score: Float, case: Bool) -> tuple[Float, Float]:
     Of more than a thousand scores, a thousand are taken.
     """
     wrong, right, _ = metrics.roc_curve(case, score, drop_intermediate=False)
-    few = np.linspace(0, len(wrong) - 1, min(len(wrong), _MOST_POINTS)).round().astype(np.int64)
-    return wrong[few], right[few]
+    positions = (
+        np.linspace(0, len(wrong) - 1, min(len(wrong), _MOST_POINTS)).round().astype(np.int64)
+    )
+    return wrong[positions], right[positions]
 
 
 @dataclass(frozen=True)
@@ -209,14 +211,14 @@ def cross_validate(matrix: Float, case: Bool, settings: ClassificationSettings) 
     total, means = np.zeros(len(case)), []
     fold_of = _folds(case.tobytes(), folds, settings.repeats, settings.seed)
     # What all subjects give is near what training sets do.
-    every, settled = logistic.maxima(basis, case, np.ones((1, len(case))))
-    start = every[0] if settled[0] else None
+    coefficients_of_all, settled = logistic.maxima(basis, case, np.ones((1, len(case))))
+    start = coefficients_of_all[0] if settled[0] else None
     parts = min(-(-fold_of.size * folds // _CHUNK), settings.repeats)
-    for some in np.array_split(fold_of, parts):
-        train = some[:, None] != np.arange(folds)[:, None]
+    for folds_here in np.array_split(fold_of, parts):
+        train = folds_here[:, None] != np.arange(folds)[:, None]
         beta = _coefficients(basis, case, train.reshape(-1, len(case)), start)
         for own, by_fold, coefficients in zip(
-            some, train, beta.reshape(len(some), folds, -1), strict=True
+            folds_here, train, beta.reshape(len(folds_here), folds, -1), strict=True
         ):
             score = np.einsum("sj,sj->s", basis, coefficients[own])
             for fold in np.flatnonzero(np.isnan(coefficients[:, 0])):
@@ -231,15 +233,15 @@ def cross_validate(matrix: Float, case: Bool, settings: ClassificationSettings) 
 
 def _coefficients(basis: Float, case: Bool, train: Bool, start: Float | None) -> Float:
     """Coefficients (sets, columns) of training sets (sets, subjects); NaN of those to look at."""
-    kept = train.astype(np.float64)
-    beta, settled = logistic.maxima(basis, case, kept, start)
+    weights = train.astype(np.float64)
+    beta, settled = logistic.maxima(basis, case, weights, start)
     # Steps that do not end lead to where groups are apart, if they are.
     wild = np.flatnonzero(~settled)
-    apart = ((beta[wild] @ basis.T > 0) == case) | ~train[wild]
-    separated = wild[apart.all(axis=1)]
+    is_separated = ((beta[wild] @ basis.T > 0) == case) | ~train[wild]
+    separated = wild[is_separated.all(axis=1)]
     beta[wild] = np.nan
     if len(separated):
-        beta[separated] = logistic.firth_maxima(basis, case, kept[separated])[0]
+        beta[separated] = logistic.firth_maxima(basis, case, weights[separated])[0]
     return beta
 
 
@@ -330,21 +332,21 @@ def compare_pairs(
     complete = np.isfinite(base).all(axis=1) & np.isfinite(added).all(axis=1)
     results = []
     for control, case in combinations(order, 2):
-        both = (groups == control) | (groups == case)
-        used = both & complete
+        in_pair = (groups == control) | (groups == case)
+        rows_used = in_pair & complete
         # Without their means, columns like years of birth are not nearly the constant.
-        centered = [values[used] - values[used].mean(axis=0) for values in (base, added)]
-        matrix = np.column_stack([np.ones(used.sum()), centered[0]])
+        centered = [values[rows_used] - values[rows_used].mean(axis=0) for values in (base, added)]
+        matrix = np.column_stack([np.ones(rows_used.sum()), centered[0]])
         try:
-            found = compare_models(matrix, centered[1], groups[used] == case, settings)
+            comparison = compare_models(matrix, centered[1], groups[rows_used] == case, settings)
         except ModelError as error:
             raise ModelError(f"{control} against {case}: {error}") from error
         results.append(
             PairComparison(
                 control=control,
                 case=case,
-                comparison=found,
-                n_incomplete=int((both & ~complete).sum()),
+                comparison=comparison,
+                n_incomplete=int((in_pair & ~complete).sum()),
             )
         )
     return results

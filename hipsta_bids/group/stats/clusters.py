@@ -42,8 +42,8 @@ def edges_of(maps: SideMaps, neighbors: int) -> Int:
 def label_regions(mask: Bool, edges: Int) -> tuple[Int, int]:
     """Find the connected regions of a mask, numbered from 1 (0 is outside), and their count."""
     inside = np.flatnonzero(mask)
-    own = (np.cumsum(mask) - 1)[edges[mask[edges].all(axis=1)]]
-    count, numbers = _components(own, len(inside))
+    pairs = (np.cumsum(mask) - 1)[edges[mask[edges].all(axis=1)]]
+    count, numbers = _components(pairs, len(inside))
     labels = np.zeros(len(mask), dtype=np.int64)
     labels[inside] = numbers + 1
     return labels, count
@@ -51,8 +51,8 @@ def label_regions(mask: Bool, edges: Int) -> tuple[Int, int]:
 
 def _components(edges: Int, n: int) -> tuple[int, Int]:
     """Count the connected components of n nodes, and number them from 0 by their first node."""
-    ones = np.ones(len(edges), dtype=bool)
-    graph = coo_array((ones, (edges[:, 0], edges[:, 1])), shape=(n, n))
+    links = np.ones(len(edges), dtype=bool)
+    graph = coo_array((links, (edges[:, 0], edges[:, 1])), shape=(n, n))
     count, numbers = connected_components(graph, directed=False)
     return int(count), numbers.astype(np.int64)
 
@@ -83,8 +83,8 @@ def enhance(statistic: Float, edges: Int) -> Float:
         count, merged = _components(region[ends[start[number] : start[number + 1]]], count)
         region = merged[region]
         above = points[first[number] :]
-        own = region[above]
-        extent = np.bincount(own, minlength=count).astype(np.float64)[own]
+        labels = region[above]
+        extent = np.bincount(labels, minlength=count).astype(np.float64)[labels]
         height = heights[number - 1]
         result[above] += extent**TFCE_EXTENT * (height**TFCE_HEIGHT * TFCE_STEP)
     return np.asarray(np.copysign(result, values.ravel()).reshape(values.shape), dtype=np.float64)

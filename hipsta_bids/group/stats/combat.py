@@ -23,7 +23,7 @@ POSTERIOR_STEPS = 200
 POSTERIOR_TOLERANCE = 1e-6
 
 #: Values of a site at a point, below which its variance says nothing about that of other points.
-_FEW = 3
+_LEAST_VISITS = 3
 _LARGEST = 1_000_000_000  # bytes of a file
 
 
@@ -95,34 +95,36 @@ def fit_effects(
     Parameters are NaN at points where missing values leave sites and columns inseparable; moments
     are those of residuals before harmonization.
     """
-    used = np.flatnonzero(visits.site >= 0)
-    values, visits = values[used], visits.take(used)
+    rows = np.flatnonzero(visits.site >= 0)
+    values, visits = values[rows], visits.take(rows)
     member = np.eye(n_sites)[visits.site]
     # Of unit spread around zero, so that the equations are well conditioned.
     center = visits.columns.mean(axis=0)
     spread = visits.columns.std(axis=0)
     spread = np.where(spread > 0, spread, 1.0)
     design = np.hstack([member, (visits.columns - center) / spread])
-    found = np.full((design.shape[1], values.shape[1]), np.nan)
+    coefficients = np.full((design.shape[1], values.shape[1]), np.nan)
     ratio = np.zeros(values.shape[1])
     varies = np.flatnonzero(_varies(values))
     if visits.participant is None:
         for part in chunks((len(values), len(varies)), design.shape[1]):
             points = varies[part]
-            own = values[:, points]
-            present = np.isfinite(own).astype(np.float64)
+            values_here = values[:, points]
+            present = np.isfinite(values_here).astype(np.float64)
             # On the diagonal are numbers of values, but for rounding.
-            found[:, points] = solve_weighted(np.nan_to_num(own), present, design, 0.5)
+            coefficients[:, points] = solve_weighted(
+                np.nan_to_num(values_here), present, design, 0.5
+            )
     elif len(varies):
-        there = np.flatnonzero(design.any(axis=0))
-        any_contrast = Contrast("", np.eye(len(there))[:1])
+        columns_used = np.flatnonzero(design.any(axis=0))
+        any_contrast = Contrast("", np.eye(len(columns_used))[:1])
         names = visits.participant.astype(np.str_)
-        own, matrix = values[:, varies], design[:, there]
-        fit = fit_mixed(own, matrix, names, [any_contrast], settings.longitudinal)
-        found[:, varies] = 0.0
-        found[np.ix_(there, varies)] = fit.coefficients
+        values_here, matrix = values[:, varies], design[:, columns_used]
+        fit = fit_mixed(values_here, matrix, names, [any_contrast], settings.longitudinal)
+        coefficients[:, varies] = 0.0
+        coefficients[np.ix_(columns_used, varies)] = fit.coefficients
         ratio[varies] = fit.variances["participant"] / fit.variances["residual"]
-    sites, slopes = found[:n_sites], found[n_sites:] / spread[:, None]
+    sites, slopes = coefficients[:n_sites], coefficients[n_sites:] / spread[:, None]
     counts = member.T @ np.isfinite(values)
     middle = np.einsum("sp,sp->p", counts, sites) / np.maximum(counts.sum(axis=0), 1)
     effects = SiteEffects(
@@ -135,9 +137,12 @@ def fit_effects(
         scale=np.ones_like(sites),
     )
     square, count = np.zeros((2, values.shape[1]))
-    for part, rest in _residuals(effects, values, visits):
-        rest -= effects.fixed[visits.site, part]  # noqa: PLW2901 -- ours
-        square[part], count[part] = np.nansum(rest**2, axis=0), np.isfinite(rest).sum(axis=0)
+    for part, residuals in _residuals(effects, values, visits):
+        residuals -= effects.fixed[visits.site, part]  # noqa: PLW2901 -- ours
+        square[part], count[part] = (
+            np.nansum(residuals**2, axis=0),
+            np.isfinite(residuals).sum(axis=0),
+        )
     sd = np.sqrt(square / np.maximum(count, 1))
     effects = replace(effects, sd=np.where(sd > 0, sd, np.nan), fixed=effects.fixed / sd)
     return _with_shifts(effects, values, visits, pooled=pooled)
@@ -154,17 +159,17 @@ def extend_effects(
 
     Sites beyond those of the effects are new. The moments are those of the given values.
     """
-    known = len(effects.fixed)
-    used = np.flatnonzero(visits.site >= 0)
-    values, visits = values[used], visits.take(used)
-    total = max(int(visits.site.max(initial=-1)) + 1, known)
+    n_known = len(effects.fixed)
+    rows = np.flatnonzero(visits.site >= 0)
+    values, visits = values[rows], visits.take(rows)
+    total = max(int(visits.site.max(initial=-1)) + 1, n_known)
     wider = np.zeros((total, values.shape[1]))
     flat = replace(effects, ratio=np.zeros_like(effects.ratio), fixed=wider)
-    wider = np.vstack([effects.fixed, _moments(flat, values, visits)[1][known:]])
+    wider = np.vstack([effects.fixed, _moments(flat, values, visits)[1][n_known:]])
     wide = replace(effects, fixed=wider)
     fitted, moments = _with_shifts(wide, values, visits, pooled=pooled)
     shift, scale = fitted.shift.copy(), fitted.scale.copy()
-    shift[:known], scale[:known] = effects.shift, effects.scale
+    shift[:n_known], scale[:n_known] = effects.shift, effects.scale
     return replace(fitted, shift=shift, scale=scale), moments
 
 
@@ -174,21 +179,21 @@ def harmonize(values: Float, visits: Visits, effects: SiteEffects) -> Float:
     What the columns explain stays, and with repeated sessions what participants have of their own.
     Visits without a site or column are NaN.
     """
-    used = np.flatnonzero(visits.site >= 0)
-    own = visits.take(used)
+    rows = np.flatnonzero(visits.site >= 0)
+    visits_used = visits.take(rows)
     result = np.full(values.shape, np.nan)
-    for part, rest in _residuals(effects, values[used], own):
-        sd, shift, scale = effects.sd[part], effects.shift[own.site, part], effects.scale
-        kept = (rest / sd - shift) / scale[own.site, part]
-        result[used, part] = values[used, part] - rest + sd * kept
+    for part, residuals in _residuals(effects, values[rows], visits_used):
+        sd, shift, scale = effects.sd[part], effects.shift[visits_used.site, part], effects.scale
+        adjusted = (residuals / sd - shift) / scale[visits_used.site, part]
+        result[rows, part] = values[rows, part] - residuals + sd * adjusted
     return result
 
 
 def _varies(values: Float) -> Bool:
     """Tell points that have different values."""
-    known = np.isfinite(values)
-    low = values.min(axis=0, where=known, initial=np.inf)
-    return np.asarray(low < values.max(axis=0, where=known, initial=-np.inf))
+    finite = np.isfinite(values)
+    low = values.min(axis=0, where=finite, initial=np.inf)
+    return np.asarray(low < values.max(axis=0, where=finite, initial=-np.inf))
 
 
 def solve_weighted(values: Float, weight: Float, design: Float, least: float = 0.0) -> Float:
@@ -215,8 +220,8 @@ def _solve_points(grams: Float, right: Float, least: float) -> Float:
     unit[~finite] = np.eye(len(diagonal))
     unique = finite & (np.linalg.eigvalsh(unit)[:, 0] > np.sqrt(np.finfo(np.float64).eps))
     unit[~unique] = np.eye(len(diagonal))
-    found = np.linalg.solve(unit, (right / size)[:, :, None])[:, :, 0] / size
-    return np.where(unique[:, None], found, np.nan).T
+    solution = np.linalg.solve(unit, (right / size)[:, :, None])[:, :, 0] / size
+    return np.where(unique[:, None], solution, np.nan).T
 
 
 def _residuals(
@@ -228,19 +233,19 @@ def _residuals(
     unbiased prediction is.
     """
     for part in chunks(values.shape, 4):
-        rest = values[:, part] - effects.mean[part] - visits.columns @ effects.slopes[:, part]
+        residuals = values[:, part] - effects.mean[part] - visits.columns @ effects.slopes[:, part]
         if visits.participant is not None:
-            without = rest - effects.sd[part] * effects.fixed[visits.site, part]
-            rest -= _intercepts(without, visits.participant, effects.ratio[part])
-        yield part, rest
+            without = residuals - effects.sd[part] * effects.fixed[visits.site, part]
+            residuals -= _intercepts(without, visits.participant, effects.ratio[part])
+        yield part, residuals
 
 
-def _intercepts(rest: Float, participant: Int, ratio: Float) -> Float:
+def _intercepts(residuals: Float, participant: Int, ratio: Float) -> Float:
     """(visits, points) predicted random intercepts."""
     _, numbers = np.unique(participant, return_inverse=True)
-    known = np.isfinite(rest)
-    total = sum_by(numbers, np.where(known, rest, 0.0))
-    count = sum_by(numbers, known.astype(np.float64))
+    finite = np.isfinite(residuals)
+    total = sum_by(numbers, np.where(finite, residuals, 0.0))
+    count = sum_by(numbers, finite.astype(np.float64))
     return np.asarray((total * ratio / (1 + count * ratio))[numbers])
 
 
@@ -249,11 +254,11 @@ def _moments(effects: SiteEffects, values: Float, visits: Visits) -> tuple[Float
     sites = len(effects.fixed)
     member = np.eye(sites)[visits.site]
     n, total, square = np.zeros((3, sites, values.shape[1]))
-    for part, rest in _residuals(effects, values, visits):
-        unit = rest / effects.sd[part]
-        known = np.isfinite(unit)
-        unit = np.where(known, unit, 0.0)
-        n[:, part], total[:, part] = member.T @ known, member.T @ unit
+    for part, residuals in _residuals(effects, values, visits):
+        unit = residuals / effects.sd[part]
+        finite = np.isfinite(unit)
+        unit = np.where(finite, unit, 0.0)
+        n[:, part], total[:, part] = member.T @ finite, member.T @ unit
         square[:, part] = member.T @ unit**2
     mean = total / np.where(n > 0, n, np.nan)
     return n, mean, np.maximum(square - n * np.where(n > 0, mean, 0.0) ** 2, 0.0)
@@ -271,40 +276,42 @@ def _with_shifts(
     variance = np.where(n > 1, around / np.where(n > 1, n - 1, 1), np.nan)
     shift, square = mean.copy(), variance.copy()
     # Without pooling, a few values give no variance, and equal ones none to divide by.
-    square[~(n >= _FEW)] = np.nan
+    square[~(n >= _LEAST_VISITS)] = np.nan
     square[square == 0] = 1.0
-    shift[~(n >= _FEW)] = np.nan
+    shift[~(n >= _LEAST_VISITS)] = np.nan
     for site in range(len(n)) if pooled else ():
-        told = (n[site] >= _FEW) & np.isfinite(variance[site])
-        if told.sum() > 1:
-            shift[site], square[site] = _pool(n[site], mean[site], around[site], told)
-    where = np.isfinite(effects.sd)
-    done = replace(
+        is_informed = (n[site] >= _LEAST_VISITS) & np.isfinite(variance[site])
+        if is_informed.sum() > 1:
+            shift[site], square[site] = _pool(n[site], mean[site], around[site], is_informed)
+    is_fitted = np.isfinite(effects.sd)
+    extended = replace(
         effects,
-        shift=np.where(where, shift, np.nan),
-        scale=np.where(where, np.sqrt(square), np.nan),
+        shift=np.where(is_fitted, shift, np.nan),
+        scale=np.where(is_fitted, np.sqrt(square), np.nan),
     )
-    return done, SiteMoments(n=n.astype(np.int64), mean=mean, sd=np.sqrt(variance))
+    return extended, SiteMoments(n=n.astype(np.int64), mean=mean, sd=np.sqrt(variance))
 
 
-def _pool(n: Float, mean: Float, around: Float, told: Bool) -> tuple[Float, Float]:
+def _pool(n: Float, mean: Float, around: Float, is_informed: Bool) -> tuple[Float, Float]:
     """Posterior shift and variance of one site at each point (Johnson et al. 2007, section 3).
 
     Over points, shifts are normal and variances inverse gamma; their parameters are moments of the
-    points that are ``told`` by enough values. Others take what these say.
+    points that are ``is_informed`` by enough values. Others take what these say.
     """
-    variance = around[told] / (n[told] - 1)
-    prior, spread = mean[told].mean(), mean[told].var(ddof=1)
+    variance = around[is_informed] / (n[is_informed] - 1)
+    prior, spread = mean[is_informed].mean(), mean[is_informed].var(ddof=1)
     middle, width = variance.mean(), variance.var(ddof=1)
     if not (width > 0 and middle > 0):
         return np.where(n > 0, mean, prior), np.full_like(mean, middle if middle > 0 else 1.0)
     shape, rate = 2 + middle**2 / width, middle * (1 + middle**2 / width)
-    own = np.where(n > 0, mean, 0.0)
-    square = np.where(told, around / np.maximum(n - 1, 1), middle)
+    site_mean = np.where(n > 0, mean, 0.0)
+    square = np.where(is_informed, around / np.maximum(n - 1, 1), middle)
     shift = np.where(n > 0, mean, prior)
     for _ in range(POSTERIOR_STEPS):
-        next_shift = (spread * n * own + square * prior) / (spread * n + square)
-        next_square = (rate + (around + n * (own - next_shift) ** 2) / 2) / (n / 2 + shape - 1)
+        next_shift = (spread * n * site_mean + square * prior) / (spread * n + square)
+        next_square = (rate + (around + n * (site_mean - next_shift) ** 2) / 2) / (
+            n / 2 + shape - 1
+        )
         change = np.max(np.abs(next_square / square - 1))
         change = max(change, np.max(np.abs(next_shift - shift)))
         shift, square = next_shift, next_square

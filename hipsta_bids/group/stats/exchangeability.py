@@ -28,7 +28,7 @@ _BETWEEN = 0.1
 #: Powers of time, from 0, that may be common to all participants.
 _POWERS = 4
 #: Keys that are worth several passes.
-_MANY = 5000
+_MOST_COMPARED = 5000
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,24 +52,24 @@ class Visits:
 
     def classes(self) -> Int:
         """(2, rows) number of visits of each row's participant, and the block."""
-        own = np.unique(self.people, return_inverse=True, return_counts=True)
+        sizes = np.unique(self.people, return_inverse=True, return_counts=True)
         blocks = np.zeros_like(self.people) if self.blocks is None else self.blocks
-        return np.stack([own[2][own[1]], blocks])
+        return np.stack([sizes[2][sizes[1]], blocks])
 
     def order(self, key: Float | None = None) -> Int:
         """Rows by class, participant and time; participants by keys where given."""
-        who = self.people if key is None else key[self.people]
-        times = np.arange(len(who)) if self.times is None else self.times
-        order = np.lexsort((times, self.people, who, *self.classes()))
+        groups = self.people if key is None else key[self.people]
+        times = np.arange(len(groups)) if self.times is None else self.times
+        order = np.lexsort((times, self.people, groups, *self.classes()))
         return np.asarray(order, dtype=np.int64)
 
-    def shuffle(self, basis: Float, how: Exchange, keys: Float, own: Float) -> Float:
+    def shuffle(self, basis: Float, exchange: Exchange, keys: Float, blocks: Float) -> Float:
         """Shuffle rows of a basis by uniform keys: of participants, and of single rows."""
-        if how == "flip":
+        if exchange == "flip":
             return flip(basis, keys[self.people])
         result = np.empty_like(basis)
-        by_row = np.lexsort((own, self.people)), np.argsort(self.people, kind="stable")
-        source, target = by_row if how == "within" else (self.order(keys), self.order())
+        by_row = np.lexsort((blocks, self.people)), np.argsort(self.people, kind="stable")
+        source, target = by_row if exchange == "within" else (self.order(keys), self.order())
         result[target] = basis[source]
         return result
 
@@ -94,7 +94,7 @@ def shuffle(basis: Float, blocks: Int | None, key: Float) -> Float:
 
 def _order(key: Float) -> Int:
     """Sort keys; many by 16 of 48 bits at a time, which takes a third of the time."""
-    if len(key) < _MANY:
+    if len(key) < _MOST_COMPARED:
         return np.argsort(key)
     bits = (key * 2.0**48).astype(np.int64)
     order = np.argsort(bits.astype(np.uint16), kind="stable")
@@ -110,8 +110,8 @@ def split(matrix: Float, contrast: Contrast) -> tuple[Float, Float]:
     The product of the former with the data is the estimated contrast.
     """
     tested = matrix @ np.linalg.solve(matrix.T @ matrix, contrast.weights.T)
-    one = contrast.n_rows == 1
-    tested = tested / np.linalg.norm(tested) if one else np.linalg.qr(tested)[0]
+    is_single = contrast.n_rows == 1
+    tested = tested / np.linalg.norm(tested) if is_single else np.linalg.qr(tested)[0]
     return tested, np.linalg.qr(matrix @ null_space(contrast.weights))[0]
 
 
@@ -152,7 +152,7 @@ def _block_means(columns: Float, blocks: Int) -> Float:
 
 
 def choose_exchange(
-    matrix: Float, contrast: Contrast, visits: Visits, wanted: Literal["auto"] | Exchange
+    matrix: Float, contrast: Contrast, visits: Visits, choice: Literal["auto"] | Exchange
 ) -> Exchange:
     """Choose what is exchanged between repeated visits (Winkler et al. 2014, 2015).
 
@@ -161,45 +161,49 @@ def choose_exchange(
     long as changes do not differ between them. With random slopes, and for means, neither holds,
     and signs are flipped.
     """
-    tested, rest = split(matrix, contrast)
+    tested, nuisance = split(matrix, contrast)
     changes = varies_inside(tested, visits.people)
     means = _block_means(tested, visits.people)
     inside = np.max(np.sum(means**2, axis=0) / np.sum(tested**2, axis=0)) <= _BETWEEN
-    whole = _between(tested, rest, visits, changes=changes)
-    if wanted == "auto":
+    whole = _between(tested, nuisance, visits, changes=changes)
+    if choice == "auto":
         people = np.unique(visits.people, return_index=True)[1]
         counts = np.unique(visits.classes()[:, people], axis=1, return_counts=True)[1]
         if whole and counts.mean() >= _CLASS:
             return "whole"
         return "within" if inside and not (whole or visits.slopes) else "flip"
-    if (wanted == "whole" and not whole) or (wanted == "within" and not inside):
-        what = "differs between" if wanted == "within" else "is the same in all"
+    if (choice == "whole" and not whole) or (choice == "within" and not inside):
+        problem = "differs between" if choice == "within" else "is the same in all"
         raise ModelError(
-            f"permutation: {contrast.name} {what} participants, which multiplicity.visits"
-            f" {wanted} does not test; use auto"
+            f"permutation: {contrast.name} {problem} participants, which multiplicity.visits"
+            f" {choice} does not test; use auto"
         )
-    return wanted
+    return choice
 
 
 def exchange_text(
     matrix: Float,
     contrasts: Sequence[Contrast],
     visits: Visits,
-    wanted: Literal["auto"] | Exchange,
+    choice: Literal["auto"] | Exchange,
 ) -> str:
     """Word what is exchanged for which contrasts."""
     kinds: dict[Exchange, list[str]] = {}
-    for one in contrasts:
-        kinds.setdefault(choose_exchange(matrix, one, visits, wanted), []).append(one.name)
-    own = (f"for {', '.join(names)}, {_TEXT[kind]}" for kind, names in kinds.items())
-    return f" In permutations {'; '.join(own)}."
+    for contrast in contrasts:
+        kinds.setdefault(choose_exchange(matrix, contrast, visits, choice), []).append(
+            contrast.name
+        )
+    texts = (f"for {', '.join(names)}, {_TEXT[kind]}" for kind, names in kinds.items())
+    return f" In permutations {'; '.join(texts)}."
 
 
-def _between(tested: Float, rest: Float, visits: Visits, *, changes: bool) -> bool:
+def _between(tested: Float, nuisance: Float, visits: Visits, *, changes: bool) -> bool:
     """Whether what is tested differs between participants, by more than time does in all."""
     if changes and visits.times is None:
         return False
     common = _powers(visits, _POWERS if changes else 1)
-    model = np.column_stack([tested, rest])
-    kept: list[Bool | bool] = [spans(rest, one) or not spans(model, one) for one in common]
-    return all(kept)
+    model = np.column_stack([tested, nuisance])
+    conditions: list[Bool | bool] = [
+        spans(nuisance, one) or not spans(model, one) for one in common
+    ]
+    return all(conditions)

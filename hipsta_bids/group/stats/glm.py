@@ -78,8 +78,8 @@ def _root(function: Callable[..., Float], near: ArrayLike, statistic: Float, df:
     """Polish approximate roots; keep those that cannot be bracketed."""
     start: Float = np.asarray(near, dtype=np.float64)
     reach = _BRACKET * (1 + np.abs(start))
-    found = elementwise.find_root(function, (start - reach, start + reach), args=(statistic, df))
-    return np.where(found.success, found.x, start)
+    root = elementwise.find_root(function, (start - reach, start + reach), args=(statistic, df))
+    return np.where(root.success, root.x, start)
 
 
 @dataclass(frozen=True)
@@ -164,7 +164,7 @@ def fit_points(
     """
     check_design(maps, matrix, contrasts)
     basis, triangle = np.linalg.qr(matrix)
-    back = np.linalg.inv(triangle)
+    inverse = np.linalg.inv(triangle)
     blocks = [
         fit_block(
             np.asarray(maps[:, part], dtype=np.float64),
@@ -178,10 +178,10 @@ def fit_points(
     fit = PointBlock(*(np.concatenate([getattr(one, name) for one in blocks]) for name in names))
     df = np.where(np.isfinite(fit.sigma), fit.n - matrix.shape[1], np.nan)
     tests = tuple(
-        _test(contrast, contrast.weights @ back, fit, df, settings.confidence)
+        _test(contrast, contrast.weights @ inverse, fit, df, settings.confidence)
         for contrast in contrasts
     )
-    return PointwiseFit(back @ fit.scores.T, fit.sigma, fit.n, tests)
+    return PointwiseFit(inverse @ fit.scores.T, fit.sigma, fit.n, tests)
 
 
 def check_design(maps: Float, matrix: Float, contrasts: Sequence[Contrast]) -> None:
@@ -306,8 +306,10 @@ def _hc3(
     leverage = np.einsum("psi,si->sp", basis @ inverse, basis)
     if weights is not None:
         leverage, residuals = weights * leverage, weights * residuals
-    alone = (1 - leverage < np.sqrt(np.finfo(np.float64).eps)) & present
-    weights = np.where(alone, np.nan, residuals / np.where(alone, 1.0, 1 - leverage)) ** 2
+    is_saturated = (1 - leverage < np.sqrt(np.finfo(np.float64).eps)) & present
+    weights = (
+        np.where(is_saturated, np.nan, residuals / np.where(is_saturated, 1.0, 1 - leverage)) ** 2
+    )
     meat = (weights.T @ products_of(basis)).reshape(inverse.shape)
     sandwich: Float = inverse @ meat @ inverse
     return sandwich
@@ -321,8 +323,8 @@ def _test(
     spread = rotated @ fit.covariance @ rotated.T
     se = np.sqrt(np.diagonal(spread, axis1=1, axis2=2))
     statistic = estimate[:, 0] / se[:, 0] if contrast.n_rows == 1 else _wald(estimate, spread)
-    where = {"df": df, "estimate": estimate.T, "se": se.T, "sigma": fit.sigma}
-    return with_effects(contrast, statistic, **where, confidence=confidence)
+    values_of = {"df": df, "estimate": estimate.T, "se": se.T, "sigma": fit.sigma}
+    return with_effects(contrast, statistic, **values_of, confidence=confidence)
 
 
 def with_effects(
@@ -389,12 +391,12 @@ def fit_measures(
     tables = [np.full((2 + 2 * contrast.n_rows, n_points), np.nan) for contrast in contrasts]
     kind = "HC3" if settings.covariance == "hc3" else "nonrobust"
     for i in np.flatnonzero(np.isfinite(block.sigma)):
-        own = np.isfinite(values[:, i])
-        found = OLS(values[own, i], matrix[own]).fit(cov_type=kind, use_t=True)
-        coefficients[:, i], sigma[i], df[i] = found.params, np.sqrt(found.scale), found.df_resid
+        present = np.isfinite(values[:, i])
+        result = OLS(values[present, i], matrix[present]).fit(cov_type=kind, use_t=True)
+        coefficients[:, i], sigma[i], df[i] = result.params, np.sqrt(result.scale), result.df_resid
         for table, contrast in zip(tables, contrasts, strict=True):
-            rows = found.t_test(contrast.weights)
-            whole = rows if contrast.n_rows == 1 else found.f_test(contrast.weights)
+            rows = result.t_test(contrast.weights)
+            whole = rows if contrast.n_rows == 1 else result.f_test(contrast.weights)
             values_of = (whole.statistic, whole.pvalue, rows.effect, rows.sd)
             table[:, i] = np.concatenate([np.ravel(one) for one in values_of])
             if not tested[i]:
@@ -442,12 +444,12 @@ class RowModel:
 def with_mean(design: Design) -> tuple[Contrast, ...]:
     """Contrasts of a design, with that of the model's mean over all rows in front."""
     mean = Contrast(MEAN, design.matrix.mean(axis=0))
-    same = [
+    matching = [
         one
         for one in design.contrasts
         if one.name == MEAN or (one.n_rows == 1 and np.allclose(one.weights, mean.weights))
     ]
-    return design.contrasts if same else (mean, *design.contrasts)
+    return design.contrasts if matching else (mean, *design.contrasts)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -471,9 +473,9 @@ class FittedMaps:
             return _values(self.maps.maps[measure], self.used)
         return sheets_of(self.maps.maps, measure, self.used).reshape(len(self.used), -1)
 
-    def parts(self, measure: str, own: Bool) -> Iterator[Float]:
+    def parts(self, measure: str, keep: Bool) -> Iterator[Float]:
         """(sheets, points) of one measure, of some of the sheets used, a part at a time."""
-        for part in parts_of_sheets(self.maps.maps, measure, self.used[own]):
+        for part in parts_of_sheets(self.maps.maps, measure, self.used[keep]):
             yield part.reshape(len(part), -1)
 
 
@@ -486,7 +488,7 @@ def fit_maps(
     contrasts: tuple[Contrast, ...] | None = None,
 ) -> FittedMaps:
     """Fit a model at each point of all maps of a hemisphere."""
-    _, used, rows = np.intersect1d(
+    _, positions, rows = np.intersect1d(
         side.rows, model.design.rows, assume_unique=True, return_indices=True
     )
     tested = model.design.contrasts if contrasts is None else contrasts
@@ -495,12 +497,12 @@ def fit_maps(
         for name in side.maps:
             # Maps of a large cohort are made here: without a name, one is gone before the next.
             if settings.glm.weights == "none":
-                fits[name] = model.fit(_values(side.maps[name], used), rows, tested, settings)
+                fits[name] = model.fit(_values(side.maps[name], positions), rows, tested, settings)
             else:
-                errors = _values(side.errors[name], used)
+                errors = _values(side.errors[name], positions)
                 matrix = model.design.matrix[rows]
                 fits[name] = fit_points(
-                    _values(side.maps[name], used), matrix, tested, settings.glm, errors
+                    _values(side.maps[name], positions), matrix, tested, settings.glm, errors
                 )
     except ModelError as error:
         raise ModelError(f"hemisphere {hemi}: {error}") from error
@@ -518,16 +520,16 @@ def fit_maps(
             )
     return FittedMaps(
         maps=side,
-        used=np.asarray(used, dtype=np.int64),
+        used=np.asarray(positions, dtype=np.int64),
         rows=np.asarray(rows, dtype=np.int64),
-        subfield=most_frequent(side.subfield[used], len(side.names)),
+        subfield=most_frequent(side.subfield[positions], len(side.names)),
         fits=fits,
     )
 
 
-def _values(maps: Float, used: Int) -> Float:
-    own = maps if len(used) == len(maps) else maps[used]
-    return own.reshape(len(used), -1)
+def _values(maps: Float, positions: Int) -> Float:
+    selected = maps if len(positions) == len(maps) else maps[positions]
+    return selected.reshape(len(positions), -1)
 
 
 def most_frequent(labels: NDArray[np.int8], count: int) -> Int:

@@ -101,9 +101,9 @@ def permute(
     """
     runs = [_Run.build(part, contrast, settings, blocks) for part in parts]
     parts_alone = [one.part for run in runs for one in run.members]
-    who = [one.subjects for one in parts_alone]
-    who += [one.visits.people for one in parts_alone if one.visits]
-    n_subjects = 1 + max(int(numbers.max()) for numbers in who)
+    subjects = [one.subjects for one in parts_alone]
+    subjects += [one.visits.people for one in parts_alone if one.visits]
+    n_subjects = 1 + max(int(numbers.max()) for numbers in subjects)
     batch = min(_BATCH, max(_KEYS // n_subjects, 1))
 
     def reached(start: int) -> list[Float]:
@@ -121,14 +121,14 @@ def permute(
     with ThreadPoolExecutor(PROCESSORS.get()) as pool:
         for start, counts in zip(starts, pool.map(reached, starts), strict=True):
             if family is not None:
-                done = family[0] * settings.permutations + start - 1
-                tell("permutations", done, family[1] * settings.permutations)
-            for run, own in zip(runs, counts, strict=True):
-                run.counts[:] += own
+                n_done = family[0] * settings.permutations + start - 1
+                tell("permutations", n_done, family[1] * settings.permutations)
+            for run, exceeding in zip(runs, counts, strict=True):
+                run.counts[:] += exceeding
     return [run.result() for run in runs]
 
 
-def combine_evidence(p: Float, how: str) -> Float:
+def combine_evidence(p: Float, method: str) -> Float:
     """Combine p-values (measures, ...) into z: the normal quantile of their two-sided p together.
 
     ``fisher`` sums minus twice their logarithms (chi squared; Fisher 1932), ``tippett`` takes the
@@ -137,7 +137,7 @@ def combine_evidence(p: Float, how: str) -> Float:
     """
     limits = np.finfo(np.float64)
     count, p = len(p), np.clip(p, limits.tiny, 1 - limits.eps)
-    if how == "fisher":
+    if method == "fisher":
         joined = special.chdtrc(2 * count, -2 * np.log(p).sum(axis=0))
     else:
         joined = -np.expm1(count * np.log1p(-p.min(axis=0)))
@@ -173,24 +173,24 @@ class _Member:
         blocks: Int | None,
     ) -> "_Member":
         maps, matrix = part.maps, part.matrix
-        tested, rest = exchangeability.split(matrix, contrast)
+        tested, nuisance = exchangeability.split(matrix, contrast)
         present = np.isfinite(maps)
         residuals = np.where(present, maps, 0.0)
-        if rest.shape[1]:
-            fitted = rest @ fit_points(maps, rest, (), GlmSettings()).coefficients
+        if nuisance.shape[1]:
+            fitted = nuisance @ fit_points(maps, nuisance, (), GlmSettings()).coefficients
             residuals = np.nan_to_num(np.where(present, maps - fitted, 0.0))
         squares = np.einsum("sp,sp->p", residuals, residuals)
         df = present.sum(axis=0) - matrix.shape[1]
-        own = None if blocks is None else blocks[part.subjects]
+        blocks_of_part = None if blocks is None else blocks[part.subjects]
         exchange = None
         if part.visits is not None:
-            visits = replace(part.visits, blocks=own)
+            visits = replace(part.visits, blocks=blocks_of_part)
             part = replace(part, visits=visits)
             exchange = exchangeability.choose_exchange(matrix, contrast, visits, settings.visits)
-        flips = not exchangeability.spans(rest, np.ones(len(rest)))
-        if own is not None and not (flips if exchange is None else exchange == "flip"):
+        flips = not exchangeability.spans(nuisance, np.ones(len(nuisance)))
+        if blocks_of_part is not None and not (flips if exchange is None else exchange == "flip"):
             weights = matrix @ np.linalg.pinv(contrast.weights)
-            varies = exchangeability.varies_inside(weights, own)
+            varies = exchangeability.varies_inside(weights, blocks_of_part)
             if part.visits is not None and exchange == "whole":
                 varies = exchangeability.varies_between(weights, part.visits)
             if not varies:  # shuffling cannot break it up
@@ -202,9 +202,9 @@ class _Member:
         usable = (df > 0) & (squares > 0)
         return cls(
             part=part,
-            blocks=own,
+            blocks=blocks_of_part,
             exchange=exchange,
-            basis=np.column_stack([tested, rest]),
+            basis=np.column_stack([tested, nuisance]),
             rows=contrast.n_rows,
             residuals=residuals,
             squares=squares,
@@ -214,16 +214,18 @@ class _Member:
 
     def shuffled(self, keys: Float) -> Float:
         """Permuted designs (batch, columns, subjects) that are given by keys of subjects."""
-        basis, own, visits = self.basis, keys[:, self.part.subjects], self.part.visits
-        bases: Iterable[Float] = (exchangeability.shuffle(basis, self.blocks, key) for key in own)
+        basis, part_keys, visits = self.basis, keys[:, self.part.subjects], self.part.visits
+        bases: Iterable[Float] = (
+            exchangeability.shuffle(basis, self.blocks, key) for key in part_keys
+        )
         if visits is not None and self.exchange is not None:
-            pairs = zip(keys, own, strict=True)
+            pairs = zip(keys, part_keys, strict=True)
             bases = (visits.shuffle(basis, self.exchange, *pair) for pair in pairs)
         elif self.flips:
-            bases = (exchangeability.flip(basis, key) for key in own)
+            bases = (exchangeability.flip(basis, key) for key in part_keys)
         designs = np.empty((len(keys), *basis.T.shape))
-        for design, one in zip(designs, bases, strict=True):
-            design[:] = one.T
+        for design, basis_of_design in zip(designs, bases, strict=True):
+            design[:] = basis_of_design.T
         return designs
 
     def statistics(self, bases: Float) -> Float:
@@ -266,11 +268,11 @@ class _Run:
         settings: MultiplicitySettings,
         blocks: Int | None,
     ) -> "_Run":
-        own = part.parts if isinstance(part, JointPart) else [part]
+        parts = part.parts if isinstance(part, JointPart) else [part]
         combine = part.combine if isinstance(part, JointPart) else None
-        members = [_Member.build(one, contrast, settings, blocks) for one in own]
+        members = [_Member.build(one, contrast, settings, blocks) for one in parts]
         observed = _together(members, [one.basis.T[None] for one in members], combine)
-        enhanced = _enhanced(observed, own[0].edges, settings)
+        enhanced = _enhanced(observed, parts[0].edges, settings)
         counts = np.ones((3, observed.shape[1]))
         return cls(members, combine, contrast, settings, observed, enhanced, counts)
 
@@ -295,13 +297,13 @@ class _Run:
         return PermutationTest(p[0], p[1], p[2], t if as_it_is else t**2)
 
 
-def _together(members: Sequence[_Member], bases: Sequence[Float], how: str | None) -> Float:
+def _together(members: Sequence[_Member], bases: Sequence[Float], method: str | None) -> Float:
     """Return the statistics of one map, or of several combined, by designs."""
-    own = [one.statistics(basis) for one, basis in zip(members, bases, strict=True)]
-    if how is None:
-        return own[0]
-    pairs = zip(members, own, strict=True)
-    return combine_evidence(np.stack([one.p_values(t) for one, t in pairs]), how)
+    member_statistics = [one.statistics(basis) for one, basis in zip(members, bases, strict=True)]
+    if method is None:
+        return member_statistics[0]
+    pairs = zip(members, member_statistics, strict=True)
+    return combine_evidence(np.stack([one.p_values(t) for one, t in pairs]), method)
 
 
 def _enhanced(t: Float, edges: Int, settings: MultiplicitySettings) -> Float:
@@ -368,26 +370,29 @@ class MapKey:
 
 def families(maps: Iterable[MapKey], scope: str) -> list[list[MapKey]]:
     """Group maps whose points are tested together."""
-    found: dict[tuple[str, ...], list[MapKey]] = {}
+    groups: dict[tuple[str, ...], list[MapKey]] = {}
     for key in maps:
         family = (key.measure, key.contrast, *(() if scope == "hemispheres" else (key.hemi,)))
-        found.setdefault(family, []).append(key)
-    return list(found.values())
+        groups.setdefault(family, []).append(key)
+    return list(groups.values())
 
 
 def discover(
     maps: Mapping[MapKey, Float], settings: MultiplicitySettings
 ) -> dict[MapKey, Discoveries]:
     """Control the false discovery rate of several maps (points,), in families."""
-    found = {}
+    discoveries = {}
     for keys in families(maps, settings.scope):
         p = np.concatenate([maps[key] for key in keys])
-        together = control_fdr(p, settings.alpha, settings.method)
+        rejections = control_fdr(p, settings.alpha, settings.method)
         ends = np.cumsum([len(maps[key]) for key in keys])[:-1]
-        adjusted, rejected = np.split(together.adjusted, ends), np.split(together.rejected, ends)
+        adjusted, rejected = (
+            np.split(rejections.adjusted, ends),
+            np.split(rejections.rejected, ends),
+        )
         for key, values, flags in zip(keys, adjusted, rejected, strict=True):
-            found[key] = replace(together, adjusted=values, rejected=flags)
-    return {key: found[key] for key in maps}
+            discoveries[key] = replace(rejections, adjusted=values, rejected=flags)
+    return {key: discoveries[key] for key in maps}
 
 
 def correct_joint(
@@ -398,59 +403,63 @@ def correct_joint(
     settings: GroupSettings,
 ) -> dict[MapKey, tuple[PermutationTest, Discoveries]]:
     """Test maps together that have the same points: fits and measures by title, by result."""
-    how = settings.multiplicity
-    if how.method not in PERMUTATIONS:
-        how = how.changed(method=_MAXIMUM)
+    rules = settings.multiplicity
+    if rules.method not in PERMUTATIONS:
+        rules = rules.changed(method=_MAXIMUM)
 
     def part(key: MapKey) -> JointPart:
-        own = [_part(*one, model, how) for one in groups[key].values()]
-        return JointPart(own, settings.joint.combine)
+        parts = [_part(*one, model, rules) for one in groups[key].values()]
+        return JointPart(parts, settings.joint.combine)
 
     tested = {key: contrasts[key.contrast] for key in groups}
-    return _permuted(tested, part, row_blocks(model, table, how), how)
+    return _permuted(tested, part, row_blocks(model, table, rules), rules)
 
 
 def _permuted(
     tested: Mapping[MapKey, Contrast],
     part: Callable[[MapKey], PermutationPart | JointPart],
     blocks: Int | None,
-    how: MultiplicitySettings,
+    rules: MultiplicitySettings,
     raw: Mapping[MapKey, Float] | None = None,
 ) -> dict[MapKey, tuple[PermutationTest, Discoveries]]:
     """Permute families of maps; ``raw`` are p-values of points for cut-offs, if others are told."""
-    found: dict[MapKey, tuple[PermutationTest, Discoveries]] = {}
-    together = families(tested, how.scope)
-    enhanced = how.method == "permutation-tfce"
-    for number, keys in enumerate(together):
+    results_of: dict[MapKey, tuple[PermutationTest, Discoveries]] = {}
+    groups = families(tested, rules.scope)
+    enhanced = rules.method == "permutation-tfce"
+    for number, keys in enumerate(groups):
         results = permute(
             [part(key) for key in keys],
             tested[keys[0]],
-            settings=how,
+            settings=rules,
             blocks=blocks,
-            family=(number, len(together)),
+            family=(number, len(groups)),
         )
-        corrected = [one.p_enhanced if enhanced else one.p_max for one in results]
-        rejected = [p <= how.alpha for p in corrected]
+        corrected = [result.p_enhanced if enhanced else result.p_max for result in results]
+        rejected = [p <= rules.alpha for p in corrected]
         n_tests = sum(int(np.isfinite(p).sum()) for p in corrected)
         cutoff = np.nan
         if n_tests and not enhanced:
-            own = [one.p_uncorrected for one in results] if raw is None else [raw[k] for k in keys]
-            p, survive = np.concatenate(own), np.concatenate(rejected)
+            p_of_points = (
+                [result.p_uncorrected for result in results]
+                if raw is None
+                else [raw[k] for k in keys]
+            )
+            p, survive = np.concatenate(p_of_points), np.concatenate(rejected)
             cutoff = p[survive].max() if survive.any() else np.nanmin(p) * BELOW_ALL
-        for key, one, p, flags in zip(keys, results, corrected, rejected, strict=True):
-            found[key] = one, Discoveries(p, flags, float(cutoff), n_tests, how.alpha)
-    return found
+        for key, result, p, flags in zip(keys, results, corrected, rejected, strict=True):
+            results_of[key] = result, Discoveries(p, flags, float(cutoff), n_tests, rules.alpha)
+    return results_of
 
 
 def _part(
-    one: FittedMaps, measure: str, model: RowModel, how: MultiplicitySettings
+    fitted: FittedMaps, measure: str, model: RowModel, rules: MultiplicitySettings
 ) -> PermutationPart:
     return PermutationPart(
-        maps=one.values(measure),
-        matrix=model.design.matrix[one.rows],
-        subjects=one.rows,
-        edges=edges_of(one.maps, how.neighbors),
-        visits=None if model.visits is None else model.visits.take(one.rows),
+        maps=fitted.values(measure),
+        matrix=model.design.matrix[fitted.rows],
+        subjects=fitted.rows,
+        edges=edges_of(fitted.maps, rules.neighbors),
+        visits=None if model.visits is None else model.visits.take(fitted.rows),
     )
 
 
@@ -458,24 +467,24 @@ def correct(
     fitted: Mapping[str, FittedMaps], model: RowModel, table: pd.DataFrame, settings: GroupSettings
 ) -> dict[MapKey, Discoveries]:
     """Tell which points survive, in families."""
-    how = settings.multiplicity
+    rules = settings.multiplicity
     tests = {
         MapKey(measure, test.contrast.name, hemi): test
         for hemi, one in fitted.items()
         for measure, fit in one.fits.items()
         for test in fit.tests
     }
-    if how.method not in PERMUTATIONS:
-        return discover({key: test.p for key, test in tests.items()}, how)
+    if rules.method not in PERMUTATIONS:
+        return discover({key: test.p for key, test in tests.items()}, rules)
     check_permutations(settings)
-    found = _permuted(
+    permuted = _permuted(
         {key: test.contrast for key, test in tests.items()},
-        lambda key: _part(fitted[key.hemi], key.measure, model, how),
-        row_blocks(model, table, how),
-        how,
+        lambda key: _part(fitted[key.hemi], key.measure, model, rules),
+        row_blocks(model, table, rules),
+        rules,
         {key: test.p for key, test in tests.items()},
     )
-    return {key: found[key][1] for key in tests}
+    return {key: permuted[key][1] for key in tests}
 
 
 def check_permutations(settings: GroupSettings) -> None:
@@ -486,22 +495,22 @@ def check_permutations(settings: GroupSettings) -> None:
         raise ModelError("permutations assume equal variances; set glm.covariance to ordinary")
 
 
-def row_blocks(model: RowModel, table: pd.DataFrame, how: MultiplicitySettings) -> Int | None:
+def row_blocks(model: RowModel, table: pd.DataFrame, rules: MultiplicitySettings) -> Int | None:
     """Return the number of each row's block, or None without blocks."""
-    if not how.blocks:
+    if not rules.blocks:
         return None
-    check_names([how.blocks], table.columns)
-    own = table[how.blocks].iloc[model.design.rows]
-    if own.isna().any():
+    check_names([rules.blocks], table.columns)
+    labels = table[rules.blocks].iloc[model.design.rows]
+    if labels.isna().any():
         raise ModelError(
-            f"permutations: column {how.blocks!r} of --blocks is missing for"
-            f" {listed(own.index[own.isna()])}"
+            f"permutations: column {rules.blocks!r} of --blocks is missing for"
+            f" {listed(labels.index[labels.isna()])}"
         )
-    blocks = np.unique(own.astype(str), return_inverse=True)[1]
+    blocks = np.unique(labels.astype(str), return_inverse=True)[1]
     people = None if model.visits is None else model.visits.people
     if people is not None and len(np.unique([people, blocks], axis=1).T) > len(np.unique(people)):
         raise ModelError(
-            f"permutations: {how.blocks!r} of --blocks changes between visits of a participant;"
+            f"permutations: {rules.blocks!r} of --blocks changes between visits of a participant;"
             " choose a column that does not"
         )
     return np.asarray(blocks, dtype=np.int64)

@@ -87,9 +87,9 @@ def fit_logistic(
     scale = _scales(matrix)
     scaled = matrix / scale
     if firth:
-        everybody = np.ones((1, len(case)))
-        beta, value = firth_maxima(scaled, case, everybody, free)
-        covariance = np.linalg.inv(_Sets.of(scaled, case, everybody).information(beta)[0])
+        weights = np.ones((1, len(case)))
+        beta, value = firth_maxima(scaled, case, weights, free)
+        covariance = np.linalg.inv(_Sets.of(scaled, case, weights).information(beta)[0])
         return LogisticFit(
             coefficients=beta[0] / scale,
             se=np.sqrt(np.diagonal(covariance)) / scale,
@@ -101,7 +101,7 @@ def fit_logistic(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of separation, which the caller looks for
         try:
-            found = model.fit(
+            fit = model.fit(
                 method="newton",
                 maxiter=FIT_STEPS,
                 tol=_CONVERGED,
@@ -110,9 +110,9 @@ def fit_logistic(
             )
         except np.linalg.LinAlgError as error:
             raise _no_convergence(FIT_STEPS) from error
-    if not found.mle_retvals["converged"]:
+    if not fit.mle_retvals["converged"]:
         raise _no_convergence(FIT_STEPS)
-    return LogisticFit(found.params / scale, found.bse / scale, float(found.llf), firth=False)
+    return LogisticFit(fit.params / scale, fit.bse / scale, float(fit.llf), firth=False)
 
 
 def fit_overlapping_or_firth(matrix: Float, case: Bool) -> LogisticFit:
@@ -135,35 +135,37 @@ def orthonormal(matrix: Float) -> Float:
     return np.asarray(basis[:, size > RANK * size[0]] * np.sqrt(len(matrix)), dtype=np.float64)
 
 
-def maxima(basis: Float, case: Bool, kept: Float, start: Float | None = None) -> tuple[Float, Bool]:
+def maxima(
+    basis: Float, case: Bool, weights: Float, start: Float | None = None
+) -> tuple[Float, Bool]:
     """Maximize the likelihood in several sets of subjects at once, by Newton's method.
 
-    ``kept`` is (sets, subjects), 1 for members. Gives coefficients (sets, columns), and in which
+    ``weights`` is (sets, subjects), 1 for members. Gives coefficients (sets, columns), and in which
     sets the steps converged: with separated groups each step is about as long as the one before.
     """
     columns = basis.shape[1]
     products = products_of(basis)
-    beta = np.tile(np.zeros(columns) if start is None else start, (len(kept), 1))
-    settled = np.zeros(len(kept), dtype=bool)
-    lost = np.zeros(len(kept), dtype=bool)
-    starts = range(0, len(case), max(_BLOCK // len(kept), 1))
+    beta = np.tile(np.zeros(columns) if start is None else start, (len(weights), 1))
+    settled = np.zeros(len(weights), dtype=bool)
+    is_lost = np.zeros(len(weights), dtype=bool)
+    starts = range(0, len(case), max(_BLOCK // len(weights), 1))
     blocks = [slice(first, first + starts.step) for first in starts]
     for number in range(_NEWTON_STEPS):
-        information, score = np.zeros((len(kept), columns**2)), np.zeros(beta.shape)
-        for own in blocks:
+        information, score = np.zeros((len(weights), columns**2)), np.zeros(beta.shape)
+        for block in blocks:
             # All sets begin at the same place.
             with np.errstate(over="ignore"):
-                chance = 1 / (1 + np.exp((beta if number else beta[:1]) @ -basis[own].T))
-            score += (kept[:, own] * (case[own] - chance)) @ basis[own]
-            information += (kept[:, own] * (chance * (1 - chance))) @ products[own]
+                chance = 1 / (1 + np.exp((beta if number else beta[:1]) @ -basis[block].T))
+            score += (weights[:, block] * (case[block] - chance)) @ basis[block]
+            information += (weights[:, block] * (chance * (1 - chance))) @ products[block]
         information = information.reshape(-1, columns, columns)
         size = np.linalg.eigvalsh(information)
-        lost |= ~(size[:, 0] > RANK * size[:, -1])
-        information[lost] = np.eye(columns)
+        is_lost |= ~(size[:, 0] > RANK * size[:, -1])
+        information[is_lost] = np.eye(columns)
         step = np.linalg.solve(information, score[:, :, None])[:, :, 0]
-        beta[~lost] += step[~lost]
-        settled = ~lost & (np.abs(step).max(axis=1) < _SETTLED)
-        if (settled | lost).all():
+        beta[~is_lost] += step[~is_lost]
+        settled = ~is_lost & (np.abs(step).max(axis=1) < _SETTLED)
+        if (settled | is_lost).all():
             break
     return beta, settled
 
@@ -185,25 +187,25 @@ def _scales(matrix: Float) -> Float:
 def firth_maxima(
     matrix: Float,
     case: Bool,
-    kept: Float,
+    weights: Float,
     free: Bool | None = None,
 ) -> tuple[Float, Float]:
     """Penalize the likelihood by the root of the information's determinant (Firth 1993).
 
-    This is Jeffreys' prior: estimates are finite under separation, and less biased. ``kept`` is
+    This is Jeffreys' prior: estimates are finite under separation, and less biased. ``weights`` is
     (sets, subjects), 1 for members. Gives coefficients (sets, columns), and the penalized log
     likelihood of each set.
     """
     free = np.ones(matrix.shape[1], dtype=bool) if free is None else free
-    sets = _Sets.of(matrix, case, kept)
-    beta = np.zeros((len(kept), matrix.shape[1]))
+    sets = _Sets.of(matrix, case, weights)
+    beta = np.zeros((len(weights), matrix.shape[1]))
     value = sets.penalized(beta)
-    active = np.arange(len(kept))
+    active = np.arange(len(weights))
     for number in range(FIRTH_STEPS):
-        own = replace(sets, kept=kept[active])
-        step, promised = own.step(beta[active], free, bent=number >= _FISHER_STEPS)
+        active_sets = replace(sets, kept=weights[active])
+        step, promised = active_sets.step(beta[active], free, bent=number >= _FISHER_STEPS)
         for halving in range(_HALVINGS):
-            new = own.penalized(beta[active] + step)
+            new = active_sets.penalized(beta[active] + step)
             least = _SHARE * promised / 2**halving - _ROUNDING * (1 + np.abs(value[active]))
             short = new < value[active] + least
             if not short.any():
@@ -228,13 +230,15 @@ class _Sets:
     kept: Float
 
     @classmethod
-    def of(cls, matrix: Float, case: Bool, kept: Float) -> "_Sets":
-        return cls(matrix, products_of(matrix), case, kept)
+    def of(cls, matrix: Float, case: Bool, weights: Float) -> "_Sets":
+        return cls(matrix, products_of(matrix), case, weights)
 
     def information(self, beta: Float) -> Float:
         chance = special.expit(beta @ self.matrix.T)
-        found = (self.kept * chance * (1 - chance)) @ self.products
-        return np.asarray(found.reshape(len(beta), *[self.matrix.shape[1]] * 2), dtype=np.float64)
+        information = (self.kept * chance * (1 - chance)) @ self.products
+        return np.asarray(
+            information.reshape(len(beta), *[self.matrix.shape[1]] * 2), dtype=np.float64
+        )
 
     def penalized(self, beta: Float) -> Float:
         """Penalized log likelihood."""

@@ -101,11 +101,11 @@ def combine(
     I squared is that of Higgins and Thompson (2002) in terms of tau squared: tau squared over its
     sum with the typical variance within sites. For ``fixed`` and ``dl`` it is (Q - df) / Q.
     """
-    known = np.isfinite(estimates) & np.isfinite(variances) & (variances > 0)
-    sites = known.sum(axis=0).astype(np.float64)
+    usable_sites = np.isfinite(estimates) & np.isfinite(variances) & (variances > 0)
+    sites = usable_sites.sum(axis=0).astype(np.float64)
     usable = sites >= least
-    values = np.where(known, estimates, 0.0)
-    plain = np.where(known, 1 / np.where(known, variances, 1.0), 0.0)
+    values = np.where(usable_sites, estimates, 0.0)
+    plain = np.where(usable_sites, 1 / np.where(usable_sites, variances, 1.0), 0.0)
     center = _mean(values, plain)
     q = np.sum(plain * (values - center) ** 2, axis=0)
     total, squares = plain.sum(axis=0), np.sum(plain**2, axis=0)
@@ -114,11 +114,11 @@ def combine(
     if not isinstance(method, str):
         tau2 = np.where(usable, method, 0.0)
     elif method == "reml":
-        tau2 = _reml(values, np.where(known, variances, 1.0), known, usable, tau2)
+        tau2 = _reml(values, np.where(usable_sites, variances, 1.0), usable_sites, usable, tau2)
     i2 = tau2 / (tau2 + np.where(usable, sites - 1, 1.0) / spread)
     if isinstance(method, str) and method == "fixed":
         tau2 = np.zeros_like(q)
-    weights = np.where(known, 1 / (np.where(known, variances, 1.0) + tau2), 0.0)
+    weights = np.where(usable_sites, 1 / (np.where(usable_sites, variances, 1.0) + tau2), 0.0)
     estimate = _mean(values, weights)
     share = weights / np.where(usable, weights.sum(axis=0), 1.0)
     se = np.sqrt(1 / np.where(usable, weights.sum(axis=0), 1.0))
@@ -128,8 +128,8 @@ def combine(
         factor = np.sum(weights * (values - estimate) ** 2, axis=0) / df
         se = se * np.sqrt(np.maximum(factor, 1.0) if test == "modified" else factor)
     values_of = {"estimate": estimate, "se": se, "df": df, "tau2": tau2, "q": q, "i2": i2}
-    found = {name: np.where(usable, value, np.nan) for name, value in values_of.items()}
-    return RandomEffects(**found, sites=sites, weights=np.where(usable, share, 0.0))
+    combined = {name: np.where(usable, value, np.nan) for name, value in values_of.items()}
+    return RandomEffects(**combined, sites=sites, weights=np.where(usable, share, 0.0))
 
 
 def _mean(values: Float, weights: Float) -> Float:
@@ -137,7 +137,7 @@ def _mean(values: Float, weights: Float) -> Float:
     return np.asarray(np.sum(weights * values, axis=0) / np.where(total > 0, total, 1.0))
 
 
-def _reml(values: Float, variances: Float, known: Bool, usable: Bool, start: Float) -> Float:
+def _reml(values: Float, variances: Float, usable_sites: Bool, usable: Bool, start: Float) -> Float:
     """Between-site variance that maximizes the restricted likelihood, not below zero.
 
     A step of Fisher scoring is (y'PPy - tr P) / tr PP with P = W - W1(1'W1)^-1 1'W; here for all
@@ -146,17 +146,17 @@ def _reml(values: Float, variances: Float, known: Bool, usable: Bool, start: Flo
     tau2 = start.copy()
     active = np.flatnonzero(usable)
     for _ in range(_MOST_STEPS):
-        now = tau2[active]
-        own = known[:, active]
-        w = np.where(own, 1 / (variances[:, active] + now), 0.0)
-        one, two, three = (np.sum(w**power, axis=0) for power in (1, 2, 3))
+        variance = tau2[active]
+        present = usable_sites[:, active]
+        w = np.where(present, 1 / (variances[:, active] + variance), 0.0)
+        weight_sum, two, three = (np.sum(w**power, axis=0) for power in (1, 2, 3))
         squares = np.sum((w * (values[:, active] - _mean(values[:, active], w))) ** 2, axis=0)
-        information = two - 2 * three / one + (two / one) ** 2
-        step = (squares - (one - two / one)) / information
-        new = np.maximum(0.0, now + step)
+        information = two - 2 * three / weight_sum + (two / weight_sum) ** 2
+        step = (squares - (weight_sum - two / weight_sum)) / information
+        new = np.maximum(0.0, variance + step)
         tau2[active] = new
-        scale = own.sum(axis=0) / one
-        active = active[np.abs(new - now) > _TOLERANCE * scale]
+        scale = present.sum(axis=0) / weight_sum
+        active = active[np.abs(new - variance) > _TOLERANCE * scale]
         if not len(active):
             break
     return tau2
@@ -212,20 +212,20 @@ def join(
         if pattern.sum() < least:
             continue
         points = np.flatnonzero((present == pattern[:, None]).all(axis=0))
-        own = [fit for fit, there in zip(fits, pattern, strict=True) if there]
-        covariances = np.stack([fit.covariance[np.ix_(slopes, slopes)] for fit in own])
+        member_fits = [fit for fit, there in zip(fits, pattern, strict=True) if there]
+        covariances = np.stack([fit.covariance[np.ix_(slopes, slopes)] for fit in member_fits])
         model = _Joined(
             information=np.asarray(np.linalg.inv(covariances), dtype=np.float64),
-            betas=np.stack([fit.coefficients[np.ix_(slopes, points)] for fit in own]),
-            residual=np.sum([fit.df * fit.sd[points] ** 2 for fit in own], axis=0),
-            freedom=sum(fit.df for fit in own) + (len(own) - 1) * int(slopes.sum()),
+            betas=np.stack([fit.coefficients[np.ix_(slopes, points)] for fit in member_fits]),
+            residual=np.sum([fit.df * fit.sd[points] ** 2 for fit in member_fits], axis=0),
+            freedom=sum(fit.df for fit in member_fits) + (len(member_fits) - 1) * int(slopes.sum()),
             direction=row / (row @ row),
         )
         ratio = model.best_ratio() if vary else np.zeros(len(points))
         _, common, inverse, variance = model.at(ratio)
         estimate[points] = row @ common
         se[points] = np.sqrt(np.einsum("i,pij,j,p->p", row, inverse, row, variance))
-        df[points] = len(own) - 1 if vary else model.freedom
+        df[points] = len(member_fits) - 1 if vary else model.freedom
         tau2[points] = ratio * variance
     return Combined(estimate=estimate, se=se, df=df), tau2
 
@@ -257,11 +257,11 @@ class _Joined:
         right -= np.einsum("sp,si,sj,sjp->pi", share, along, along, self.betas, optimize=True)
         inverse = np.linalg.inv(total)
         common = np.einsum("pij,pj->ip", inverse, right)
-        away = self.betas - common
+        deviation = self.betas - common
         squares = self.residual + np.einsum(
-            "sip,sij,sjp->p", away, self.information, away, optimize=True
+            "sip,sij,sjp->p", deviation, self.information, deviation, optimize=True
         )
-        squares -= np.sum(share * np.einsum("si,sip->sp", along, away) ** 2, axis=0)
+        squares -= np.sum(share * np.einsum("si,sip->sp", along, deviation) ** 2, axis=0)
         likelihood = self.freedom * np.log(squares) + np.log(scale).sum(axis=0)
         likelihood = -(likelihood + np.linalg.slogdet(total)[1]) / 2
         return likelihood, common, inverse, squares / self.freedom
@@ -283,9 +283,9 @@ class _Joined:
             value = self.at(ratio(new))[0]
             inner = [np.where(left, new, inner[1]), np.where(left, inner[0], new)]
             values = [np.where(left, value, values[1]), np.where(left, values[0], value)]
-        found = ratio((low + high) / 2)
-        none = np.zeros_like(found)
-        return np.where(self.at(found)[0] > self.at(none)[0], found, none)
+        best = ratio((low + high) / 2)
+        zero = np.zeros_like(best)
+        return np.where(self.at(best)[0] > self.at(zero)[0], best, zero)
 
 
 def pooled_sd(fits: list[SiteFit]) -> Float:
@@ -342,13 +342,13 @@ def meta_analyze(
     else:
         fixed, _ = join(fits, weights[0], intercept, least)
         if settings.random == "reml":
-            found, tau2 = join(fits, weights[0], intercept, least, vary=True)
+            joined, tau2 = join(fits, weights[0], intercept, least, vary=True)
             common = np.stack([replace(fit, sd=sd).se(weights[0]) for fit in fits]) ** 2
             random = replace(
                 combine(estimates, common, tau2, least=least),
-                estimate=found.estimate,
-                se=found.se,
-                df=found.df,
+                estimate=joined.estimate,
+                se=joined.se,
+                df=joined.df,
             )
     without = []
     if leave_out and len(fits) > settings.min_sites:

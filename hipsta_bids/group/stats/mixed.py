@@ -68,12 +68,12 @@ class Sums:
     def where(self, usable: Bool) -> "Sums":
         """Replace points that cannot be fitted by harmless ones."""
         size = self.squares.shape[1]
-        kept = usable[:, None, None]
+        mask = usable[:, None, None]
         return replace(
             self,
             n=np.where(usable, self.n, size + 1),
-            squares=np.where(kept, self.squares, np.eye(size)),
-            own_squares=np.where(kept, self.own_squares, 0.0),
+            squares=np.where(mask, self.squares, np.eye(size)),
+            own_squares=np.where(mask, self.own_squares, 0.0),
         )
 
     def at(self, ratio: Float) -> State:
@@ -89,7 +89,7 @@ class Sums:
         left = np.column_stack([-scores, np.ones(len(scores))])
         moved = np.einsum("pij,pj->pi", first, left)
         change = np.einsum("pij,pj->pi", inverse, moved[:, :-1])
-        ahead, bent = (np.einsum("pij,pj->pi", one, left) for one in (whole, second))
+        gradient, bent = (np.einsum("pij,pj->pi", one, left) for one in (whole, second))
         residual_second = np.einsum("pi,pi->p", left, bent)
         residual_second -= 2 * np.einsum("pi,pi->p", change, moved[:, :-1])
         relative = inverse @ first[:, :-1, :-1]
@@ -101,7 +101,7 @@ class Sums:
             inverse=inverse,
             information_first=first[:, :-1, :-1],
             residual=(
-                np.einsum("pi,pi->p", left, ahead),
+                np.einsum("pi,pi->p", left, gradient),
                 np.einsum("pi,pi->p", left, moved),
                 residual_second,
             ),
@@ -120,9 +120,9 @@ def collect_sums(maps: Float, basis: Float, participants: Int) -> Sums:
     columns = np.empty((*maps.shape, basis.shape[1] + 1))
     columns[..., :-1] = present[:, :, None] * basis[:, None, :]
     columns[..., -1] = np.where(present, maps, 0.0)
-    own = glm.sum_by(participants, columns)
+    sums = glm.sum_by(participants, columns)
     sizes = np.unique(np.maximum(counts, 1.0))
-    chosen = [np.where(counts == size, 1.0, 0.0) for size in sizes]
+    masks = [np.where(counts == size, 1.0, 0.0) for size in sizes]
 
     def squares(rows: Float, weight: Float) -> Float:
         weighted = np.moveaxis(rows * weight[:, :, None], 0, 2)
@@ -133,8 +133,8 @@ def collect_sums(maps: Float, basis: Float, participants: Int) -> Sums:
         repeated=np.asarray((counts > 1).any(axis=0)),
         squares=squares(columns, np.ones(maps.shape)),
         sizes=sizes,
-        people=np.array([who.sum(axis=0) for who in chosen]),
-        own_squares=np.array([squares(own, who) for who in chosen]),
+        people=np.array([who.sum(axis=0) for who in masks]),
+        own_squares=np.array([squares(sums, who) for who in masks]),
     )
 
 
@@ -201,8 +201,8 @@ def fit_mixed(
             " separated from noise; use random intercepts"
         )
     basis, triangle = np.linalg.qr(matrix)
-    back = np.linalg.inv(triangle)
-    rotated = tuple(contrast.weights @ back for contrast in contrasts)
+    inverse = np.linalg.inv(triangle)
+    rotated = tuple(contrast.weights @ inverse for contrast in contrasts)
     parts = []
     for points in glm.chunks(maps.shape, matrix.shape[1]):
         values = np.asarray(maps[:, points], dtype=np.float64)
@@ -215,7 +215,7 @@ def fit_mixed(
     # The standard deviation of single visits: effect sizes are those of independent rows.
     sigma = np.sqrt(whole["residual"] + whole["participant"])
     return glm.PointwiseFit(
-        coefficients=back @ whole["scores"],
+        coefficients=inverse @ whole["scores"],
         sigma=sigma,
         n=whole["n"].astype(np.int64),
         tests=tuple(_tests(contrasts, whole, sigma, settings.confidence)),
@@ -229,12 +229,14 @@ def _larger_where_better(
 ) -> dict[str, Float]:
     """Join the fits of some points: with slopes, except where the likelihood gains nothing."""
     gain = intercepts["loss"] - slopes["loss"]
-    none = gain < _NO_GAIN
-    found = {name: np.where(none, intercepts[name], own) for name, own in slopes.items()}
-    found["slope"] = np.where(none, 0.0, slopes["slope"])
+    is_worse = gain < _NO_GAIN
+    chosen_values = {
+        name: np.where(is_worse, intercepts[name], own) for name, own in slopes.items()
+    }
+    chosen_values["slope"] = np.where(is_worse, 0.0, slopes["slope"])
     gain = np.where(gain < 0, 0.0, gain)
-    found["slopes_p"] = (special.chdtrc(1, gain) + special.chdtrc(2, gain)) / 2
-    return found
+    chosen_values["slopes_p"] = (special.chdtrc(1, gain) + special.chdtrc(2, gain)) / 2
+    return chosen_values
 
 
 def _tests(
@@ -247,18 +249,18 @@ def _tests(
         start = rows.stop
         estimate, se, t, df = (whole[name][rows] for name in ("estimate", "se", "t", "df"))
         single = contrast.n_rows == 1
-        where = {"df": df[0] if single else _denominator(df), "estimate": estimate, "se": se}
+        values_of = {"df": df[0] if single else _denominator(df), "estimate": estimate, "se": se}
         statistic = t[0] if single else np.mean(t**2, axis=0)
-        yield glm.with_effects(contrast, statistic, **where, sigma=sigma, confidence=confidence)
+        yield glm.with_effects(contrast, statistic, **values_of, sigma=sigma, confidence=confidence)
 
 
 def _denominator(df: Float) -> Float:
     """Denominator's degrees of freedom of F from those (rows, points) of its t statistics."""
     rows, least = len(df), 2.0  # F has no expectation below
     expected = np.sum(df / np.where(df > least, df - least, np.nan), axis=0)
-    found = np.asarray(2 * expected / (expected - rows), dtype=np.float64)
-    found = np.where(np.ptp(df, axis=0) < _SAME_DF, df.mean(axis=0), found)
-    return np.where(np.isfinite(df).all(axis=0) & np.isnan(found), least, found)
+    df_residual = np.asarray(2 * expected / (expected - rows), dtype=np.float64)
+    df_residual = np.where(np.ptp(df, axis=0) < _SAME_DF, df.mean(axis=0), df_residual)
+    return np.where(np.isfinite(df).all(axis=0) & np.isnan(df_residual), least, df_residual)
 
 
 def _tested(
@@ -269,24 +271,24 @@ def _tested(
     Rows are (rows, points, columns), scores (points, columns), the inverse (points, columns,
     columns).
     """
-    given, turned = [], []
+    fixed, turned = [], []
     for rows in rotated:
-        own = np.broadcast_to(rows[:, None], (len(rows), *inverse.shape[:2]))
-        given.append(own)
+        weights = np.broadcast_to(rows[:, None], (len(rows), *inverse.shape[:2]))
+        fixed.append(weights)
         if len(rows) > 1:
             axes = np.linalg.eigh(rows @ inverse @ rows.T)[1]
-            own = np.einsum("pjk,ji->kpi", axes, rows)
-        turned.append(own)
-    both = np.concatenate(given), np.concatenate(turned)
-    (estimate, se), (other, root) = (
+            weights = np.einsum("pjk,ji->kpi", axes, rows)
+        turned.append(weights)
+    joined = np.concatenate(fixed), np.concatenate(turned)
+    (estimate, se), (scale, root) = (
         (
             np.einsum("cpj,pj->cp", rows, scores),
             np.sqrt(random_slope.forms(inverse, rows) * variance),
         )
-        for rows in both
+        for rows in joined
     )
-    found = {"scores": scores.T, "residual": variance, "estimate": estimate, "se": se}
-    return both[1], found | {"t": other / root}
+    state_values = {"scores": scores.T, "residual": variance, "estimate": estimate, "se": se}
+    return joined[1], state_values | {"t": scale / root}
 
 
 def _fit(
@@ -305,18 +307,18 @@ def _fit(
     state = sums.at(ratio)
     freedom = sums.n - columns
     variance = state.residual[0] / freedom
-    turned, found = _tested(rotated, state.scores, state.inverse, variance)
+    turned, values_of = _tested(rotated, state.scores, state.inverse, variance)
     form = random_slope.forms(state.inverse, turned)
     slope = -random_slope.forms(state.inverse @ state.information_first @ state.inverse, turned)
     df = _satterthwaite(form, slope, freedom, ratio, state)
     blank = np.where(usable, 1.0, np.nan)
-    found |= {
+    values_of |= {
         "participant": variance * ratio,
         "df": df,
         "loss": freedom * np.log(state.residual[0]) + state.penalty[0],
     }
-    found = {name: values * blank for name, values in found.items()}
-    return found | {"slope": np.full(len(blank), np.nan), "n": sums.n.astype(np.float64)}
+    values_of = {name: values * blank for name, values in values_of.items()}
+    return values_of | {"slope": np.full(len(blank), np.nan), "n": sums.n.astype(np.float64)}
 
 
 def _fit_slopes(
@@ -334,16 +336,16 @@ def _fit_slopes(
     usable = np.linalg.eigvalsh(sums.squares)[:, 0] > glm.MIN_INFORMATION
     usable &= sums.moments[0].max(axis=1) >= _SLOPE_SESSIONS
     usable &= sums.n > basis.shape[1] + _SLOPE_SESSIONS
-    kept = sums.take(np.flatnonzero(usable))
-    triangles = random_slope.best_triangles(kept)
-    state = random_slope.solve_slopes(kept, triangles)
-    variance = state.residual / (kept.n - basis.shape[1])
-    turned, found = _tested(rotated, state.scores, state.inverse, variance)
-    found |= {
+    subset = sums.take(np.flatnonzero(usable))
+    triangles = random_slope.best_triangles(subset)
+    state = random_slope.solve_slopes(subset, triangles)
+    variance = state.residual / (subset.n - basis.shape[1])
+    turned, values_of = _tested(rotated, state.scores, state.inverse, variance)
+    values_of |= {
         "participant": variance * triangles[:, 0] ** 2,
         "slope": variance * np.sum(triangles[:, 1:] ** 2, axis=1) / unit**2,
-        "df": random_slope.slope_freedom(kept, triangles, turned),
-        "loss": (kept.n - basis.shape[1]) * np.log(state.residual) + state.penalty,
+        "df": random_slope.slope_freedom(subset, triangles, turned),
+        "loss": (subset.n - basis.shape[1]) * np.log(state.residual) + state.penalty,
     }
 
     def spread(values: Float) -> Float:
@@ -351,7 +353,7 @@ def _fit_slopes(
         full[..., usable] = values
         return full
 
-    spaced = {name: spread(values) for name, values in found.items()}
+    spaced = {name: spread(values) for name, values in values_of.items()}
     return spaced | {"n": sums.n.astype(np.float64)}
 
 
@@ -368,8 +370,8 @@ def _satterthwaite(form: Float, slope: Float, freedom: Int, ratio: Float, state:
     safe = (ratio > 0) & (determinant > 0)
     relative = slope / form
     spread = second - 2 * mixed * relative + freedom * relative**2
-    found = np.where(safe, determinant, 1.0) / np.where(safe, spread, 1.0)
-    return np.where(safe, found, freedom.astype(np.float64))
+    df_of = np.where(safe, determinant, 1.0) / np.where(safe, spread, 1.0)
+    return np.where(safe, df_of, freedom.astype(np.float64))
 
 
 @dataclass(frozen=True, eq=False)
@@ -417,13 +419,13 @@ def longitudinal_model(
         raise ModelError(
             "longitudinal model: it assumes equal variances; set glm.covariance to ordinary"
         )
-    own = table.iloc[design.rows]
-    times = None if time is None else own[time].to_numpy(dtype=np.float64)
-    visits = own[PARTICIPANT].value_counts()
-    several = int((visits >= _SLOPE_SESSIONS).sum())
-    enough = times is not None and several >= settings.longitudinal.slope_participants
+    rows_table = table.iloc[design.rows]
+    times = None if time is None else rows_table[time].to_numpy(dtype=np.float64)
+    visits = rows_table[PARTICIPANT].value_counts()
+    n_repeated = int((visits >= _SLOPE_SESSIONS).sum())
+    has_slopes = times is not None and n_repeated >= settings.longitudinal.slope_participants
     random = settings.longitudinal.random
-    slopes = random == "slope" or (random == "auto" and enough)
+    slopes = random == "slope" or (random == "auto" and has_slopes)
     if slopes and times is None:
         raise ModelError(
             "longitudinal model: random slopes need the time of each session; give a column"
@@ -431,7 +433,7 @@ def longitudinal_model(
         )
     if times is not None and not np.isfinite(times).all():
         if slopes:
-            lacking = ", ".join(map(str, own.index[~np.isfinite(times)][:8]))
+            lacking = ", ".join(map(str, rows_table.index[~np.isfinite(times)][:8]))
             raise ModelError(f"longitudinal model: no {time} of {lacking}")
         times = None
-    return RepeatedRows(design, own[PARTICIPANT].to_numpy(dtype=np.str_), times, slopes)
+    return RepeatedRows(design, rows_table[PARTICIPANT].to_numpy(dtype=np.str_), times, slopes)

@@ -96,20 +96,20 @@ class Norms:
         ``1 / n`` and by the mean leverage of age and sex; z is the normal quantile of the same
         probability.
         """
-        found = np.full(values.shape, np.nan)
-        known = np.flatnonzero(people.known)
-        own = people.take(known)
-        for part in chunks((len(known), values.shape[1]), 4):
-            some = self.points(part)
-            mean, sd = some.expected(own)
-            rest = values[known, part] - mean - some.shift[own.site]
-            z = to_normal(rest / (sd * some.scale[own.site]), some.shape)
-            n = np.maximum(some.n[own.site], 1)  # without any, the shift is missing
+        scores = np.full(values.shape, np.nan)
+        rows = np.flatnonzero(people.known)
+        people_known = people.take(rows)
+        for part in chunks((len(rows), values.shape[1]), 4):
+            norms_here = self.points(part)
+            mean, sd = norms_here.expected(people_known)
+            residual = values[rows, part] - mean - norms_here.shift[people_known.site]
+            z = to_normal(residual / (sd * norms_here.scale[people_known.site]), norms_here.shape)
+            n = np.maximum(norms_here.n[people_known.site], 1)  # without any, the shift is missing
             # Mean of the leverage of the spline and of sex.
-            others = (len(some.mean) - 1) / np.maximum(some.n.sum(axis=0), 1)
-            tail = special.stdtr(n - 1, -np.abs(z) / np.sqrt(1 + 1 / n + others))
-            found[known, part] = -np.sign(z) * special.ndtri(tail)
-        return found
+            mean_leverage = (len(norms_here.mean) - 1) / np.maximum(norms_here.n.sum(axis=0), 1)
+            tail = special.stdtr(n - 1, -np.abs(z) / np.sqrt(1 + 1 / n + mean_leverage))
+            scores[rows, part] = -np.sign(z) * special.ndtri(tail)
+        return scores
 
     def centiles(self, people: People, levels: Sequence[float]) -> Float:
         """(levels, visits, points) values at these probabilities, at the average site."""
@@ -120,8 +120,8 @@ class Norms:
     def average_site(self, values: Float, people: People) -> Float:
         """(visits, points) values as they would be at the average site."""
         mean, _ = self.expected(people)
-        own = self.shift[people.site], self.scale[people.site]
-        moved = mean + (values - mean - own[0]) / own[1]
+        site_values = self.shift[people.site], self.scale[people.site]
+        moved = mean + (values - mean - site_values[0]) / site_values[1]
         return np.where(people.known[:, None], moved, np.nan)
 
     def points(self, part: slice) -> "Norms":
@@ -138,15 +138,15 @@ class Norms:
         for site in range(len(self.n), n_sites):
             rows = np.flatnonzero(people.known & (people.site == site))
             mean, sd = self.expected(people.take(rows))
-            rest = values[rows] - mean
-            there = np.isfinite(rest)
-            n = there.sum(axis=0)
-            weight = np.where(there, sd**-2.0, 0.0)
-            rest = np.where(there, rest, 0.0)
-            enough = n >= least
-            total = np.where(enough, weight.sum(axis=0), np.nan)
-            shift = (weight * rest).sum(axis=0) / total
-            square = (weight * (rest - shift) ** 2).sum(axis=0) / np.maximum(n - 1, 1)
+            residual = values[rows] - mean
+            finite = np.isfinite(residual)
+            n = finite.sum(axis=0)
+            weight = np.where(finite, sd**-2.0, 0.0)
+            residual = np.where(finite, residual, 0.0)
+            is_informed = n >= least
+            total = np.where(is_informed, weight.sum(axis=0), np.nan)
+            shift = (weight * residual).sum(axis=0) / total
+            square = (weight * (residual - shift) ** 2).sum(axis=0) / np.maximum(n - 1, 1)
             scale = np.sqrt(np.where(square > 0, square, np.nan))
             for block, row in zip(blocks, (shift, scale, n), strict=True):
                 block.append(row[None])
@@ -162,22 +162,22 @@ def age_columns(age: Float, knots: Float) -> Float:
     return np.column_stack([t, slopes[:, :-1] - slopes[:, -1:]])
 
 
-def choose_knots(ages: Float, how: NormSettings) -> Float:
+def choose_knots(ages: Float, rules: NormSettings) -> Float:
     """Knots at equal shares of people; beyond the outer ones are some, so that nobody is told."""
     ages = np.sort(ages[np.isfinite(ages)])
-    if len(ages) < how.least_participants:
+    if len(ages) < rules.least_participants:
         raise ModelError(
             f"--fit-norms: {len(ages)} participants with age, sex and site are too few; norms need"
-            f" {how.least_participants} or more: join the reference cohorts of several sites by"
+            f" {rules.least_participants} or more: join the reference cohorts of several sites by"
             " --derivatives"
         )
-    low, high = np.floor(ages[how.edge - 1]), np.ceil(ages[-how.edge])
+    low, high = np.floor(ages[rules.edge - 1]), np.ceil(ages[-rules.edge])
     inside = ages[(ages >= low) & (ages <= high)]
-    inner = np.quantile(inside, np.linspace(0, 1, how.knots)[1:-1]).round(1)
+    inner = np.quantile(inside, np.linspace(0, 1, rules.knots)[1:-1]).round(1)
     knots = np.array([low, *inner, high], dtype=np.float64)
     if not (np.diff(knots) > 0).all():
         raise ModelError(
-            f"--fit-norms: too few different ages for {how.knots} knots of a spline"
+            f"--fit-norms: too few different ages for {rules.knots} knots of a spline"
             f" ({', '.join(f'{age:g}' for age in knots)}); set norms.knots to fewer"
         )
     return knots
@@ -193,8 +193,8 @@ def fit_norms(
     residuals over their SD, and is kept where it is better than the normal one by a
     likelihood-ratio test.
     """
-    used = np.flatnonzero(people.known)
-    values, people = values[used], people.take(used)
+    rows = np.flatnonzero(people.known)
+    values, people = values[rows], people.take(rows)
     parts = [
         _fit(np.asarray(values[:, part], dtype=np.float64), people, n_sites, knots, settings)
         for part in chunks(values.shape, 4 + n_sites)
@@ -208,8 +208,8 @@ def fit_norms(
 def _fit(
     values: Float, people: People, n_sites: int, knots: Float, settings: NormSettings
 ) -> Norms:
-    there = np.isfinite(values)
-    filled = np.where(there, values, 0.0)
+    finite = np.isfinite(values)
+    filled = np.where(finite, values, 0.0)
     member = np.eye(n_sites)[people.site]
     ages = age_columns(people.age, knots)
     # Around zero, so that constants of sites are those of their mean.
@@ -217,29 +217,29 @@ def _fit(
     design = np.hstack([member, np.hstack([ages, people.sex]) - middle])
     center = ages[:, 0].mean()
     spread = np.hstack([member, ages[:, :1] - center])
-    n = member.T @ there
-    enough = n >= settings.least_site // 2
+    n = member.T @ finite
+    is_informed = n >= settings.least_site // 2
     leverage = np.sum(np.linalg.qr(design)[0] ** 2, axis=1)
-    kept = np.maximum(1 - leverage, 1 / len(values))[:, None]
-    back = np.linalg.pinv(spread) / 2
+    one_minus_leverage = np.maximum(1 - leverage, 1 / len(values))[:, None]
+    inverse = np.linalg.pinv(spread) / 2
     log_sd = np.zeros((n_sites + 1, values.shape[1]))
-    sd = _spread_of(filled, there)
+    sd = _spread_of(filled, finite)
     log_sd[:n_sites] = np.log(np.where(sd > 0, sd, np.nan))
     coefficients = np.full((design.shape[1], values.shape[1]), np.nan)
     for _ in range(_STEPS):
-        weight = there * np.exp(-2 * (spread @ log_sd))
+        weight = finite * np.exp(-2 * (spread @ log_sd))
         coefficients = solve_weighted(filled, weight, design)
-        square = (filled - design @ coefficients) ** 2 * weight / kept
-        step = back @ np.where(there, square - 1, 0.0)
+        square = (filled - design @ coefficients) ** 2 * weight / one_minus_leverage
+        step = inverse @ np.where(finite, square - 1, 0.0)
         log_sd += np.clip(np.nan_to_num(step), -_LARGEST_STEP, _LARGEST_STEP)
         if np.abs(step[np.isfinite(step)]).max(initial=0.0) < _SMALLEST:
             break
-    rest = np.where(there, filled - design @ coefficients, np.nan)
-    shape = _fit_shape(rest * np.exp(-(spread @ log_sd)), SHAPE_LEVEL)
+    residual = np.where(finite, filled - design @ coefficients, np.nan)
+    shape = _fit_shape(residual * np.exp(-(spread @ log_sd)), SHAPE_LEVEL)
     # Of the average site, at which covariates are zero again.
     part = n / np.maximum(n.sum(axis=0), 1)
-    means = np.where(enough, coefficients[:n_sites], np.nan)
-    sds = np.where(enough, log_sd[:n_sites], np.nan)
+    means = np.where(is_informed, coefficients[:n_sites], np.nan)
+    sds = np.where(is_informed, log_sd[:n_sites], np.nan)
     average = [np.sum(part * np.where(n > 0, one, 0.0), axis=0) for one in (means, sds)]
     slopes = coefficients[n_sites:]
     return Norms(
@@ -253,10 +253,10 @@ def _fit(
     )
 
 
-def _spread_of(filled: Float, there: Bool) -> Float:
-    count = np.maximum(there.sum(axis=0), 1)
+def _spread_of(filled: Float, finite: Bool) -> Float:
+    count = np.maximum(finite.sum(axis=0), 1)
     mean = filled.sum(axis=0) / count
-    return np.asarray(np.sqrt((there * (filled - mean) ** 2).sum(axis=0) / count))
+    return np.asarray(np.sqrt((finite * (filled - mean) ** 2).sum(axis=0) / count))
 
 
 def _power(order: Float) -> Float:
@@ -308,9 +308,9 @@ def _fit_shape(residuals: Float, level: float) -> Float:
         better = new > best[active]
         gain = np.where(better, new - best[active], np.inf)
         damping[active] *= np.where(better, 0.2, 8.0)
-        there = active[better]
-        shape[:, there], best[there] = tried[:, better], new[better]
-        gradient[there], information[there] = slope[better], squares[better]
+        improved = active[better]
+        shape[:, improved], best[improved] = tried[:, better], new[better]
+        gradient[improved], information[improved] = slope[better], squares[better]
         active = active[(gain > _GAIN) & (damping[active] < 1e6)]  # noqa: PLR2004
     # Twice the gain has a chi-squared distribution with two degrees of freedom.
     needed = np.nan_to_num(best - normal) > -np.log(level)
@@ -319,8 +319,8 @@ def _fit_shape(residuals: Float, level: float) -> Float:
 
 def _likelihood(residuals: Float, shape: Float) -> tuple[Float, Float, Float]:
     """Log likelihood (points,), derivatives (points, 2), and their squares (points, 2, 2)."""
-    there = np.isfinite(residuals)
-    r = np.where(there, residuals, 0.0)
+    finite = np.isfinite(residuals)
+    r = np.where(finite, residuals, 0.0)
     mean, sd = _moments(shape)
     # Derivatives of mean and SD by skewness and by the logarithm of the tail weight.
     moved = [
@@ -341,9 +341,9 @@ def _likelihood(residuals: Float, shape: Float) -> tuple[Float, Float, Float]:
     by_x = by_angle * tail / root - x / root**2
     skewed = -by_angle + by_x * (moved[0][0] + moved[0][1] * r) + moved[0][1] / sd
     tailed = by_angle * tail * angle + by_x * (moved[1][0] + moved[1][1] * r) + moved[1][1] / sd + 1
-    single = np.stack([skewed, tailed]) * there
+    single = np.stack([skewed, tailed]) * finite
     information = np.einsum("isp,jsp->pij", single, single)
-    return (terms * there).sum(axis=0), single.sum(axis=1).T, information
+    return (terms * finite).sum(axis=0), single.sum(axis=1).T, information
 
 
 @dataclass(frozen=True)
@@ -366,18 +366,18 @@ def w_scores(maps: Float, matrix: Float, reference: Bool, settings: GlmSettings)
     """
     if settings.covariance != "ordinary":
         raise ModelError("normative scores assume equal variances; set glm.covariance to ordinary")
-    own = matrix[reference]
-    if len(own) - matrix.shape[1] <= settings.min_residual_df:
+    reference_matrix = matrix[reference]
+    if len(reference_matrix) - matrix.shape[1] <= settings.min_residual_df:
         raise ModelError(
-            f"normative scores: {len(own)} reference subjects are too few for"
+            f"normative scores: {len(reference_matrix)} reference subjects are too few for"
             f" {matrix.shape[1]} columns"
         )
-    if np.linalg.matrix_rank(own) < matrix.shape[1]:
+    if np.linalg.matrix_rank(reference_matrix) < matrix.shape[1]:
         raise ModelError(
             "normative scores: in the reference group the columns are not independent; leave out"
             " a covariate that does not vary there"
         )
-    basis, triangle = np.linalg.qr(own)
+    basis, triangle = np.linalg.qr(reference_matrix)
     rotated = matrix @ np.linalg.inv(triangle)
     parts = [
         _score(np.asarray(maps[:, part], dtype=np.float64), rotated, basis, reference, settings)
@@ -403,14 +403,16 @@ def _score(
     variance = np.broadcast_to(fit.sigma**2, maps.shape)
     member = reference[:, None]
     # A subject that alone determines a coefficient cannot be told without it.
-    kept = np.where(member, 1 - leverage, 1.0)
-    kept = np.where(kept > np.sqrt(np.finfo(np.float64).eps), kept, np.nan)
-    without = (variance * df - residuals**2 / kept) / (df - 1)
+    one_minus_leverage = np.where(member, 1 - leverage, 1.0)
+    one_minus_leverage = np.where(
+        one_minus_leverage > np.sqrt(np.finfo(np.float64).eps), one_minus_leverage, np.nan
+    )
+    without = (variance * df - residuals**2 / one_minus_leverage) / (df - 1)
     sigma = np.sqrt(np.where(member, np.maximum(without, 0.0), variance))
-    error = residuals / kept
+    error = residuals / one_minus_leverage
     w = error / np.where(sigma > 0, sigma, np.nan)
     # Variance of the expectation, with the subject itself left out: h / (1 - h).
-    spread = np.where(member, leverage / kept, leverage)
+    spread = np.where(member, leverage / one_minus_leverage, leverage)
     freedom = np.where(member, df - 1, df)
     p = 2 * special.stdtr(freedom, -np.abs(w) / np.sqrt(1 + spread))
     return w, np.asarray(p, dtype=np.float64)

@@ -91,16 +91,16 @@ def collect_slope_sums(maps: Float, basis: Float, participants: Int, times: Floa
     def per_person(table: Float) -> Float:
         return np.moveaxis(sum_by(participants, table), 0, 1)
 
-    shown = weight[:, :1] if present.all() else weight
+    weight_shown = weight[:, :1] if present.all() else weight
     return SlopeSums(
         n=present.sum(axis=0),
         squares=(weight.T @ products_of(basis)).reshape(-1, columns, columns),
         products=values.T @ basis,
         total=np.einsum("sp,sp->p", values, values),
-        moments=np.stack([per_person(shown * power[:, None]) for power in powers]),
+        moments=np.stack([per_person(weight_shown * power[:, None]) for power in powers]),
         own_columns=np.stack(
             [
-                per_person((shown * power[:, None])[:, :, None] * basis[:, None, :])
+                per_person((weight_shown * power[:, None])[:, :, None] * basis[:, None, :])
                 for power in powers[:2]
             ]
         ),
@@ -175,9 +175,9 @@ def best_triangles(sums: SlopeSums) -> Float:
         better = gain > 0
         best[active[better]] = trial[better]
         damping[active] *= np.where(better, 1 / _FACTOR, _FACTOR)
-        done = np.abs(gradient).max(axis=1) < _FLAT
-        done |= better & (gain < SLOPE_TOLERANCE)
-        active = active[~done & (damping[active] < _MOST_DAMPING)]
+        is_settled = np.abs(gradient).max(axis=1) < _FLAT
+        is_settled |= better & (gain < SLOPE_TOLERANCE)
+        active = active[~is_settled & (damping[active] < _MOST_DAMPING)]
         if not len(active):
             break
     return best

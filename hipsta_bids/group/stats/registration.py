@@ -161,8 +161,8 @@ def _identity(profiles: Float) -> Float:
 def _after_inverse(warps: Float, common: Float) -> Float:
     """Follow all warps by the inverse of one; by their mean's, it becomes the identity."""
     grid = np.linspace(0.0, 1.0, warps.shape[1])
-    back = np.interp(warps.ravel(), common, grid)
-    return np.asarray(back.reshape(warps.shape), dtype=np.float64)
+    inverse = np.interp(warps.ravel(), common, grid)
+    return np.asarray(inverse.reshape(warps.shape), dtype=np.float64)
 
 
 def _scaled(profiles: Float, scale: float | None) -> Float:
@@ -303,26 +303,26 @@ def shift_difference(
     """
     _, first, index = np.unique(people, return_index=True, return_inverse=True)
     totals = [np.bincount(index, column) for column in registration.shifts.T]
-    own: Float = np.stack(totals, axis=1) / np.bincount(index)[:, None]
+    means: Float = np.stack(totals, axis=1) / np.bincount(index)[:, None]
     names, member = np.unique(np.asarray(groups)[first], return_inverse=True)
     matrix = np.eye(len(names))[member]
     counts = matrix.sum(axis=0)
-    spread = np.ptp(matrix.T @ own / counts[:, None], axis=0)
+    spread = np.ptp(matrix.T @ means / counts[:, None], axis=0)
     node, p = int(np.argmax(spread)), float("nan")
-    varied = own.var(axis=0)
+    varied = means.var(axis=0)
     varying = varied > _ROUNDING * varied.max()
     if len(names) > 1 and counts.min() > 1 and varying.any():
         part = PermutationPart(
-            maps=own[:, varying],
+            maps=means[:, varying],
             matrix=matrix,
-            subjects=np.arange(len(own)),
+            subjects=np.arange(len(means)),
             edges=np.empty((0, 2), dtype=np.int64),
         )
         contrast = Contrast("groups", np.diff(np.eye(len(names)), axis=0))
-        how = MultiplicitySettings(
+        rules = MultiplicitySettings(
             method="permutation-max", permutations=permutations + 1, seed=seed
         )
-        (test,) = permute([part], contrast, settings=how)
+        (test,) = permute([part], contrast, settings=rules)
         p = float(np.nanmin(test.p_max))
     return ShiftDifference(float(spread[node]), node, p)
 

@@ -110,23 +110,23 @@ def sample_size(
     is that of true slopes plus that within participants over the sum of squared times (Ard and
     Edland 2011). The test is Student's for two groups, so that power is that of the non-central t.
     """
-    wanted = settings.power.power
+    target_power = settings.power.power
     sd = endpoint_sd(effect, reference)
     difference = _difference(effect, reference.mean, reference.slope)
-    per_arm = participants_needed(difference / sd, alpha, wanted, MOST_PARTICIPANTS)
+    per_arm = participants_needed(difference / sd, alpha, target_power, MOST_PARTICIPANTS)
     ends = None
     if limits:
         if effect.kind == SLOWING and reference.slope_limits is not None:
             low, high = reference.slope_limits
             # Where the slope may be zero, no number is enough.
             least = np.where(low * high > 0, np.minimum(abs(low), abs(high)), 0.0)
-            most = np.maximum(abs(low), abs(high))
-            d = np.stack([most, least]) * effect.share / sd
+            largest = np.maximum(abs(low), abs(high))
+            d = np.stack([largest, least]) * effect.share / sd
         else:
             tail = (1 - settings.glm.confidence) / 2
             chi = stats.chi2.ppf(np.array([[1 - tail], [tail]]), reference.freedom)
             d = difference / sd * np.sqrt(chi / reference.freedom)
-        ends = participants_needed(d, alpha, wanted, MOST_PARTICIPANTS)
+        ends = participants_needed(d, alpha, target_power, MOST_PARTICIPANTS)
     return SampleSize(
         difference=difference,
         sd=sd,
@@ -183,22 +183,22 @@ def power_of(d: Float, per_arm: Float, alpha: float) -> Float:
     size = np.where(ready, per_arm, 2.0)
     center, df = np.abs(np.where(ready, d, 0.0)) * np.sqrt(size / 2), 2 * size - 2
     limit = stats.t.isf(alpha / 2, df)
-    found = 1 - special.nctdtr(df, center, limit) + special.nctdtr(df, center, -limit)
+    power = 1 - special.nctdtr(df, center, limit) + special.nctdtr(df, center, -limit)
     # SciPy has no value for some centers far beyond the limit, where power is 1.
-    found = np.where(np.isnan(found) & (center > limit), 1.0, found)
-    return np.where(ready, found, np.nan)
+    power = np.where(np.isnan(power) & (center > limit), 1.0, power)
+    return np.where(ready, power, np.nan)
 
 
-def participants_needed(d: Float, alpha: float, power: float, most: int) -> Float:
-    """Smallest number per arm that reaches a power, by halving; NaN beyond ``most``."""
+def participants_needed(d: Float, alpha: float, power: float, limit: int) -> Float:
+    """Smallest number per arm that reaches a power, by halving; NaN beyond ``limit``."""
     d = np.asarray(d, dtype=np.float64)
-    low, high = np.ones(d.shape), np.full(d.shape, float(most))
-    enough = power_of(d, high, alpha) >= power
+    low, high = np.ones(d.shape), np.full(d.shape, float(limit))
+    is_enough = power_of(d, high, alpha) >= power
     while (high - low > 1).any():
         middle = np.floor((low + high) / 2)
         reached = power_of(d, middle, alpha) >= power
         low, high = np.where(reached, low, middle), np.where(reached, middle, high)
-    return np.where(enough, high, np.nan)
+    return np.where(is_enough, high, np.nan)
 
 
 def point_level(settings: GroupSettings) -> float:
@@ -210,24 +210,24 @@ def point_level(settings: GroupSettings) -> float:
     two-stage procedure does it with q / (1 + q), and again with q / (1 + q) over the share of
     points not found in the first stage; its power in the first stage is that of the level there.
     """
-    how, plan = settings.multiplicity, settings.power
-    if how.method not in {"fdr2", "bh"}:
+    rules, plan = settings.multiplicity, settings.power
+    if rules.method not in {"fdr2", "bh"}:
         raise UsageError(
             f"--power: participants per point are known for false discovery rates, not for"
-            f" {how.method}; give --correction fdr2 or bh"
+            f" {rules.method}; give --correction fdr2 or bh"
         )
-    if how.method == "bh":
-        return how.alpha * plan.affected * plan.power / (1 - how.alpha * (1 - plan.affected))
-    return _two_stage_level(how, plan.power, plan.affected)
+    if rules.method == "bh":
+        return rules.alpha * plan.affected * plan.power / (1 - rules.alpha * (1 - plan.affected))
+    return _two_stage_level(rules, plan.power, plan.affected)
 
 
-def _two_stage_level(how: MultiplicitySettings, power: float, affected: float) -> float:
-    rate = how.alpha / (1 + how.alpha)
+def _two_stage_level(rules: MultiplicitySettings, power: float, affected: float) -> float:
+    rate = rules.alpha / (1 + rules.alpha)
     second = first = rate * affected * power
     for _ in range(_TURNS):
         center = stats.norm.isf(second / 2) + stats.norm.ppf(power)
-        seen = stats.norm.sf(stats.norm.isf(first / 2) - center)
-        found = affected * seen + (1 - affected) * first
+        power_first = stats.norm.sf(stats.norm.isf(first / 2) - center)
+        found = affected * power_first + (1 - affected) * first
         first = rate * found
         second = rate * affected * power / (1 - found - rate * (1 - affected))
     return float(second)
@@ -301,14 +301,14 @@ def repeatability(values: Float, *, confidence: float = 0.95, least: int = 3) ->
     n = complete.sum(axis=0)
     usable = n >= max(least, 2)
     size = np.where(usable, n, 2).astype(np.float64)
-    known = np.where(complete[:, None], values, 0.0)
-    grand = known.sum(axis=(0, 1)) / (size * k)
-    people = known.mean(axis=1)
-    sessions = known.sum(axis=0) / size
-    rest = np.where(complete[:, None], known - people[:, None] - sessions + grand, 0.0)
+    filled = np.where(complete[:, None], values, 0.0)
+    grand = filled.sum(axis=(0, 1)) / (size * k)
+    people = filled.mean(axis=1)
+    sessions = filled.sum(axis=0) / size
+    residual = np.where(complete[:, None], filled - people[:, None] - sessions + grand, 0.0)
     rows = k * np.where(complete, (people - grand) ** 2, 0.0).sum(axis=0) / (size - 1)
     columns = size * ((sessions - grand) ** 2).sum(axis=0) / (k - 1)
-    error = (rest**2).sum(axis=(0, 1)) / ((size - 1) * (k - 1))
+    error = (residual**2).sum(axis=(0, 1)) / ((size - 1) * (k - 1))
     usable &= error > 0
     rows, columns, error = (np.where(usable, one, np.nan) for one in (rows, columns, error))
     freedom = size * (k - 1)
@@ -337,9 +337,9 @@ def _icc_limits(
     freedom = mixed**2 / ((a * columns) ** 2 / (k - 1) + (b * error) ** 2 / ((n - 1) * (k - 1)))
     down = stats.f.ppf(tails[0], n - 1, freedom)
     up = stats.f.ppf(tails[0], freedom, n - 1)
-    other = k * columns + (k * n - k - n) * error
-    low = n * (rows - down * error) / (down * other + n * rows)
-    high = n * (up * rows - error) / (other + n * up * rows)
+    denominator = k * columns + (k * n - k - n) * error
+    low = n * (rows - down * error) / (down * denominator + n * rows)
+    high = n * (up * rows - error) / (denominator + n * up * rows)
     return np.stack([low, high])
 
 

@@ -51,15 +51,15 @@ def _along(knots: Float, coefficients: Float, places: Float) -> tuple[Float, Flo
     By the cubic of each interval, which takes a third of the time of all splines.
     """
     ends, basis = np.concatenate([[0.0], knots]), make_basis(knots)
-    where = np.searchsorted(knots, places, side="right")
-    step = places - ends[where]
-    where += np.arange(len(places))[:, None] * len(ends)
-    zero, one, two, three = (
-        (coefficients @ part(ends).T).take(where)
+    interval = np.searchsorted(knots, places, side="right")
+    step = places - ends[interval]
+    interval += np.arange(len(places))[:, None] * len(ends)
+    zero, second, two, three = (
+        (coefficients @ part(ends).T).take(interval)
         for part in (basis, *(basis.derivative(order) for order in (1, 2, 3)))
     )
-    slope = one + step * (two + step * three / 2)
-    return zero + step * (one + step * (two / 2 + step * three / 6)), slope
+    slope = second + step * (two + step * three / 2)
+    return zero + step * (second + step * (two / 2 + step * three / 6)), slope
 
 
 @dataclass(frozen=True)
@@ -205,8 +205,8 @@ def _maximize(moments: _Moments, scores: _Scores) -> tuple[Float, Float]:
     size = splines * (components + 1)
     system = np.einsum("sij,spq->ipjq", moments.squares, second, optimize=True)
     right = np.einsum("si,sp->ip", moments.products, first)
-    found = np.linalg.solve(system.reshape(size, size), right.ravel()).reshape(splines, -1)
-    return found[:, components], found[:, :components]
+    solution = np.linalg.solve(system.reshape(size, size), right.ravel()).reshape(splines, -1)
+    return solution[:, components], solution[:, :components]
 
 
 @dataclass(frozen=True)
@@ -296,19 +296,19 @@ class _Problem:
         damping = np.full(len(profiles), _DAMPING)
         for _ in range(WARP_STEPS):
             curves = coefficients[active]
-            now = self._state(best[active], profiles[active], curves)
-            matrix, right = self._normal(now)
+            state = self._state(best[active], profiles[active], curves)
+            matrix, right = self._normal(state)
             size = np.maximum(np.trace(matrix, axis1=1, axis2=2), _LEAST_DAMPING)
             ridge = size[:, None, None] * (level + damping[active, None, None] * np.eye(len(level)))
             step = np.linalg.solve(matrix + ridge, right[:, :, None])[:, :, 0]
-            trial = self._state(now.parameters + step, profiles[active], curves)
-            gained = now.loss - trial.loss
+            trial = self._state(state.parameters + step, profiles[active], curves)
+            gained = state.loss - trial.loss
             better = gained > 0
             best[active[better]] = trial.parameters[better]
             eased = np.maximum(damping[active] / _FACTOR, _LEAST_DAMPING)
             damping[active] = np.where(better, eased, damping[active] * _FACTOR)
-            done = better & (gained < WARP_TOLERANCE * now.loss)
-            active = active[~done & (damping[active] < _MOST_DAMPING)]
+            is_settled = better & (gained < WARP_TOLERANCE * state.loss)
+            active = active[~is_settled & (damping[active] < _MOST_DAMPING)]
             if not len(active):
                 break
         last = self._state(best, profiles, coefficients)
@@ -325,11 +325,11 @@ class _Problem:
         loss += 0.5 * self.penalty * np.sum(parameters**2, axis=1)
         return _State(parameters, warps, slopes, residuals, along, loss)
 
-    def _normal(self, now: _State) -> tuple[Float, Float]:
+    def _normal(self, state: _State) -> tuple[Float, Float]:
         """Matrix and right-hand side of a Gauss-Newton step."""
-        jacobian = now.along[:, :, None] * now.slopes
+        jacobian = state.along[:, :, None] * state.slopes
         matrix = np.swapaxes(jacobian, 1, 2) @ jacobian
-        right = np.einsum("sdi,sd->si", jacobian, now.residuals) - self.penalty * now.parameters
+        right = np.einsum("sdi,sd->si", jacobian, state.residuals) - self.penalty * state.parameters
         return matrix + self.penalty * np.eye(matrix.shape[1]), right
 
 
@@ -367,8 +367,8 @@ def warp_values(maps: Float, warps: Float) -> Float:
         left, weight = _sources(warps[block])
         rows = np.arange(len(left))[:, None]
         share = weight[:, :, None]
-        own = maps[block]
-        low, high = own[rows, left], own[rows, left + 1]
+        values = maps[block]
+        low, high = values[rows, left], values[rows, left + 1]
         mixed = (1 - share) * low + share * high
         carried[block] = np.where(share == 0, low, np.where(share == 1, high, mixed))
     return carried
