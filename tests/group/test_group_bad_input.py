@@ -222,10 +222,10 @@ def no_values(study):
     [
         (no_groups, [], 65, "no column tells groups"),
         (no_table, [], 65, "BIDS_DIR has no participants.tsv"),
-        (impossible_age, [], 65, "has sub-04 (1e+50) where half of the others are"),
+        (impossible_age, [], 65, "has sub-04 (1e+50) where half of the other values are"),
         (negative_age, [], 65, "sub-04 (-3), which nobody has"),
         (age_in_months, [], 65, "sub-04 (150), which nobody has"),
-        (coded_age, [], 65, "has sub-04 (-9999), sub-08 (-9999) where all others are 5"),
+        (coded_age, [], 65, "has sub-04 (-9999), sub-08 (-9999) where all other values are 5"),
         (coded_sex, [], 65, "'sex' has 999 (3) among words: a code for missing values?"),
         (comma_age, [], 65, "'age' holds decimal commas, as sub-01 ('74,1')"),
         (date_age, [], 65, "'age' holds dates, as sub-01 ('1974-01-01')"),

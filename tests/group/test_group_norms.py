@@ -238,7 +238,7 @@ def test_sites_need_controls(people, norms, capsys, tmp_path):
         ({"seg": "other"}, "segmentation protocol: other, but here demo"),
         ({"region": "extended"}, "region: extended, but here body"),
         ({"settings_hash": "0"}, "hash of the participant level's settings: 0"),
-        ({"x": [0.0, 1.0]}, "grid of the sheet: others, 2 by 7 nodes"),
+        ({"x": [0.0, 1.0]}, "grid of the sheet: another grid, 2 by 7 nodes"),
     ],
 )
 def test_people_who_were_measured_in_another_way_are_refused(people, norms, capsys, change, said):

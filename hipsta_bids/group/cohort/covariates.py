@@ -1,4 +1,4 @@
-"""Covariates of participants and sessions, from the tables of a BIDS dataset and from others."""
+"""Covariates of participants and sessions, from tables of a BIDS dataset and other tables."""
 
 import re
 from collections.abc import Mapping, Sequence

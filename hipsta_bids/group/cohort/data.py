@@ -101,8 +101,8 @@ def choose_visits(cohort: Cohort, comparison: Comparison) -> tuple[Cohort, Mappi
         reasons[~in_pair] = f"sessions {' and '.join(comparison.pair)} are compared"
         if not keep.any():
             raise ModelError(
-                f"no participant has both sessions {' and '.join(comparison.pair)}; choose two"
-                " others"
+                f"no participant has both sessions {' and '.join(comparison.pair)}; choose"
+                " two other sessions"
             )
     return cohort.take(keep), dict(reasons[~keep])
 

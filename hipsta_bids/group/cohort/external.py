@@ -57,7 +57,7 @@ def map_patterns(
     surfaces: Sequence[tuple[str | None, str]],
     reserved: Sequence[str],
 ) -> tuple[MapPattern, ...]:
-    """Combine and check the options about maps; a surface without a name is for all others."""
+    """Combine and check the options about maps; a surface without a name is for all other maps."""
     names = [name for name, _ in patterns]
     for name, pattern in patterns:
         if not (name.isalnum() and name.isascii() and name[0].isalpha()):
@@ -241,8 +241,8 @@ class ExternalCohorts:
 
     measured: Measured
     """Sheets, with the maps that lie on their grid."""
-    others: Mapping[str, Cohort]
-    """Maps with points of their own, by name; the covariates are the visits only."""
+    cohorts: Mapping[str, Cohort]
+    """Maps with points of their own, by surface; the covariates are the visits only."""
     notes: tuple[str, ...]
 
 
@@ -287,17 +287,18 @@ def add_external(
         sheets = {hemi: replace(side, maps={}) for hemi, side in curvature.items()}
         measured = replace(_on_grid(measured, nodes) if nodes else measured, sides=sheets)
     sides = {hemi: _with_maps(side, hemi, flat) for hemi, side in measured.sides.items()}
-    others = {}
-    for name, own in maps.items():
+    cohorts = {}
+    for name, sides_of_map in maps.items():
         if name not in flat:
-            on_mesh = any(side.mesh is not None for side in own.values())
-            axes = measured if on_mesh else _on_grid(measured, _nodes(own))
-            table = measured.visits
-            others[name] = Cohort(table=table, sides=own, x=axes.x, y=axes.y, units=units)
-    if others:
-        notes.append(f"maps {', '.join(others)}: not registered, their points are to correspond")
+            on_mesh = any(side.mesh is not None for side in sides_of_map.values())
+            axes = measured if on_mesh else _on_grid(measured, _nodes(sides_of_map))
+            cohorts[name] = Cohort(
+                table=measured.visits, sides=sides_of_map, x=axes.x, y=axes.y, units=units
+            )
+    if cohorts:
+        notes.append(f"maps {', '.join(cohorts)}: not registered, their points are to correspond")
     return ExternalCohorts(
-        measured=replace(measured, sides=sides), others=others, notes=tuple(notes)
+        measured=replace(measured, sides=sides), cohorts=cohorts, notes=tuple(notes)
     )
 
 

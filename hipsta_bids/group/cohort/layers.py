@@ -8,7 +8,8 @@ import numpy as np
 from hipsta_bids.group.cohort.data import Cohort, hemispheres, summary_values
 from hipsta_bids.group.stats.arrays import Float, Int, SideMaps
 
-#: Surfaces: the sheet, and that of summary measures, which is one point; others have names.
+#: Surfaces: the sheet, and that of summary measures, which is one point. Those of other programs'
+#: maps have names.
 SHEET, SUMMARY = "", "summary"
 
 

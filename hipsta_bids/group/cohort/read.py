@@ -24,7 +24,7 @@ from hipsta_bids.types import PARTICIPANT, SESSION, VisitKey
 
 #: Map that registration rests on.
 CURVATURE = "curvature"
-#: Maps that are analyzed unless others are asked for.
+#: Maps that are analyzed unless other maps are asked for.
 THICKNESS = "thickness"
 DEFAULT = (THICKNESS, CURVATURE)
 #: Names of all maps in the sheet tables.

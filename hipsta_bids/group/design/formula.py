@@ -376,7 +376,7 @@ def _refuse_spellings(text: pd.Series) -> None:
 
 
 def check_numbers(values: pd.Series, settings: DesignSettings) -> None:
-    """Refuse codes for missing values that are far from all others, and values out of all range."""
+    """Refuse codes for missing values, far from all other values, and impossible values."""
     present = values[values.notna()]
     codes = present.isin(settings.missing_codes)
     values_left = present[~codes]
@@ -386,8 +386,8 @@ def check_numbers(values: pd.Series, settings: DesignSettings) -> None:
         far = codes & (gap > high - low)
         if far.any():
             raise ModelError(
-                f"model: column {values.name!r} has {_cells(present[far])} where all others are"
-                f" {low:g} to {high:g}: a code for missing values? mark them n/a (or change the"
+                f"model: column {values.name!r} has {_cells(present[far])} where all other values"
+                f" are {low:g} to {high:g}: a code for missing values? mark them n/a (or change the"
                 " setting design.missing_codes)"
             )
     if not len(present):
@@ -397,8 +397,8 @@ def check_numbers(values: pd.Series, settings: DesignSettings) -> None:
     far = (present - quartiles[1]).abs() > reach
     if reach > 0 and far.any():
         raise ModelError(
-            f"model: column {values.name!r} has {_cells(present[far])} where half of the others are"
-            f" {quartiles[0]:.4g} to {quartiles[2]:.4g}; correct them, or mark them n/a"
+            f"model: column {values.name!r} has {_cells(present[far])} where half of the other"
+            f" values are {quartiles[0]:.4g} to {quartiles[2]:.4g}; correct them, or mark them n/a"
         )
 
 

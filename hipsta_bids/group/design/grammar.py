@@ -28,7 +28,7 @@ _CODINGS = frozenset({"diff", "helmert", "poly", "sum", "treatment"})
 CONTEXT: Mapping[str, object] = MappingProxyType({"abs": np.abs, "sqrt": np.sqrt})
 
 _ALLOWED = (
-    "allowed are names of columns (others than words in backticks), 0, 1, + - * : / **, parentheses"
+    "allowed are names of columns (except words in backticks), 0, 1, + - * : / **, parentheses"
     f" and {', '.join(['C', *sorted(_VALUE | _COLUMN)])}"
 )
 _TOKEN = re.compile(

@@ -20,7 +20,7 @@ from hipsta_bids.group.design.settings import DefaultModelSettings, DesignSettin
 from hipsta_bids.io import files
 from hipsta_bids.types import PARTICIPANT, SESSION, Float, Int64
 
-#: A column is a combination of others if less than this fraction of its length is its own.
+#: A column is a combination of other columns if less than this fraction of its length is its own.
 DEPENDENCE = 1e-9
 
 #: How a contrast asks whether a variable bends, and the ages that the default model may bend.
@@ -42,11 +42,11 @@ class Groups:
 
     column: str
     levels: tuple[str, ...]
-    """The reference first, the others in the order of the alphabet."""
+    """The reference first, the other levels in the order of the alphabet."""
 
     @property
     def reference(self) -> str:
-        """The level that the others are compared with."""
+        """The level that the other levels are compared with."""
         return self.levels[0]
 
     def contrasts(self) -> list[str]:
@@ -184,8 +184,8 @@ class Comparison:
             raise UsageError("give --longitudinal (all sessions) or --paired (two), not both")
         if self.longitudinal and self.normative:
             raise UsageError(
-                "w-scores need one visit per participant, as others of the same participant would"
-                " be in the reference; leave --longitudinal out, or use --paired"
+                "w-scores need one visit per participant, as other visits of the same participant"
+                " would be in the reference; leave --longitudinal out, or use --paired"
             )
 
 

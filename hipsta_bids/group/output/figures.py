@@ -39,7 +39,7 @@ _SIGNS = (*range(0x20, 0x250), *range(0x370, 0x400), *range(0x2000, 0x20A0), *ra
 
 _STYLE: Any = {
     "font.family": "sans-serif",
-    # The first two are everywhere; the others are for readers of drawings who lack them.
+    # The first two are everywhere; the other fonts are for readers of drawings who lack them.
     # Chinese, Japanese and Korean characters come from the first of these that is installed.
     "font.sans-serif": [
         _FONT,

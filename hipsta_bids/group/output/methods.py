@@ -71,13 +71,13 @@ def methods_text(
     settings: group_settings.GroupSettings,
     n_out: int,
     *,
-    others: Sequence[str] = (),
+    surfaces: Sequence[str] = (),
     region: str = "body",
     ratings: Mapping[str, int] | None = None,
 ) -> str:
     """Word what was done and what came out."""
     cite = Citations()
-    paragraphs = [_sample(cohort, analysis, n_out, cite("method"), others)]
+    paragraphs = [_sample(cohort, analysis, n_out, cite("method"), surfaces)]
     if ratings is not None:
         counts = ", ".join(f"{n} {rating}" for rating, n in ratings.items())
         paragraphs[0] += (
@@ -85,10 +85,10 @@ def methods_text(
             " left out."
         )
     aligned = [_registration(analysis, settings, cite)] if analysis.sides else []
-    if others:
+    if surfaces:
         aligned.append(
-            f"Maps of other programs ({', '.join(others)}) were taken as they are, point by point,"
-            " without registration."
+            f"Maps of other programs ({', '.join(surfaces)}) were taken as they are, point by"
+            " point, without registration."
         )
     if aligned:
         paragraphs.append(" ".join(aligned))
@@ -111,13 +111,13 @@ def methods_text(
 
 
 def _sample(
-    cohort: Cohort, analysis: Analysis, n_out: int, method: str, others: Sequence[str]
+    cohort: Cohort, analysis: Analysis, n_out: int, method: str, surfaces: Sequence[str]
 ) -> str:
     rows = analysis.design.rows
     table = analysis.compared.table.iloc[rows]
     people = cohort.table[PARTICIPANT].nunique()
     visits = f" ({len(cohort.table)} visits)" if len(cohort.table) > people else ""
-    names = [name.replace("_", " ") for name in (*analysis.measured.maps, *others)]
+    names = [name.replace("_", " ") for name in (*analysis.measured.maps, *surfaces)]
     maps = ", ".join(f"map of {name}" for name in names) or "summaries"
     text = (
         f"Measures of the hippocampus {method} ({maps}) of"

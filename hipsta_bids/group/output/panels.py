@@ -180,7 +180,7 @@ def contrasts(
     """Effect sizes and corrected p-values of each contrast.
 
     Tests are those of all measures, by side and measure, which share their colors; ``like`` names
-    contrasts of which others take these.
+    contrasts of which other functions take these.
     """
     tests = {hemi: own[measure] for hemi, own in every_test.items() if measure in own}
     sides = list(tests)

@@ -188,7 +188,7 @@ class NormsFile(TomlTable):
         return pd.concat(blocks)
 
     def arrays(self) -> dict[Key, Norms]:
-        """Norms by hemisphere and measure; ValueError if these do not fit, or are others."""
+        """Return norms by hemisphere and measure; ValueError if these do not fit."""
         knots = np.array(self.knots, dtype=np.float64)
         if not (np.diff(knots) > 0).all():
             raise ValueError("knots of age do not ascend")

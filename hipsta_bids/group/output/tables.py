@@ -15,7 +15,7 @@ from hipsta_bids.group.output import columns, results
 from hipsta_bids.group.stats.arrays import Float, describe_known, mean_of_known
 from hipsta_bids.group.stats.classify import ClassifierResult
 from hipsta_bids.group.stats.clusters import edges_of
-from hipsta_bids.group.stats.inference import control_fdr
+from hipsta_bids.group.stats.inference import Discoveries, MapKey, control_fdr
 from hipsta_bids.group.stats.registration import ShiftDifference
 from hipsta_bids.types import PARTICIPANT, SESSION
 
@@ -34,41 +34,27 @@ JOINT_COLUMNS: Mapping[str, str] = COLUMNS | _MEANINGS["joint"]
 
 
 def result_tables(
-    cohort: Cohort, analysis: results.Analysis, settings: GroupSettings
+    surface: str, cohort: Cohort, analysis: results.Analysis, settings: GroupSettings
 ) -> Iterator[Named]:
-    """Make all tables of one model."""
-    grouped = analysis.groups is not None
+    """Make all tables of one model of the maps of one surface."""
+    prefix = f"{surface}_" if surface else ""
     if analysis.fitted:
-        yield "peaks", _stacked(_peaks(cohort, analysis, settings))
-        yield "means", _stacked(_means(cohort, analysis))
-    if analysis.found:
-        yield "maps", _overview(analysis)
+        yield f"{prefix}peaks", _stacked(_peaks(cohort, analysis, settings))
+        yield f"{prefix}means", _stacked(_means(cohort, analysis))
     if analysis.sides:
         yield from _registration_tables(cohort, analysis)
-    yield from _sites("sites", cohort, analysis)
+    yield from _sites(f"{prefix}sites", cohort, analysis)
     if analysis.measures:
         yield "measures", with_fdr(_stacked(_measures(cohort, analysis)), settings)
-        if grouped:
+        if analysis.groups is not None:
             yield "descriptives", _stacked(_descriptives(analysis))
     if analysis.scores is not None and len(analysis.scores.table):
-        yield "wscores", analysis.scores.table
+        yield f"{prefix}wscores", analysis.scores.table
     if analysis.pairs:
         yield "classification", _classification(analysis, settings)
         yield "roc", _stacked(_curves(analysis, _roc))
         if any(pair.comparison.full.calibration.judged for *_, pair in analysis.pairs):
             yield "calibration", _stacked(_curves(analysis, _calibration))
-    yield from _statistics(cohort, analysis)
-
-
-def point_tables(
-    name: str, cohort: Cohort, analysis: results.Analysis, settings: GroupSettings
-) -> Iterator[Named]:
-    """Make the tables of maps that lie on a surface of their own."""
-    yield f"{name}_peaks", _stacked(_peaks(cohort, analysis, settings))
-    if analysis.scores is not None:
-        yield f"{name}_wscores", analysis.scores.table
-    yield from _sites(f"{name}_sites", cohort, analysis)
-    yield f"{name}_means", _stacked(_means(cohort, analysis))
     yield from _statistics(cohort, analysis)
 
 
@@ -163,12 +149,12 @@ def _profiles(cohort: Cohort, analysis: results.Analysis) -> Iterator[Columns]:
                     }
 
 
-def _overview(analysis: results.Analysis) -> pd.DataFrame:
-    """One row per map: how many points survive, and at which p."""
+def overview_table(discoveries: Mapping[MapKey, Discoveries]) -> pd.DataFrame:
+    """Return one row per map: how many points survive, and at which p."""
     return pd.DataFrame(
         [
-            columns.overview_row(map_name(key.hemi, key.measure, key.contrast), key, found)
-            for key, found in analysis.found.items()
+            columns.overview_row(map_name(key.hemi, key.measure, key.contrast), key, result)
+            for key, result in discoveries.items()
         ]
     )
 

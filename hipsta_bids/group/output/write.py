@@ -19,6 +19,7 @@ from pyarrow import parquet
 from hipsta_bids.derivatives.names import DATASET_FILES
 from hipsta_bids.group.cohort.collect import Exclusion
 from hipsta_bids.group.cohort.data import Cohort
+from hipsta_bids.group.cohort.layers import SHEET
 from hipsta_bids.group.design.settings import GroupSettings
 from hipsta_bids.group.output import results, tables
 from hipsta_bids.group.output.figures import Drawing, draw_figures, encode
@@ -37,8 +38,8 @@ _LOGGER = logging.getLogger(__name__)
 
 #: Folder of all models, in the output dataset.
 GROUP_FOLDER = DATASET_FILES["group"]
-#: Name of the surface of the sheets.
-SHEET = "sheet"
+#: Name of the surface of the sheets in files.
+_SHEET_NAME = "sheet"
 #: Values per row group of maps, and participants per row group of scores; bounds the memory.
 _BLOCK, _ROWS_OF_SCORES = 500_000, 500
 _ROWS = 10_000  # of tables that are spelled at once
@@ -90,52 +91,54 @@ def _replace(scratch: Path, final: Path) -> None:
 
 def write_results(
     folder: Path,
-    cohort: Cohort,
-    analysis: results.Analysis,
+    cohorts: Mapping[str, Cohort],
+    analyses: Mapping[str, results.Analysis],
     settings: GroupSettings,
     exclusions: Sequence[Exclusion],
     *,
-    others: Mapping[str, tuple[Cohort, results.Analysis]],
     joint: Sequence[JointMap] = (),
     region: str = "body",
     ratings: Mapping[str, int] | None = None,
 ) -> None:
-    """Write tables, maps and text."""
-    for name, table in tables.result_tables(cohort, analysis, settings):
-        write_table(folder, name, table)
-    for name, other in others.items():
-        for title, table in tables.point_tables(name, *other, settings):
-            write_table(folder, title, table)
+    """Write tables, maps and text; cohorts and analyses are by surface."""
+    cohort, analysis = cohorts[SHEET], analyses[SHEET]
+    for surface, own in cohorts.items():
+        for name, table in tables.result_tables(surface, own, analyses[surface], settings):
+            write_table(folder, name, table)
+    if analysis.found:
+        write_table(folder, "maps", tables.overview_table(analysis.found))
     write_exclusions(folder, exclusions)
     rows_of_model = analysis.compared.table.iloc[analysis.design.rows]
     write_table(folder, "covariates", rows_of_model, described=False)
     write_table(folder, "design", tables.design_table(analysis), described=False)
     registered = {hemi: side.registered for hemi, side in analysis.sides.items()}
-    if registered or others:
-        points = {name: other for name, (other, _) in others.items()}
+    if registered or len(cohorts) > 1:
         states = [cohort.sides, registered]
         if analysis.harmonization is not None:
             states.append(analysis.harmonization.cohort.sides)
-        _write_maps(folder / "maps.parquet", cohort, states if registered else [], points)
+        _write_maps(folder / "maps.parquet", cohorts, states if registered else [])
     if templates := results.templates_of(analysis.sides):
         files.write_json(folder / "template.json", templates)
     if analysis.harmonization is not None:
-        done = [analysis.harmonization, *(other.harmonization for _, other in others.values())]
-        how = results.digests({hemi: side.registration for hemi, side in analysis.sides.items()})
-        if effects := results.effects_of([one for one in done if one is not None], how):
+        parts = [one.harmonization for one in analyses.values() if one.harmonization is not None]
+        templates_used = results.digests(
+            {h: side.registration for h, side in analysis.sides.items()}
+        )
+        if effects := results.effects_of(parts, templates_used):
             files.write_json(folder / "harmonization.json", effects.model_dump(by_alias=True))
-    for own, one in ((cohort, analysis), *others.values()):
-        _write_surfaces(folder, own, one)
+    for surface, one in analyses.items():
+        _write_surfaces(folder, cohorts[surface], one)
         write_stats(folder, stats_of(results.tested_maps(one)))
-        found = {} if one.scores is None else one.scores.sides
-        write_scores(folder, own, one.compared.table, found, letter="w", sheets=bool(one.sides))
+        scored, table = {} if one.scores is None else one.scores.sides, one.compared.table
+        sheets = bool(one.sides)
+        write_scores(folder, cohorts[surface], table, scored, letter="w", sheets=sheets)
     _write_joint(folder, joint, settings)
     text = methods_text(
         cohort,
         analysis,
         settings,
         len(exclusions),
-        others=tuple(others),
+        surfaces=[surface for surface in cohorts if surface != SHEET],
         region=region,
         ratings=ratings,
     )
@@ -151,16 +154,18 @@ def write_exclusions(folder: Path, exclusions: Sequence[Exclusion]) -> None:
 
 def draw(
     folder: Path,
-    cohort: Cohort,
-    analysis: results.Analysis,
+    cohorts: Mapping[str, Cohort],
+    analyses: Mapping[str, results.Analysis],
     shapes: Mapping[str, AverageShape],
     *,
-    others: Mapping[str, tuple[Cohort, results.Analysis]],
     joint: Sequence[JointMap] = (),
 ) -> list[str]:
     """Draw the figures of all models, and say what is wrong with them."""
-    every = ((cohort, analysis, shapes), *((*one, {}) for one in others.values()))
-    drawings = [figure for one in every for figure in draw_figures(*one)]
+    drawings = [
+        drawing
+        for surface, cohort in cohorts.items()
+        for drawing in draw_figures(cohort, analyses[surface], shapes if surface == SHEET else {})
+    ]
     if joint:
         drawings.append((f"{JOINT}_maps", partial(draw_joint, joint, shapes, {})))
     return write_figures(folder, drawings)
@@ -239,17 +244,14 @@ def _cell(value: object) -> str:
 
 
 def _write_maps(
-    path: Path,
-    cohort: Cohort,
-    states: Sequence[Mapping[str, SideMaps]],
-    others: Mapping[str, Cohort],
+    path: Path, cohorts: Mapping[str, Cohort], states: Sequence[Mapping[str, SideMaps]]
 ) -> None:
     """Write all analyzed maps as one Parquet file: a row per visit, hemisphere and point.
 
     The states of the sheets are those before and after each step; none without sheets.
     """
     fields = [pa.field(name, _WORD) for name in (PARTICIPANT, SESSION, "hemi")]
-    about = {"description": f"{SHEET}, or the name of maps with points of their own"}
+    about = {"description": f"{_SHEET_NAME}, or the name of maps with points of their own"}
     fields.append(pa.field("surface", _WORD, metadata=about))
     about = {"description": "point of the surface, the first is 0; on the sheet y is the faster"}
     fields.append(pa.field("vertex", pa.int32(), metadata=about))
@@ -261,13 +263,15 @@ def _write_maps(
     for suffix, text in list(_SUFFIXES.items())[: len(states)]:
         if suffix != "_harmonized":
             fields.append(pa.field(f"subfield{suffix}", _WORD, metadata={"description": text}))
-        fields += [_number(f"{name}{suffix}", cohort, name, text) for name in measures]
-    fields += [_number(name, other, name, "as given") for name, other in others.items()]
+        fields += [_number(f"{name}{suffix}", cohorts[SHEET], name, text) for name in measures]
+    fields += [
+        _number(name, one, name, "as given") for name, one in cohorts.items() if name != SHEET
+    ]
     about = {
         "description": "one row per visit, hemisphere and point; x from medial to lateral, y"
         " from posterior to anterior; a column is empty where the surface lacks the measure"
     }
-    rows = _map_blocks(cohort, states, others)
+    rows = _map_blocks(cohorts, states)
     _write_parquet(path, pa.schema(fields, metadata=about), rows)
 
 
@@ -298,20 +302,21 @@ def _write_parquet(path: Path, schema: pa.Schema, rows: Iterable[Columns]) -> No
 
 
 def _map_blocks(
-    cohort: Cohort, states: Sequence[Mapping[str, SideMaps]], others: Mapping[str, Cohort]
+    cohorts: Mapping[str, Cohort], states: Sequence[Mapping[str, SideMaps]]
 ) -> Iterator[Columns]:
-    surfaces = [(SHEET, cohort, sides) for sides in states[:1]]
-    surfaces += [(name, other, other.sides) for name, other in others.items()]
-    for surface, own, sides in surfaces:
-        for hemi, side in sides.items():
+    for surface, cohort in cohorts.items():
+        if surface == SHEET and not states:
+            continue
+        for hemi, side in cohort.sides.items():
             points = int(np.prod(side.shape))
             for part in blocks(len(side.rows), max(_BLOCK // points, 1)):
                 rows = side.rows[part]
-                columns = _visit_columns(own.table, rows, points, hemi=hemi, surface=surface)
+                name = surface or _SHEET_NAME
+                columns = _visit_columns(cohort.table, rows, points, hemi=hemi, surface=name)
                 vertices = np.tile(np.arange(points, dtype=np.int32), len(rows))
                 columns["vertex"] = pa.array(vertices)
                 if side.mesh is None:
-                    columns |= _node_columns(own, side.shape, len(rows))
+                    columns |= _node_columns(cohort, side.shape, len(rows))
                 if surface == SHEET:
                     for suffix, state in zip(_SUFFIXES, states, strict=False):
                         columns[f"subfield{suffix}"] = _subfields(state[hemi], part)

@@ -7,6 +7,7 @@ from typing import Any
 
 from hipsta_bids.derivatives import dataset
 from hipsta_bids.group.cohort import collect
+from hipsta_bids.group.cohort.layers import SHEET
 from hipsta_bids.group.design import model as designs
 from hipsta_bids.group.design.settings import GroupSettings
 from hipsta_bids.group.output.results import Analysis, harmonization_record
@@ -47,7 +48,7 @@ def _analyze(options: study.GroupOptions, settings: GroupSettings) -> study.Grou
     """Analyze and write all but the page, for which the memory that it takes is free again."""
     tell("reading")
     inputs = study.read_inputs(options, settings)
-    fitting.check_joint([*inputs.measures.maps, *inputs.others], options.comparison, settings)
+    fitting.check_joint(inputs.maps, options.comparison, settings)
     cohort = inputs.cohort
     document, model, groups, references = designs.choose_model(
         options.model,
@@ -70,17 +71,17 @@ def _analyze(options: study.GroupOptions, settings: GroupSettings) -> study.Grou
         templates=templates,
         site_effects=load_effects(options.harmonize_model) if options.harmonize_model else None,
     )
-    others = {
-        name: (other, fitting.analyze_points(other, analysis, settings))
-        for name, other in inputs.others.items()
+    analyses = {
+        surface: analysis
+        if surface == SHEET
+        else fitting.analyze_points(inputs.cohorts[surface], analysis, settings)
+        for surface in inputs.cohorts
     }
-    found = dict(analysis.found)
-    for _, other in others.values():
-        found |= other.found
-    joint = fitting.combine_maps([analysis, *(other for _, other in others.values())], settings)
+    joint = fitting.combine_maps(list(analyses.values()), settings)
+    found = {key: test for one in analyses.values() for key, test in one.found.items()}
     found |= {key: one.found for key, one in joint.items()}
     tested = tuple(joint.values())
-    analysis = replace(analysis, found=found)
+    analysis = analyses[SHEET] = replace(analysis, found=found)
     exclusions = [*inputs.exclusions, *_incomplete(analysis)]
     wanted = designs.wanted_measures(options.model, options.measures)
     notes = [*inputs.notes, *_notes(options, inputs, analysis, settings)]
@@ -93,11 +94,10 @@ def _analyze(options: study.GroupOptions, settings: GroupSettings) -> study.Grou
     def fill(folder: Path) -> dict[str, Any]:
         write_results(
             folder,
-            cohort,
-            analysis,
+            inputs.cohorts,
+            analyses,
             settings,
             exclusions,
-            others=others,
             joint=tested,
             region=options.sheets.region,
             ratings=inputs.found.ratings,
@@ -108,7 +108,7 @@ def _analyze(options: study.GroupOptions, settings: GroupSettings) -> study.Grou
         write_shapes(folder, shapes)
         if analysis.sides and inputs.found.records and not shapes:
             notes.append("no average surfaces: those of the participant level are missing")
-        notes.extend(draw(folder, cohort, analysis, shapes, others=others, joint=tested))
+        notes.extend(draw(folder, inputs.cohorts, analyses, shapes, joint=tested))
         return _record(analysis, inputs.found.ratings)
 
     return study.write_folder(

@@ -1,4 +1,4 @@
-"""What a site sends to others about one analysis, and how it is read: sums over participants only.
+"""What a site sends to other sites about an analysis, and how it is read: sums over people only.
 
 A summary is one JSON file. All of its numbers are about the same participants, so that no
 difference of two of them is about one person.

@@ -272,7 +272,7 @@ def without_tests_of_sites(
     if about and (named.intersection(about) or len(about) == len(design.contrasts)):
         raise ModelError(
             f"--harmonize {plan.column}: contrast {about[0]} is about what it takes out;"
-            " harmonize sites or scanners, and choose contrasts of others by --contrast"
+            " harmonize sites or scanners, and choose other contrasts by --contrast"
         )
     contrasts = tuple(one for one in design.contrasts if one.name not in about)
     return replace(design, contrasts=contrasts)
@@ -352,8 +352,8 @@ def _effects(
     saved_effects = plan.saved.effects_on_summaries if summary else plan.saved.effects_on_maps
     if key not in saved_effects:
         raise ModelError(
-            f"{plan.saved.file}: has no map of {key[1]} of hemisphere {key[0]}; choose others by"
-            " --measures, or harmonize anew"
+            f"{plan.saved.file}: has no map of {key[1]} of hemisphere {key[0]}; choose other maps"
+            " by --measures, or harmonize anew"
         )
     if len(saved_effects[key].mean) != values.shape[1]:
         raise ModelError(
@@ -377,7 +377,7 @@ def _notes(plan: SitePlan, settings: GroupSettings, unknown: set[str]) -> Iterat
 
 
 def _check_templates(saved: SavedEffects, registrations: Mapping[str, Registration]) -> None:
-    """Refuse parameters of points that are others here."""
+    """Refuse parameters of other points than those of this cohort."""
     for hemi, digest in digests(registrations).items():
         if saved.templates.get(hemi) != digest:
             is_unregistered = saved.templates.get(hemi) == "none"

@@ -14,7 +14,7 @@ from hipsta_bids import __version__
 from hipsta_bids.derivatives import dataset
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.cohort.data import Cohort
-from hipsta_bids.group.cohort.layers import layers
+from hipsta_bids.group.cohort.layers import SHEET, layers
 from hipsta_bids.group.design.formula import check_names, level_labels, listed, typed
 from hipsta_bids.group.design.model import BOTH, FIRST_AGE, Comparison
 from hipsta_bids.group.design.settings import GroupSettings, NormSettings
@@ -162,7 +162,7 @@ def _registered(
     """Register maps, and collect them and summary measures of each side and of the mean of both."""
     inputs = study.inputs
     template, cohorts, tables = study.register(templates)
-    names = {*inputs.measures.maps, *inputs.others}
+    names = set(inputs.maps)
     for name, cohort in cohorts.items():
         sides = {
             hemi: side.only([name for name in side.maps if name in names])
@@ -208,7 +208,9 @@ def _write(study: studies.Study, scoring: _Made, notes: Iterable[str]) -> studie
                 if side.maps:
                     write.write_surface(folder, one, points_of(side), hemi)
             if found := scoring.scored.get(surface):
-                write.write_scores(folder, one, one.table, found, letter="z", sheets=not surface)
+                write.write_scores(
+                    folder, one, one.table, found, letter="z", sheets=surface == SHEET
+                )
         files.write_text(folder / "methods.md", text)
         return write.write_figures(folder, _figures(scoring))
 
@@ -310,7 +312,7 @@ def _site_labels(table: pd.DataFrame, column: str) -> pd.Series:
 
 
 def _people(study: studies.Study, file: NormsFile) -> normative.People:
-    """Describe visits as norms have to know them, new sites last; others are left out."""
+    """Describe visits as norms have to know them, new sites last; all other visits are left out."""
     table, _settings = study.cohort.table, study.settings
     check_names([file.age, *([file.sex] if file.sexes else [])], table.columns)
     age, labels = _ages(table, file.age), _site_labels(table, file.site)
@@ -344,7 +346,7 @@ def _check(file: NormsFile, path: Path, inputs: studies.GroupInputs) -> list[str
         len(a) == len(b) and np.allclose(a, b) for a, b in ((file.x, cohort.x), (file.y, cohort.y))
     )
     grid_text = f"{len(cohort.x)} by {len(cohort.y)} nodes"
-    file_text = grid_text if is_same_grid else f"others, {len(file.x)} by {len(file.y)} nodes"
+    file_text = grid_text if is_same_grid else f"another grid, {len(file.x)} by {len(file.y)} nodes"
     seg, region = _protocol(inputs)
     for subject, value, expected in (
         ("segmentation protocol", seg, file.seg),
@@ -358,7 +360,7 @@ def _check(file: NormsFile, path: Path, inputs: studies.GroupInputs) -> list[str
                 " cohort of the norms was"
             )
     available = {measure for measures in file.norms.values() for measure in measures}
-    requested = [*inputs.measures.maps, *inputs.others, *(inputs.measures.summaries or ())]
+    requested = [*inputs.maps, *(inputs.measures.summaries or ())]
     if unknown := [name for name in requested if name not in available]:
         raise ModelError(
             f"{path}: has no norms of {listed(unknown)}, only of {listed(sorted(available))};"

@@ -149,7 +149,7 @@ def _agree(
 
 
 def _agree_on_measures(sites: Sequence[SiteSummary]) -> None:
-    """Refuse sites that lack a map or summary measure of others."""
+    """Refuse sites that lack a map or summary measure of other sites."""
     names_of = [
         [
             f"{name}, {model.hemi} ({'map' if model.kind == 'map' else model.formula})"
@@ -172,7 +172,9 @@ def _few(values: Sequence[float]) -> str:
     return f"{len(values)} nodes from {values[0]:.4g} to {values[-1]:.4g}" if values else "none"
 
 
-@np.errstate(over="ignore", divide="ignore", invalid="ignore")  # of numbers as others sent them
+@np.errstate(
+    over="ignore", divide="ignore", invalid="ignore"
+)  # of numbers as other sites sent them
 def analyze_sites(sites: list[SiteSummary], settings: GroupSettings) -> Meta:
     """Combine each contrast of each model, and tell which points survive."""
     items = [

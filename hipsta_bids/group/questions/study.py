@@ -15,6 +15,7 @@ from hipsta_bids.errors import InputError, ModelError
 from hipsta_bids.group.cohort import collect, external, read
 from hipsta_bids.group.cohort.covariates import add_icv, add_time, read_covariates
 from hipsta_bids.group.cohort.data import Cohort, Measures, choose_visits
+from hipsta_bids.group.cohort.layers import SHEET
 from hipsta_bids.group.design import model as designs
 from hipsta_bids.group.design.formula import check_names, listed, with_factors
 from hipsta_bids.group.design.settings import GroupSettings
@@ -64,7 +65,7 @@ class GroupOptions:
     """Parameters of the harmonization of another analysis."""
     comparison: designs.Comparison = field(default_factory=designs.Comparison)
     export_summary: str | None = None
-    """Name of this site in a summary for others, empty for that of the folder; ``None`` for no
+    """Name of this site in a summary for other sites, empty for that of the folder; ``None`` for no
     summary."""
     reports: bool = True
     """Whether a page is made."""
@@ -78,10 +79,8 @@ class GroupInputs:
 
     found: collect.Collection
     """Hemispheres that were measured."""
-    cohort: Cohort
-    """Visits that are compared, with covariates and sheets."""
-    others: Mapping[str, Cohort]
-    """The same visits with other programs' maps, by the names of these."""
+    cohorts: Mapping[str, Cohort]
+    """Visits that are compared, with covariates and maps, by surface."""
     measures: Measures
     """Measures of the sheets."""
     icv: str | None
@@ -91,6 +90,16 @@ class GroupInputs:
     """Of hemispheres, and of sessions that are not compared."""
     notes: tuple[str, ...]
     """What to know, one line each."""
+
+    @property
+    def cohort(self) -> Cohort:
+        """Return the visits with their sheets."""
+        return self.cohorts[SHEET]
+
+    @property
+    def maps(self) -> list[str]:
+        """Return the maps of all surfaces."""
+        return [*self.measures.maps, *(name for name in self.cohorts if name != SHEET)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -174,7 +183,7 @@ def read_inputs(options: GroupOptions, settings: GroupSettings) -> GroupInputs:
         further.measured, found.records, options.volumes, options.bids_dir
     )
     read.check_summaries(measures, measured.sides)
-    everybody = Cohort(
+    all_visits = Cohort(
         table=with_factors(
             read_covariates(measured.visits, options.bids_dir, options.covariates), settings
         ),
@@ -184,33 +193,34 @@ def read_inputs(options: GroupOptions, settings: GroupSettings) -> GroupInputs:
         units=measured.units,
     )
     # A visit may have lost both of its hemispheres.
-    sides = [side for one in (everybody, *further.others.values()) for side in one.sides.values()]
-    there = np.isin(np.arange(len(everybody.table)), np.concatenate([one.rows for one in sides]))
-    cohort, reasons = choose_visits(everybody.take(there), options.comparison)
-    keep = everybody.table.index.isin(cohort.table.index)
+    cohorts = {SHEET: all_visits, **further.cohorts}
+    rows = np.concatenate([side.rows for one in cohorts.values() for side in one.sides.values()])
+    has_maps = np.isin(np.arange(len(all_visits.table)), rows)
+    cohort, reasons = choose_visits(all_visits.take(has_maps), options.comparison)
+    keep = all_visits.table.index.isin(cohort.table.index)
     table, icv = add_icv(cohort.table, measured.sources, settings)
     cohort = replace(cohort, table=table)
     time = None
     if options.comparison.longitudinal:
         time = add_time(cohort.table, settings)
         cohort = replace(cohort, table=time.table)
-    own = tuple(name for name in measures.maps if name not in further.others)
-    other = "other-session" if options.comparison.pair else "later-session"
+    sheet_maps = tuple(name for name in measures.maps if name not in further.cohorts)
+    reason = "other-session" if options.comparison.pair else "later-session"
     return GroupInputs(
         found=found,
-        cohort=cohort,
-        others={
-            name: replace(other.take(keep), table=cohort.table)
-            for name, other in further.others.items()
+        cohorts={SHEET: cohort}
+        | {
+            surface: replace(one.take(keep), table=cohort.table)
+            for surface, one in further.cohorts.items()
         },
-        measures=replace(measures, maps=own),
+        measures=replace(measures, maps=sheet_maps),
         icv=icv,
         time=time,
         exclusions=(
             *found.exclusions,
             *measured.damaged,
             *collect.exclude_visits(
-                measured.visits, {visit: (other, message) for visit, message in reasons.items()}
+                measured.visits, {visit: (reason, message) for visit, message in reasons.items()}
             ),
         ),
         notes=(*found.notes, *further.notes, *volume_notes, *_damaged(measured)),
@@ -366,8 +376,10 @@ class Study:
             for hemi in each("registration", with_maps)
         }
         registered = {hemi: side.registered for hemi, side in sides.items()} or cohort.sides
-        others = {name: other.take(self.keep) for name, other in self.inputs.others.items()}
-        cohorts = {"": replace(cohort, sides=registered), **others}
+        cohorts = {
+            surface: replace(cohort, sides=registered) if surface == SHEET else one.take(self.keep)
+            for surface, one in self.inputs.cohorts.items()
+        }
         tables = dict(registration_tables(cohort, sides)) if sides else {}
         return templates_of(sides), cohorts, tables
 

@@ -227,7 +227,7 @@ def _solve_points(grams: Float, right: Float, least: float) -> Float:
 def _residuals(
     effects: SiteEffects, values: Float, visits: Visits
 ) -> Iterator[tuple[slice, Float]]:
-    """Take what columns and participants explain out of values, at some points after others.
+    """Take what columns and participants explain out of values, at one block of points at a time.
 
     A participant's own part is the mean of what the model leaves, shrunk as the best linear
     unbiased prediction is.

@@ -253,7 +253,7 @@ def fit_block(
 ) -> PointBlock:
     """Solve least squares at some points, by normal equations in orthonormal coordinates.
 
-    There the equations of a complete point are the identity, and those of others stay well
+    There the equations of a complete point are the identity, and those of other points stay well
     conditioned unless the missing subjects really carried a column.
     """
     present = np.isfinite(maps)

@@ -422,7 +422,7 @@ def _permuted(
     rules: MultiplicitySettings,
     raw: Mapping[MapKey, Float] | None = None,
 ) -> dict[MapKey, tuple[PermutationTest, Discoveries]]:
-    """Permute families of maps; ``raw`` are p-values of points for cut-offs, if others are told."""
+    """Permute families of maps; ``raw`` replaces the p-values of points for cut-offs."""
     results_of: dict[MapKey, tuple[PermutationTest, Discoveries]] = {}
     groups = families(tested, rules.scope)
     enhanced = rules.method == "permutation-tfce"

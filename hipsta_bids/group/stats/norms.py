@@ -360,7 +360,7 @@ class NormativeScores:
 def w_scores(maps: Float, matrix: Float, reference: Bool, settings: GlmSettings) -> NormativeScores:
     """Score each subject against a reference group, adjusted for covariates.
 
-    Members of the reference group are scored against the others: as if the model had been
+    Members of the reference group are scored against its other members: as if the model had been
     fitted without them (from their leverage, so that nothing is fitted again). Their scores
     thus mean the same as those of everybody else.
     """

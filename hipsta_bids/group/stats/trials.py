@@ -204,7 +204,7 @@ def participants_needed(d: Float, alpha: float, power: float, limit: int) -> Flo
 def point_level(settings: GroupSettings) -> float:
     """Level of the test at a point that holds the false discovery rate, on average.
 
-    If a share a of the points differs, and is found with the power P, while the others are found
+    If a share a of the points differs, and is found with the power P, while the rest are found
     at the level t, a share a P + (1 - a) t of the points is found. The procedure of Benjamini and
     Hochberg has then t = q (a P + (1 - a) t), which gives t (Jung 2005; Liu and Hwang 2007). The
     two-stage procedure does it with q / (1 + q), and again with q / (1 + q) over the share of
