@@ -119,7 +119,7 @@ def simulate_design(design: TrialDesign, trials: int, seed: int = 0) -> dict[str
     settings = design.settings
     alpha = point_level(settings) if design.is_map else settings.power.alpha
     found = sample_size(design.effect, reference, settings, alpha=alpha)
-    per_arm, enrolled = int(np.median(found.per_arm)), int(np.median(found.enrolled))
+    per_arm, enrolled = int(np.median(found["per_arm"])), int(np.median(found["enrolled_per_arm"]))
     if design.is_map:
         shares = [_map_trial(design, per_arm, random) for _ in range(trials)]
     elif settings.power.dropout:
@@ -130,7 +130,7 @@ def simulate_design(design: TrialDesign, trials: int, seed: int = 0) -> dict[str
         ]
     else:
         shares = [_trial(design, enrolled, random) for _ in range(trials)]
-    power = power_of(found.cohen_d, np.full(found.sd.shape, per_arm), alpha)
+    power = power_of(found["cohen_d"], np.full(found["cohen_d"].shape, per_arm), alpha)
     return {
         "per arm": per_arm,
         "enrolled": enrolled,

@@ -52,12 +52,12 @@ def test_numbers_at_the_ends():
 def test_end_point_of_one_visit_is_a_value():
     effect = TrialEffect(kind="thinning", share=0.05)
     found = sample_size(effect, REFERENCE, SETTINGS, alpha=0.05, limits=True)
-    assert found.difference[0] == pytest.approx(0.08)
-    assert found.sd[0] == pytest.approx(0.2)
-    assert found.per_arm[0] == np.ceil(TTestIndPower().solve_power(0.4, alpha=0.05, power=0.8))
+    assert found["arm_difference"][0] == pytest.approx(0.08)
+    assert found["sd_endpoint"][0] == pytest.approx(0.2)
+    assert found["per_arm"][0] == np.ceil(TTestIndPower().solve_power(0.4, alpha=0.05, power=0.8))
     low, high = (np.sqrt(48 / stats.chi2.ppf(q, 48)) for q in (0.975, 0.025))
     ends = [TTestIndPower().solve_power(0.4 / f, alpha=0.05, power=0.8) for f in (low, high)]
-    assert found.limits[:, 0].tolist() == np.ceil(ends).tolist()
+    assert [found["per_arm_low"][0], found["per_arm_high"][0]] == np.ceil(ends).tolist()
 
 
 def test_end_point_of_several_visits_is_the_slope():
@@ -65,21 +65,21 @@ def test_end_point_of_several_visits_is_the_slope():
     settings = SETTINGS.changed(power={"dropout": 0.2})
     found = sample_size(effect, REFERENCE, settings, alpha=0.05, limits=True)
     # Squared deviations of 0, 12 and 24 months from 12 are 288 in all.
-    assert found.sd[0] == pytest.approx(np.sqrt(1e-5 + 0.04 / 288))
-    assert found.difference[0] == pytest.approx(0.001)
+    sd = found["sd_endpoint"][0] / 12
+    assert sd == pytest.approx(np.sqrt(1e-5 + 0.04 / 288))
+    assert found["arm_difference"][0] == pytest.approx(0.012)
     # Of those who leave some have two visits, whose slope says less than that of three.
     stay, after_two = 0.8, np.sqrt(0.8) - 0.8
-    share = stay + after_two * found.sd[0] ** 2 / (1e-5 + 0.04 / 72)
-    assert found.enrolled[0] == np.ceil(found.per_arm[0] / share)
-    assert found.per_arm[0] < found.enrolled[0] < np.ceil(found.per_arm[0] / 0.8)
-    assert found.limits[0, 0] < found.per_arm[0] < found.limits[1, 0]
+    share = stay + after_two * sd**2 / (1e-5 + 0.04 / 72)
+    assert found["enrolled_per_arm"][0] == np.ceil(found["per_arm"][0] / share)
+    assert found["per_arm"][0] < found["enrolled_per_arm"][0] < np.ceil(found["per_arm"][0] / 0.8)
+    assert found["per_arm_low"][0] < found["per_arm"][0] < found["per_arm_high"][0]
     over_zero = Reference(**vars(REFERENCE) | {"slope_limits": np.array([[-0.01], [0.002]])})
     uncertain = sample_size(effect, over_zero, settings, alpha=0.05, limits=True)
-    assert np.isnan(uncertain.limits[1, 0])
+    assert np.isnan(uncertain["per_arm_high"][0])
     thinner = TrialEffect(kind="thinning", share=0.05, visits=(0, 12, 24))
-    assert sample_size(thinner, REFERENCE, settings, alpha=0.05).difference[0] == pytest.approx(
-        0.08 / 24
-    )
+    thinned = sample_size(thinner, REFERENCE, settings, alpha=0.05)
+    assert thinned["arm_difference"][0] == pytest.approx(0.08 / 2)
 
 
 def test_slowing_needs_change_and_visits():

@@ -29,8 +29,8 @@ def points(values):
 def test_agreement_is_that_of_shrout_and_fleiss():
     found = repeatability(points(JUDGED))
     # The paper prints two digits; limits are those of R's psych for its table.
-    assert found.icc[0] == pytest.approx(0.29, abs=0.005)
-    assert found.icc_limits[:, 0] == pytest.approx([0.019, 0.761], abs=0.0006)
+    assert found["icc"][0] == pytest.approx(0.29, abs=0.005)
+    assert [found["icc_low"][0], found["icc_high"][0]] == pytest.approx([0.019, 0.761], abs=0.0006)
     rows = [(i, j, v) for i, row in enumerate(JUDGED) for j, v in enumerate(row)]
     table = pd.DataFrame(rows, columns=["who", "when", "value"])
     squares = anova_lm(ols("value ~ C(who) + C(when)", table).fit())
@@ -38,17 +38,19 @@ def test_agreement_is_that_of_shrout_and_fleiss():
     expected = (rows_ms - error_ms) / (
         rows_ms + 3 * error_ms + 4 * (columns_ms - error_ms) / len(JUDGED)
     )
-    assert found.icc[0] == pytest.approx(expected, rel=1e-12)
-    assert found.p_sessions[0] == pytest.approx(squares["PR(>F)"].iloc[1], rel=1e-9)
+    assert found["icc"][0] == pytest.approx(expected, rel=1e-12)
+    assert found["p_sessions"][0] == pytest.approx(squares["PR(>F)"].iloc[1], rel=1e-9)
 
 
 def test_within_subject_sd_is_that_of_bland_and_altman():
     found = repeatability(points(FLOW))
-    assert found.within[0] == pytest.approx(15.3, abs=0.05)
-    assert found.detectable[0] == pytest.approx(1.96 * np.sqrt(2) * found.within[0])
-    assert found.within[0] ** 2 == pytest.approx(np.var(FLOW, axis=1, ddof=1).mean(), rel=1e-12)
-    low, high = found.within_limits[:, 0]
-    squares = 17 * found.within[0] ** 2
+    assert found["sd_within"][0] == pytest.approx(15.3, abs=0.05)
+    assert found["detectable_change"][0] == pytest.approx(1.96 * np.sqrt(2) * found["sd_within"][0])
+    assert found["sd_within"][0] ** 2 == pytest.approx(
+        np.var(FLOW, axis=1, ddof=1).mean(), rel=1e-12
+    )
+    low, high = found["sd_within_low"][0], found["sd_within_high"][0]
+    squares = 17 * found["sd_within"][0] ** 2
     assert stats.chi2.cdf(squares / low**2, 17) == pytest.approx(0.975)
     assert stats.chi2.cdf(squares / high**2, 17) == pytest.approx(0.025)
 
@@ -61,12 +63,12 @@ def test_limits_cover_the_true_agreement():
     values = values + np.sqrt(0.05) * random.standard_normal((1, 3, people))
     values = values + np.sqrt(0.35) * random.standard_normal((n, 3, people))
     found = repeatability(values)
-    low, high = found.icc_limits
+    low, high = found["icc_low"], found["icc_high"]
     covered = ((low < 0.6) & (high > 0.6)).mean()
     # Three standard errors of 2,000 studies are .015.
     assert covered == pytest.approx(0.95, abs=0.02)
-    assert np.mean(found.within**2) == pytest.approx(0.4, abs=0.01)
-    assert np.mean(found.between**2) == pytest.approx(0.6, abs=0.02)
+    assert np.mean(found["sd_within"] ** 2) == pytest.approx(0.4, abs=0.01)
+    assert np.mean(found["sd_between"] ** 2) == pytest.approx(0.6, abs=0.02)
 
 
 def test_missing_values_cost_a_participant_at_their_points_only():
@@ -74,16 +76,20 @@ def test_missing_values_cost_a_participant_at_their_points_only():
     values[4, 1, 1] = np.nan
     values[3:, 0, 2] = np.nan
     found = repeatability(values, least=5)
-    assert found.n.tolist() == [17, 16, 3]
+    assert found["n"].tolist() == [17, 16, 3]
     without = repeatability(points([row for i, row in enumerate(FLOW) if i != 4]))
-    assert found.icc[1] == pytest.approx(without.icc[0], rel=1e-12)
-    assert found.within[0] == pytest.approx(repeatability(points(FLOW)).within[0], rel=1e-12)
-    assert np.isnan([found.icc[2], found.within[2], found.p_sessions[2]]).all()
+    assert found["icc"][1] == pytest.approx(without["icc"][0], rel=1e-12)
+    assert found["sd_within"][0] == pytest.approx(
+        repeatability(points(FLOW))["sd_within"][0], rel=1e-12
+    )
+    assert np.isnan([found["icc"][2], found["sd_within"][2], found["p_sessions"][2]]).all()
 
 
 def test_values_that_do_not_vary_have_no_agreement():
     found = repeatability(np.ones((6, 2, 1)))
-    assert np.isnan([found.icc[0], found.within[0], *found.icc_limits[:, 0]]).all()
+    assert np.isnan(
+        [found["icc"][0], found["sd_within"][0], found["icc_low"][0], found["icc_high"][0]]
+    ).all()
 
 
 def cohort(*visits):

@@ -29,7 +29,7 @@ def test_a_wrong_size_is_noticed(monkeypatch):
 
     def half(*args, **options):
         found = real(*args, **options)
-        return replace(found, enrolled=found.enrolled // 2)
+        return found | {"enrolled_per_arm": found["enrolled_per_arm"] // 2}
 
     monkeypatch.setattr(trials, "sample_size", half)
     found = simulate_design(DESIGNS[0], 300)

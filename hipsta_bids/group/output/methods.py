@@ -151,10 +151,11 @@ def _registration(
     standardization = (
         ", each less its mean and over its standard deviation," if rules.standardize else ""
     )
+    differences = {hemi: side.difference for hemi, side in analysis.sides.items()}
     groups = "; ".join(
-        f"{hemi}: {side.difference.largest:.2f} nodes, p = {side.difference.p:.2g}"
-        for hemi, side in analysis.sides.items()
-        if side.difference is not None
+        f"{hemi}: {columns['difference']:.2f} nodes, p = {columns['difference_p']:.2g}"
+        for hemi, columns in differences.items()
+        if columns
     )
     moved = (
         " The largest difference of mean displacement between groups, with its p-value corrected"

@@ -141,10 +141,10 @@ class SideResult:
     registration: alignment.Registration
     registered: arrays.SideMaps
     """Maps of all visits that were chosen."""
-    shifts: Mapping[str, alignment.GroupShift]
-    """Shifts by group; empty without groups."""
-    difference: alignment.ShiftDifference | None
-    """Between the groups, if there are groups."""
+    shifts: Mapping[str, Mapping[str, Any]]
+    """Columns of shifts by group; empty without groups."""
+    difference: Mapping[str, float]
+    """Columns of the largest difference between the groups; empty without groups."""
 
 
 def templates_of(sides: Mapping[str, SideResult]) -> dict[str, Any] | None:

@@ -16,7 +16,6 @@ from hipsta_bids.group.stats.arrays import Float, describe_known, mean_of_known
 from hipsta_bids.group.stats.classify import ClassifierResult
 from hipsta_bids.group.stats.clusters import edges_of
 from hipsta_bids.group.stats.inference import Discoveries, MapKey, control_fdr
-from hipsta_bids.group.stats.registration import ShiftDifference
 from hipsta_bids.types import PARTICIPANT, SESSION
 
 Named = tuple[str, pd.DataFrame]
@@ -228,22 +227,12 @@ def registration_tables(cohort: Cohort, sides: Mapping[str, results.SideResult])
             "explained_after": side.registration.explained_after,
             "iterations": side.registration.iterations,
             "converged": side.registration.converged,
-            **_difference(side.difference),
+            **side.difference,
         }
         for hemi, side in sides.items()
     ]
     yield "registration", pd.DataFrame(rows)
     yield "warps", _stacked(_warps(cohort, sides))
-
-
-def _difference(difference: ShiftDifference | None) -> Columns:
-    if difference is None:
-        return {}
-    return {
-        "difference": difference.largest,
-        "difference_node": difference.node + 1,
-        "difference_p": difference.p,
-    }
 
 
 def _alignment(analysis: results.Analysis) -> pd.DataFrame:
@@ -283,14 +272,7 @@ def _warps(cohort: Cohort, sides: Mapping[str, results.SideResult]) -> Iterator[
 def _shifts(analysis: results.Analysis) -> Iterator[Columns]:
     for hemi, side in analysis.sides.items():
         for group, shift in side.shifts.items():
-            yield {
-                "hemi": hemi,
-                "group": group,
-                "node_x": np.arange(len(shift.mean)) + 1,
-                "n": shift.n,
-                "shift": shift.mean,
-                "shift_se": shift.se,
-            }
+            yield {"hemi": hemi, "group": group, **shift}
 
 
 def _sites(name: str, cohort: Cohort, analysis: results.Analysis) -> Iterator[Named]:

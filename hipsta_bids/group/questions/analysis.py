@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import product
+from typing import Any
 
 import numpy as np
 from scipy import special
@@ -284,8 +285,8 @@ def register_side(
         result = registration.register(profiles, settings.registration)
     else:
         result = registration.register_to(profiles, templates[hemi], settings.registration)
-    shifts: Mapping[str, registration.GroupShift] = {}
-    difference = None
+    shifts: Mapping[str, Mapping[str, Any]] = {}
+    difference: Mapping[str, float] = {}
     if groups is not None:
         names = cohort.table[groups.column].iloc[side.rows]
         has_group = names.notna().to_numpy()

@@ -18,7 +18,7 @@ from hipsta_bids.group.output.results import RetestCohort
 from hipsta_bids.group.stats.arrays import Float, Int, SideMaps, mean_of_known
 from hipsta_bids.group.stats.glm import FittedMaps, PointwiseFit, RowModel, fit_maps, most_frequent
 from hipsta_bids.group.stats.mixed import longitudinal_model
-from hipsta_bids.group.stats.trials import Reference, repeatability, retest_columns
+from hipsta_bids.group.stats.trials import Reference, repeatability
 from hipsta_bids.types import PARTICIPANT, SESSION
 
 #: Months per unit of columns of time with these names.
@@ -108,16 +108,18 @@ class Retested:
             least=self._settings.min_participants,
         )
         # Of one visit, the variance between and within; of several, that within.
-        freedom = agreed.n * (len(self.retest.sessions) - 1) if self._has_visits else agreed.n - 1
+        n = agreed["n"]
+        freedom = n * (len(self.retest.sessions) - 1) if self._has_visits else n - 1
+        between = 0.0 if self._has_visits else agreed["sd_between"] ** 2
         reference = Reference(
-            n=agreed.n,
-            mean=agreed.mean,
-            variance=agreed.within**2 + (0.0 if self._has_visits else agreed.between**2),
+            n=n,
+            mean=agreed["mean"],
+            variance=agreed["sd_within"] ** 2 + between,
             freedom=np.maximum(freedom, 1.0),
         )
         return Described(
             layer=layer,
-            tables={"retest": retest_columns(agreed)},
+            tables={"retest": agreed},
             reference=reference,
             data=data,
             points=points_of(layer.source) if isinstance(layer.source, SideMaps) else None,

@@ -137,8 +137,7 @@ def _sample_sizes(
             return {}
         moments = replace(moments, mean=np.full_like(moments.mean, np.nan))
     alpha = settings.power.alpha if single else trials.point_level(settings)
-    size = trials.sample_size(effect, moments, settings, alpha=alpha, limits=single)
-    return {"power": trials.power_columns(effect, size, moments)}
+    return {"power": trials.sample_size(effect, moments, settings, alpha=alpha, limits=single)}
 
 
 def _notes(

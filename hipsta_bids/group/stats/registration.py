@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -231,17 +232,6 @@ def _explained(profiles: Float) -> float:
     return 1 - float(np.mean(profiles.var(axis=0))) / max(float(profiles.var()), 1e-300)
 
 
-@dataclass(frozen=True)
-class GroupShift:
-    """By how much a group was displaced."""
-
-    mean: Float
-    """(nodes,) registered minus original position, in grid nodes; positive is lateral."""
-    se: Float
-    """(nodes,)"""
-    n: int
-
-
 def mean_profiles(maps: Float, settings: RegistrationSettings) -> Float:
     """Profiles of curvature along x: means over y, with gaps filled linearly."""
     counts, profiles = np.empty(maps.shape[:2], dtype=np.int64), np.empty(maps.shape[:2])
@@ -264,18 +254,6 @@ def mean_profiles(maps: Float, settings: RegistrationSettings) -> Float:
     return profiles
 
 
-@dataclass(frozen=True)
-class ShiftDifference:
-    """Whether groups are displaced by different amounts."""
-
-    largest: float
-    """Largest difference between the mean displacements of two groups, grid nodes."""
-    node: int
-    """Where along x, from 0."""
-    p: float
-    """That the largest F over the nodes is by chance; NaN if a group has fewer than two members."""
-
-
 def shift_difference(
     registration: Registration,
     groups: Sequence[str] | NDArray[np.str_],
@@ -283,7 +261,7 @@ def shift_difference(
     *,
     permutations: int,
     seed: int,
-) -> ShiftDifference:
+) -> dict[str, float | int]:
     """Compare displacements between groups, at all nodes along x at once.
 
     Warps of one person are averaged first. F of a one-way analysis of variance at each node; the
@@ -324,17 +302,23 @@ def shift_difference(
         )
         (test,) = permute([part], contrast, settings=rules)
         p = float(np.nanmin(test.p_max))
-    return ShiftDifference(float(spread[node]), node, p)
+    largest = float(spread[node])
+    return {"difference": largest, "difference_node": node + 1, "difference_p": p}
 
 
 def shift_by_group(
     registration: Registration, groups: Sequence[str] | NDArray[np.str_]
-) -> Mapping[str, GroupShift]:
-    """Mean displacement of each group along x (figure A5 of the paper)."""
+) -> Mapping[str, Mapping[str, Any]]:
+    """Return the columns of the table of shifts of each group (figure A5 of the paper)."""
     names, shifts = np.asarray(groups), registration.shifts
     result = {}
     for name in np.unique(names):
         part = shifts[names == name]
         spread = part.std(axis=0, ddof=1) if len(part) > 1 else np.full(part.shape[1], np.nan)
-        result[str(name)] = GroupShift(part.mean(axis=0), spread / np.sqrt(len(part)), len(part))
+        result[str(name)] = {
+            "node_x": np.arange(part.shape[1]) + 1,
+            "n": len(part),
+            "shift": part.mean(axis=0),
+            "shift_se": spread / np.sqrt(len(part)),
+        }
     return result

@@ -1,7 +1,7 @@
 """Sample size: how many participants a trial needs for an effect on a measure or at a point."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,7 +9,7 @@ from scipy import special, stats
 
 from hipsta_bids.errors import ModelError, UsageError
 from hipsta_bids.group.design.settings import GroupSettings, MultiplicitySettings
-from hipsta_bids.group.stats.arrays import Bool, Float, Int
+from hipsta_bids.group.stats.arrays import Bool, Float
 
 #: More participants per arm are not looked for.
 MOST_PARTICIPANTS = 10_000
@@ -70,31 +70,6 @@ class TrialEffect:
         return float(np.var(self.visits) * len(self.visits)) if self.visits else 0.0
 
 
-@dataclass(frozen=True, kw_only=True)
-class SampleSize:
-    """Participants per arm of a trial, at each point."""
-
-    difference: Float
-    """Between the arms: of means, or with several visits of changes per month."""
-    sd: Float
-    """Of a participant's value, or of a participant's estimated change per month."""
-    alpha: float
-    """Two-sided level of the test at one point."""
-    per_arm: Float
-    """Who complete the trial; NaN beyond ``MOST_PARTICIPANTS``."""
-    power: Float
-    """With that many."""
-    enrolled: Float
-    """Per arm, so that those who drop out leave as much information."""
-    limits: Float | None = None
-    """(2, points) participants per arm at the confidence limits of the reference."""
-
-    @property
-    def cohen_d(self) -> Float:
-        """Difference over SD."""
-        return self.difference / self.sd
-
-
 def sample_size(
     effect: TrialEffect,
     reference: Reference,
@@ -102,8 +77,8 @@ def sample_size(
     *,
     alpha: float,
     limits: bool = False,
-) -> SampleSize:
-    """Find the participants per arm that give the power which the settings ask for.
+) -> dict[str, Any]:
+    """Return the columns of the table of sample sizes: participants per arm for the power asked.
 
     With one visit the end point is a participant's value. With several it is the slope by least
     squares over the visits, as in a mixed model with random slopes and complete data: its variance
@@ -114,7 +89,7 @@ def sample_size(
     sd = endpoint_sd(effect, reference)
     difference = _difference(effect, reference.mean, reference.slope)
     per_arm = participants_needed(difference / sd, alpha, target_power, MOST_PARTICIPANTS)
-    ends = None
+    ends = {}
     if limits:
         if effect.kind == SLOWING and reference.slope_limits is not None:
             low, high = reference.slope_limits
@@ -126,18 +101,23 @@ def sample_size(
             tail = (1 - settings.glm.confidence) / 2
             chi = stats.chi2.ppf(np.array([[1 - tail], [tail]]), reference.freedom)
             d = difference / sd * np.sqrt(chi / reference.freedom)
-        ends = participants_needed(d, alpha, target_power, MOST_PARTICIPANTS)
-    return SampleSize(
-        difference=difference,
-        sd=sd,
-        alpha=alpha,
-        per_arm=per_arm,
-        power=power_of(difference / sd, per_arm, alpha),
-        enrolled=np.ceil(
-            np.round(per_arm / information_left(effect, reference, settings.power.dropout), 9)
-        ),
-        limits=ends,
-    )
+        low, high = participants_needed(d, alpha, target_power, MOST_PARTICIPANTS)
+        ends = {"per_arm_low": low, "per_arm_high": high}
+    per_year = _YEAR if effect.visits else 1.0
+    left = information_left(effect, reference, settings.power.dropout)
+    return {
+        "n": reference.n,
+        "mean": reference.mean,
+        "change_per_year": np.nan if reference.slope is None else reference.slope * _YEAR,
+        "arm_difference": difference * per_year,
+        "sd_endpoint": sd * per_year,
+        "cohen_d": difference / sd,
+        "alpha": alpha,
+        "per_arm": per_arm,
+        **ends,
+        "enrolled_per_arm": np.ceil(np.round(per_arm / left, 9)),
+        "power": power_of(difference / sd, per_arm, alpha),
+    }
 
 
 def endpoint_sd(effect: TrialEffect, reference: Reference) -> Float:
@@ -233,62 +213,16 @@ def _two_stage_level(rules: MultiplicitySettings, power: float, affected: float)
     return float(second)
 
 
-def power_columns(
-    effect: TrialEffect, found: SampleSize, reference: Reference
-) -> Mapping[str, object]:
-    """Columns of the tables of sample sizes; changes are per year."""
-    per_year = _YEAR if effect.visits else 1.0
-    limits = {}
-    if found.limits is not None:
-        limits = {"per_arm_low": found.limits[0], "per_arm_high": found.limits[1]}
-    return {
-        "n": reference.n,
-        "mean": reference.mean,
-        "change_per_year": np.nan if reference.slope is None else reference.slope * _YEAR,
-        "arm_difference": found.difference * per_year,
-        "sd_endpoint": found.sd * per_year,
-        "cohen_d": found.cohen_d,
-        "alpha": found.alpha,
-        "per_arm": found.per_arm,
-        **limits,
-        "enrolled_per_arm": found.enrolled,
-        "power": found.power,
-    }
-
-
 #: Smallest detectable change over the within-subject SD, for 95 % of changes by chance.
 DETECTABLE = 1.96 * np.sqrt(2)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Repeatability:
-    """How well values of the same participants agree; NaN where it cannot be told."""
+def repeatability(
+    values: Float, *, confidence: float = 0.95, least: int = 3
+) -> dict[str, NDArray[Any]]:
+    """Return the columns of test-retest tables for values (participants, sessions, points).
 
-    n: Int
-    """(points,) participants with a value in all sessions."""
-    mean: Float
-    """(points,) in units of the map."""
-    between: Float
-    """(points,) SD between participants, of their true values."""
-    within: Float
-    """(points,) SD within participants, differences between sessions included."""
-    within_limits: Float
-    """(2, points)"""
-    icc: Float
-    """(points,) ICC(2,1): two-way random effects, absolute agreement, single measurement."""
-    icc_limits: Float
-    """(2, points)"""
-    p_sessions: Float
-    """(points,) of the F test that sessions have the same mean."""
-
-    @property
-    def detectable(self) -> Float:
-        """(points,) smallest change in one participant that measurement hardly explains."""
-        return np.asarray(DETECTABLE * self.within)
-
-
-def repeatability(values: Float, *, confidence: float = 0.95, least: int = 3) -> Repeatability:
-    """Split the variance of values (participants, sessions, points) between and within people.
+    The variance is split between and within participants; NaN where it cannot be.
 
     Where one session is missing, the participant is left out at that point; points with fewer
     complete participants than ``least`` are NaN. The within-subject SD is the root of the mean
@@ -315,16 +249,21 @@ def repeatability(values: Float, *, confidence: float = 0.95, least: int = 3) ->
     within = np.sqrt(((k - 1) * columns + (size - 1) * (k - 1) * error) / freedom)
     tails = np.array([[(1 + confidence) / 2], [(1 - confidence) / 2]])
     icc = (rows - error) / (rows + (k - 1) * error + k * (columns - error) / size)
-    return Repeatability(
-        n=n,
-        mean=np.where(usable, grand, np.nan),
-        between=np.sqrt(np.maximum((rows - error) / k, 0.0)),
-        within=within,
-        within_limits=within * np.sqrt(freedom / stats.chi2.ppf(tails, freedom)),
-        icc=icc,
-        icc_limits=_icc_limits(icc, rows, columns, error, n=size, k=k, tails=tails),
-        p_sessions=stats.f.sf(columns / error, k - 1, (size - 1) * (k - 1)),
-    )
+    low, high = within * np.sqrt(freedom / stats.chi2.ppf(tails, freedom))
+    icc_low, icc_high = _icc_limits(icc, rows, columns, error, n=size, k=k, tails=tails)
+    return {
+        "n": n,
+        "mean": np.where(usable, grand, np.nan),
+        "sd_between": np.sqrt(np.maximum((rows - error) / k, 0.0)),
+        "sd_within": within,
+        "sd_within_low": low,
+        "sd_within_high": high,
+        "icc": icc,
+        "icc_low": icc_low,
+        "icc_high": icc_high,
+        "detectable_change": DETECTABLE * within,
+        "p_sessions": stats.f.sf(columns / error, k - 1, (size - 1) * (k - 1)),
+    }
 
 
 def _icc_limits(
@@ -341,20 +280,3 @@ def _icc_limits(
     low = n * (rows - down * error) / (down * denominator + n * rows)
     high = n * (up * rows - error) / (denominator + n * up * rows)
     return np.stack([low, high])
-
-
-def retest_columns(found: Repeatability) -> Mapping[str, Float | Int]:
-    """Columns of the tables of test-retest."""
-    return {
-        "n": found.n,
-        "mean": found.mean,
-        "sd_between": found.between,
-        "sd_within": found.within,
-        "sd_within_low": found.within_limits[0],
-        "sd_within_high": found.within_limits[1],
-        "icc": found.icc,
-        "icc_low": found.icc_limits[0],
-        "icc_high": found.icc_limits[1],
-        "detectable_change": found.detectable,
-        "p_sessions": found.p_sessions,
-    }
