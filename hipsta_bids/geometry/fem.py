@@ -50,11 +50,9 @@ class Laplace:
         self._mesh, self._solver = mesh, solver
         if diffusion is None:
             self._fem = Solver(mesh, lump=True)
-        else:  # LaPy's constructor knows no other speeds than exponentials of curvature
-            self._fem = Solver.__new__(Solver)
-            self._fem.use_cholmod = False
-            matrices = Solver._fem_tria_aniso(mesh, *diffusion, lump=True)  # noqa: SLF001
-            self._fem.stiffness, self._fem.mass = matrices
+        else:
+            self._fem = Solver(bare_mesh(TriaMesh, mesh.v, mesh.t), lump=True)
+            self._fem.stiffness = _directed_stiffness(mesh, *diffusion)
         symmetric = self._fem.stiffness
         if symmetric.shape[0] != len(self.points):
             raise _unsolvable()  # the last vertex belongs to no cell
@@ -155,6 +153,26 @@ def bare_mesh(kind: type[Any], points: Float, cells: Int) -> Any:  # noqa: ANN40
     mesh = object.__new__(kind)
     mesh.v, mesh.t = points, cells
     return mesh
+
+
+def _directed_stiffness(
+    mesh: TriaMesh, first: Float, second: Float, speeds: Float
+) -> sparse.csc_matrix:
+    """Compute the stiffness (V, V) of a diffusion that has two speeds in each triangle.
+
+    LaPy's constructor knows no other speeds than exponentials of curvature.
+    """
+    corners = mesh.v[mesh.t]
+    edges = np.roll(corners, -1, axis=1) - corners
+    along = (edges[:, :, None] * np.stack([first, second], axis=1)[:, None]).sum(axis=-1)
+    areas = 2 * np.linalg.norm(np.cross(edges[:, 1], edges[:, 2]), axis=1)  # four times the area
+    least = np.finfo(float).eps
+    areas[areas < least] = max(1e-4 * areas.mean(), least)
+    pairs = np.roll(along, -1, axis=1) * speeds[:, None] * np.roll(along, 1, axis=1)
+    sides = pairs.sum(axis=-1) / areas[:, None]
+    entries = np.column_stack([sides.repeat(2, axis=1), -sides - np.roll(sides, 1, axis=1)])
+    rows, columns = mesh.t[:, [0, 1, 1, 2, 2, 0, 0, 1, 2]], mesh.t[:, [1, 0, 2, 1, 0, 2, 0, 1, 2]]
+    return sparse.csc_matrix((entries.ravel(), (rows.ravel(), columns.ravel())))
 
 
 def _factor(matrix: sparse.csc_array) -> linalg.SuperLU:

@@ -8,6 +8,7 @@ import pytest
 from geometry_cases import box_mesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from skimage.measure import marching_cubes
 
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry import fem
@@ -80,6 +81,20 @@ def test_diffusion_is_slowed_along_the_direction_only(angle):
     wanted = (slope @ slope - along**2 + share * along**2) * 12  # area of 4 x 3
     values = vertices @ slope
     assert values @ (laplace.stiffness @ values) == pytest.approx(wanted, rel=EXACT)
+
+
+@pytest.mark.parametrize("strength", [0.0, 5.0])
+def test_directed_diffusion_is_that_of_lapy(strength):
+    x, y, z = np.mgrid[-8:9, -10:11, -12:13]
+    vertices, triangles, *_ = marching_cubes((x / 5) ** 2 + (y / 7) ** 2 + (z / 9) ** 2, 1.03)
+    egg = lapy.TriaMesh(vertices.astype(float), triangles)
+    egg.orient_()
+    theirs = lapy.Solver(egg, lump=True, aniso=strength, aniso_smooth=2)
+    across, along, least, most = egg.curvature_tria(2)
+    speeds = np.exp(-strength * np.abs(np.column_stack([most, least])))
+    ours = Laplace(egg, diffusion=(across, along, speeds))
+    scale = abs(theirs.stiffness).max()
+    assert abs(ours.stiffness - theirs.stiffness).max() <= 1e-12 * scale  # rounding
 
 
 @given(st.integers(0, 1000))
