@@ -15,7 +15,7 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from hipsta_bids.errors import SettingsError
-from hipsta_bids.geometry.digital import ALL, to_ras
+from hipsta_bids.geometry.digital import CUBE, to_ras
 from hipsta_bids.protocols.protocol import Part, Tissue
 from hipsta_bids.types import Bool, Float, LabelVolume, Sheet
 
@@ -302,7 +302,7 @@ def _pits(site: Site, size: float, position: Position) -> Defect:
     chosen = inner[generator.choice(len(inner), min(round(size), len(inner)), replace=False)]
     spots = np.zeros(site.wall.shape, dtype=bool)
     spots[tuple(chosen.T)] = True
-    return site.erased(site.wall & ndimage.binary_dilation(spots, structure=ALL))
+    return site.erased(site.wall & ndimage.binary_dilation(spots, structure=CUBE))
 
 
 def _rim_notch(site: Site, size: float, position: Position) -> Defect:

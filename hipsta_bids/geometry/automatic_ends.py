@@ -26,13 +26,14 @@ END_USUAL = 0.3
 END_WEIGHT = 3.0
 #: Even odds of an end: the sheet, CA1, or CA2 and CA3 have this share of their usual area.
 LOST_SHARE = 0.5
-#: The same of dentate gyrus and CA4, since the sheet closes over them in the tail.
+#: Even odds of an end: dentate gyrus and CA4 have this share of their usual area. In the tail the
+#: sheet closes over them.
 CORE_SHARE = 0.5
-#: The evidence rises from none to certain over this range of such shares.
+#: The evidence rises from none to certain over this range of the shares of usual areas.
 LOST_WIDTH = 0.5
 #: Even odds: CA2 and CA3 spread this many times as far as usual, since the uncus has some.
 UNCUS_SPREAD = 2.5
-#: The same of dentate gyrus and CA4; and even odds at this multiple of their usual area.
+#: Even odds: dentate gyrus and CA4 have this multiple of their usual spread, or of their area.
 CORE_GROWTH = 1.6
 #: Even odds: the sheet has this multiple of its usual area.
 HEAD_GROWTH = 1.5
@@ -71,7 +72,7 @@ def find_ends(
     volume: LabelVolume,
     sheet: NDArray[np.uint8],
     axis: Float,
-    known: dict[End, float],
+    known_levels: dict[End, float],
     settings: BodySettings,
 ) -> dict[End, FoundEnd]:
     """Find where each end lies along the axis, between the levels of ends that are known, mm.
@@ -82,7 +83,7 @@ def find_ends(
     """
     profile = _profile(volume, sheet, axis)
     levels = profile.levels
-    low, high = known.get("posterior", -np.inf), known.get("anterior", np.inf)
+    low, high = known_levels.get("posterior", -np.inf), known_levels.get("anterior", np.inf)
     typical = _has_subfields(profile) & (levels > low) & (levels < high)
     if not typical.any():
         raise GeometryError(
@@ -90,28 +91,32 @@ def find_ends(
             "tail labels: label the head and the tail, or check that the protocol fits the labels",
             reason="no-body",
         )
-    lost, odd = _evidence(profile, typical)
-    ends = _mean_ends(levels, _doubt(lost, odd), known, settings)
+    absence, odd = _evidence(profile, typical)
+    ends = _mean_ends(levels, _doubt(absence, odd), known_levels, settings)
     # The standard error over the cues, by leaving each out once (jackknife).
-    less = [
-        _mean_ends(levels, _doubt(lost, {k: odd[k] for k in odd if k != left}), known, settings)
+    jackknife = [
+        _mean_ends(
+            levels, _doubt(absence, {k: odd[k] for k in odd if k != left}), known_levels, settings
+        )
         for left in odd
     ]
-    found: dict[End, FoundEnd] = {}
+    results: dict[End, FoundEnd] = {}
     sides: tuple[tuple[End, float], ...] = (("posterior", 1.0), ("anterior", -1.0))
     for n, (end, sign) in enumerate(sides):
-        others = np.array([pair[n] for pair in less])
-        error = float(np.sqrt((len(others) - 1) * others.var())) if len(others) > 1 else 0.0
+        estimates = np.array([pair[n] for pair in jackknife])
+        error = (
+            float(np.sqrt((len(estimates) - 1) * estimates.var())) if len(estimates) > 1 else 0.0
+        )
         order = np.argsort(sign * levels)
         depth = sign * (levels[order] - ends[n])
         trim = max(
-            _grazed(depth, profile.area[name][order], lost[name][order], settings)
+            _grazed(depth, profile.area[name][order], absence[name][order], settings)
             for name in _NEEDED
         )
         trim += settings.end_margin
-        rule = _main_evidence(levels, ends[n], sign, lost, odd)
-        found[end] = FoundEnd(ends[n] + sign * trim, rule, error)
-    return found
+        rule = _main_evidence(levels, ends[n], sign, absence, odd)
+        results[end] = FoundEnd(ends[n] + sign * trim, rule, error)
+    return results
 
 
 def _profile(volume: LabelVolume, sheet: NDArray[np.uint8], axis: Float) -> _Profile:
@@ -156,10 +161,10 @@ def _binned(at: Float, values: Float, count: int) -> Float:
     So nothing jumps as voxels move.
     """
     low = np.floor(at).astype(int)
-    kept = (low >= 0) & (low < count - 1)
-    upper = np.where(kept, at - low, 0.0)
-    lower = np.where(kept, 1.0 - upper, 0.0)
-    low = np.where(kept, low, 0)
+    in_range = (low >= 0) & (low < count - 1)
+    upper = np.where(in_range, at - low, 0.0)
+    lower = np.where(in_range, 1.0 - upper, 0.0)
+    low = np.where(in_range, low, 0)
     sums = [
         np.bincount(low.ravel(), (lower * column[:, None]).ravel(), count)
         + np.bincount(low.ravel() + 1, (upper * column[:, None]).ravel(), count)
@@ -170,18 +175,18 @@ def _binned(at: Float, values: Float, count: int) -> Float:
 
 def _has_subfields(profile: _Profile) -> Bool:
     """Say which levels have CA1 and CA2 or CA3."""
-    both = np.ones(len(profile.levels), dtype=bool)
+    has_both = np.ones(len(profile.levels), dtype=bool)
     for name in ("CA1", "CA2-3"):
         area = profile.area[name]
         present = area > 0.01 * area.max(initial=0)  # without tails of the Gaussian
-        both &= area > 0.2 * np.median(area[present]) if present.any() else False
-    return both
+        has_both &= area > 0.2 * np.median(area[present]) if present.any() else False
+    return has_both
 
 
 def _evidence(profile: _Profile, typical: Bool) -> tuple[Cues, Cues]:
     """Weigh what speaks against each level: tissues that are lost, and shapes unlike the body's.
 
-    Either is 0.5 at the share, or ratio, that the settings name. Usual is a low quantile over the
+    Either is 0.5 at the share, or ratio, that the constants name. Usual is a low quantile over the
     levels with CA1 and CA2 or CA3, since part of these may belong to the head or the tail.
     """
 
@@ -193,7 +198,7 @@ def _evidence(profile: _Profile, typical: Bool) -> tuple[Cues, Cues]:
     has_core = usual(area["core"]) > 0.02 * usual(area["sheet"])  # is it labeled
     if has_core:
         shares["core"] = CORE_SHARE
-    lost = {
+    absence = {
         name: np.clip(0.5 + (share - area[name] / usual(area[name])) / LOST_WIDTH, 0, 1)
         for name, share in shares.items()
     }
@@ -208,19 +213,19 @@ def _evidence(profile: _Profile, typical: Bool) -> tuple[Cues, Cues]:
         name: np.clip(0.5 * np.log(np.maximum(x / usual(x), 1.0)) / np.log(ratio), 0, 1)
         for name, (x, ratio) in ratios.items()
     }
-    return lost, odd
+    return absence, odd
 
 
-def _doubt(lost: Cues, odd: Cues) -> Float:
+def _doubt(absence: Cues, odd: Cues) -> Float:
     """Combine evidence (T,): any lost tissue is enough, cues of the shape are averaged."""
     inside = 1.0 - np.mean(list(odd.values()), axis=0)
-    for share in lost.values():
+    for share in absence.values():
         inside = inside * (1.0 - share)
     return np.asarray(1.0 - inside)
 
 
 def _mean_ends(
-    levels: Float, doubt: Float, known: dict[End, float], settings: BodySettings
+    levels: Float, doubt: Float, known_levels: dict[End, float], settings: BodySettings
 ) -> tuple[float, float]:
     """Mean level of both ends, weighted by the evidence for a body between each two levels.
 
@@ -230,7 +235,7 @@ def _mean_ends(
     gain = END_WEIGHT * np.cumsum(0.5 - doubt) * _STEP
     weight = gain - gain[:, None]
     allowed = levels - levels[:, None] >= settings.min_length
-    low, high = known.get("posterior"), known.get("anterior")
+    low, high = known_levels.get("posterior"), known_levels.get("anterior")
     if low is not None:
         allowed &= (levels == levels[np.abs(levels - low).argmin()])[:, None]
     if high is not None:
@@ -248,7 +253,7 @@ def _mean_ends(
     return float(weight.sum(axis=1) @ edges), float(weight.sum(axis=0) @ edges)
 
 
-def _grazed(depth: Float, area: Float, lost: Float, settings: BodySettings) -> float:
+def _grazed(depth: Float, area: Float, absence: Float, settings: BodySettings) -> float:
     """Length behind an end, mm, at which a tissue's areas are smaller than behind it.
 
     Labels that end obliquely fill a part of these cross-sections only. Smoothing alone takes as
@@ -261,7 +266,7 @@ def _grazed(depth: Float, area: Float, lost: Float, settings: BodySettings) -> f
     share = np.interp(fine, depth, area) / max(float(area[inner].mean()), 1e-6)
     length = _below(share, settings.end_fullness)
     blurred = _below(ndtr(fine / END_SMOOTHING), settings.end_fullness)
-    labels_end = np.interp(-_BESIDE, depth, lost)
+    labels_end = np.interp(-_BESIDE, depth, absence)
     return float(labels_end * max(length - blurred, 0.0))
 
 
@@ -270,11 +275,11 @@ def _below(share: Float, fullness: float) -> float:
     return float(np.clip((fullness - share) / (1 - fullness), 0, 1).sum() * _STEP)
 
 
-def _main_evidence(levels: Float, end: float, sign: float, lost: Cues, odd: Cues) -> str:
+def _main_evidence(levels: Float, end: float, sign: float, absence: Cues, odd: Cues) -> str:
     """Name the strongest evidence just beyond an end."""
     depth = sign * (levels - end)
     beyond = (depth < 0) & (depth > -_BESIDE)
-    strength = {name: float(share[beyond].mean()) for name, share in lost.items()}
+    strength = {name: float(share[beyond].mean()) for name, share in absence.items()}
     fields = max(strength[name] for name in _NEEDED)
     shape = float(np.mean([share[beyond].mean() for share in odd.values()]))
     names = {"subfields": fields, "core": strength.get("core", 0.0), "cross-section": shape}

@@ -13,28 +13,7 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from hipsta_bids.errors import GeometryError
-from hipsta_bids.geometry.completion import (
-    Cavities,
-    Index,
-    Tissues,
-    between,
-    fill_cavities,
-    fill_pits,
-    fill_slits,
-    find_cavities,
-    find_uncus,
-    hand_over,
-    value_of_nearest,
-)
-from hipsta_bids.geometry.digital import (
-    ALL,
-    FACES,
-    box_around,
-    low_corner,
-    positions,
-    to_ras,
-    voxel_points,
-)
+from hipsta_bids.geometry import completion, digital
 from hipsta_bids.geometry.ends import EndPlanes, find_end_planes
 from hipsta_bids.protocols.load import for_region
 from hipsta_bids.protocols.protocol import MEDIAL_END, Tissue, lateral_rank
@@ -66,9 +45,9 @@ class MaskChange:
 class Body:
     """The merged ribbon, on the grid of the label image."""
 
-    tissue: Tissues
+    tissue: completion.Tissues
     """(I, J, K) tissue of the region's sheet, with the molecular layer; 0 elsewhere."""
-    hippocampal: Tissues
+    hippocampal: completion.Tissues
     """(I, J, K) tissue of the hippocampal sheet, whatever the region; 0 elsewhere."""
     region: str
     """``body``, ``extended`` or ``entorhinal``."""
@@ -82,15 +61,15 @@ class Body:
     """Voxels of the molecular layer that were merged with a subfield of the sheet."""
     inside: Bool
     """(I, J, K) sheet voxels between the end planes."""
-    filled: Index = field(default_factory=lambda: np.zeros((0, 3), np.intp))
+    filled: completion.Index = field(default_factory=lambda: np.zeros((0, 3), np.intp))
     """(N, 3) indices of voxels in slits through the sheet that were filled."""
-    cavities: Cavities = field(default_factory=Cavities)
+    cavities: completion.Cavities = field(default_factory=completion.Cavities)
     """Cavities between the end planes that were filled."""
-    uncus: Index = field(default_factory=lambda: np.zeros((0, 3), np.intp))
+    uncus: completion.Index = field(default_factory=lambda: np.zeros((0, 3), np.intp))
     """(N, 3) indices of voxels of the uncus, which are no part of the sheet."""
     handed_over: int = 0
     """Head or tail voxels between the planes that got the subfield of a neighbor."""
-    gap: Index = field(default_factory=lambda: np.zeros((0, 3), np.intp))
+    gap: completion.Index = field(default_factory=lambda: np.zeros((0, 3), np.intp))
     """(N, 3) indices of the largest thin gap in the labels that was not filled."""
     mask_change: MaskChange | None = None
     """What an edited mask changed; None without a mask."""
@@ -105,7 +84,7 @@ class Body:
         if self.region != "entorhinal":
             return lateral_rank(self.tissue[self.inside]).astype(np.float64)
         medial = np.isin(self.hippocampal, MEDIAL_END)
-        near = cKDTree(voxel_points(medial, self.affine))
+        near = cKDTree(digital.voxel_points(medial, self.affine))
         return np.asarray(-near.query(self.inside_points()[1])[0])
 
     @cached_property
@@ -117,10 +96,10 @@ class Body:
     def outward(self) -> dict[End, Float]:
         """Unit vectors (3,) along which the body leaves its two end planes."""
         index, points = self.inside_points()
-        around = box_around(index)
-        pieces, _ = ndimage.label(self.inside[around], structure=ALL)
-        number = pieces[tuple((index - low_corner(around)).T)]
-        ends, found = self.ends, dict[End, Float]()
+        around = digital.box_around(index)
+        pieces, _ = ndimage.label(self.inside[around], structure=digital.CUBE)
+        number = pieces[tuple((index - digital.low_corner(around)).T)]
+        ends, directions = self.ends, dict[End, Float]()
         signs: tuple[tuple[End, float], ...] = (("posterior", 1.0), ("anterior", -1.0))
         for end, sign in signs:
             depth = sign * ends.height(points, end)
@@ -132,18 +111,18 @@ class Body:
             step /= max(float(np.linalg.norm(step)), 1e-9)
             # Nearly along the plane, or of a single slice, it says nothing.
             along = -sign * (step @ ends[end].normal) > _LEAST_SLOPE
-            found[end] = step if along else -sign * ends.axis
-        return found
+            directions[end] = step if along else -sign * ends.axis
+        return directions
 
     def to_voxels(self, points: Float) -> Float:
         """Voxel indices (..., 3), fractions included, of points (..., 3), RAS mm."""
-        return to_ras(points, np.linalg.inv(self.affine))
+        return digital.to_ras(points, np.linalg.inv(self.affine))
 
-    def inside_points(self) -> tuple[Index, Float]:
+    def inside_points(self) -> tuple[completion.Index, Float]:
         """Voxel indices (N, 3) and RAS mm (N, 3) of the sheet between the end planes."""
         return self._inside_points
 
-    def nearest(self, points: Float, count: int = 1) -> Index:
+    def nearest(self, points: Float, count: int = 1) -> completion.Index:
         """Numbers (M,), or (M, count), of the inside points that are nearest to points (M, 3)."""
         return np.asarray(self._tree.query(points, k=count)[1])
 
@@ -152,10 +131,10 @@ class Body:
         return cKDTree(self.inside_points()[1])
 
     @cached_property
-    def _inside_points(self) -> tuple[Index, Float]:
+    def _inside_points(self) -> tuple[completion.Index, Float]:
         """Cached: a dozen steps ask for it, and the volume is large."""
-        index = positions(self.inside)
-        points = to_ras(index, self.affine)
+        index = digital.positions(self.inside)
+        points = digital.to_ras(index, self.affine)
         index.flags.writeable = False
         points.flags.writeable = False
         return index, points
@@ -174,21 +153,21 @@ def extract_body(volume: LabelVolume, settings: BodySettings) -> Body:
             reason="no-sheet-labels",
         )
     ends = find_end_planes(volume, tissue, settings)
-    volume, tissue, handed_over = hand_over(volume, tissue, ends, settings.plane_reach)
-    cavities = find_cavities(volume, tissue, ends, settings)
-    volume, tissue = fill_cavities(volume, tissue, cavities, settings)
+    volume, tissue, handed_over = completion.hand_over(volume, tissue, ends, settings.plane_reach)
+    cavities = completion.find_cavities(volume, tissue, ends, settings)
+    volume, tissue = completion.fill_cavities(volume, tissue, cavities, settings)
     change = None
     if volume.edited_mask is not None:
         volume, tissue, change = _apply_mask(volume, tissue, volume.edited_mask, ends)
         # What the mask removed may have changed the long axis.
         ends = find_end_planes(volume, tissue, settings)
-    uncus = find_uncus(tissue, volume.affine, ends)
+    uncus = completion.find_uncus(tissue, volume.affine, ends)
     tissue = tissue.copy()
     tissue[tuple(uncus.T)] = 0
     hippocampal, region = tissue, settings.region
     if region != "body":
         tissue = join_cortex(volume, hippocampal, region)
-    inside, points = between(tissue > 0, volume.affine, ends)
+    inside, points = completion.between(tissue > 0, volume.affine, ends)
     length = ends.length(points) if len(points) else 0.0
     if length < settings.min_length:
         raise GeometryError(
@@ -199,12 +178,12 @@ def extract_body(volume: LabelVolume, settings: BodySettings) -> Body:
     if region != "body":
         check_reach(points, tissue[inside], ends, settings)
     empty = volume.tissue == Tissue.BACKGROUND
-    slits = fill_slits(tissue, inside, empty, volume.affine, settings)
+    slits = completion.fill_slits(tissue, inside, empty, volume.affine, settings)
     if volume.edited_mask is not None:  # a person has taken these voxels out
         empty &= volume.edited_mask.inside
-    tissue, pits = fill_pits(slits.tissue, inside, empty, volume.affine, settings)
+    tissue, pits = completion.fill_pits(slits.tissue, inside, empty, volume.affine, settings)
     if len(slits.filled) or len(pits):
-        inside, _ = between(tissue > 0, volume.affine, ends)
+        inside, _ = completion.between(tissue > 0, volume.affine, ends)
     return Body(
         tissue=tissue,
         hippocampal=hippocampal,
@@ -231,7 +210,7 @@ def check_side(body: Body, hemi: str) -> float:
     """
     inside, points = body.inside, body.inside_points()[1]
     if body.region != "body":
-        inside, points = between(body.hippocampal > 0, body.affine, body.ends)
+        inside, points = completion.between(body.hippocampal > 0, body.affine, body.ends)
     values = body.hippocampal[inside]
     medial = np.isin(values, MEDIAL_END)
     lateral = values == Tissue.CA1
@@ -243,10 +222,10 @@ def check_side(body: Body, hemi: str) -> float:
     centers = points[medial].mean(axis=0), points[lateral].mean(axis=0)
     if offset < -1.0 and not _has_handedness(body, *centers, hemi):
         side = {"L": "left", "R": "right"}
-        other = side["R" if hemi == "L" else "L"]
+        opposite = side["R" if hemi == "L" else "L"]
         raise GeometryError(
             f"labeled {side[hemi]}, but the subiculum lies {-offset:.1f} mm lateral of CA1 as in "
-            f"a {other} hemisphere: check the image's affine and which file is which",
+            f"a {opposite} hemisphere: check the image's affine and which file is which",
             reason="left-right-swapped",
         )
     return offset
@@ -258,7 +237,7 @@ def _has_handedness(body: Body, subiculum: Float, ca1: Float, hemi: str) -> bool
     Seen along the long axis, the path from the subiculum over CA1 to the interior labels bends in
     opposite directions on the left and on the right.
     """
-    _, points = between(body.interior & (body.tissue == 0), body.affine, body.ends)
+    _, points = completion.between(body.interior & (body.tissue == 0), body.affine, body.ends)
     if not len(points):
         return False
     first, second = ca1 - subiculum, points.mean(axis=0) - subiculum
@@ -268,7 +247,7 @@ def _has_handedness(body: Body, subiculum: Float, ca1: Float, hemi: str) -> bool
     return (turn if hemi == "L" else -turn) > 0.05  # noqa: PLR2004
 
 
-def _merge_layer(volume: LabelVolume, settings: BodySettings) -> tuple[Tissues, int]:
+def _merge_layer(volume: LabelVolume, settings: BodySettings) -> tuple[completion.Tissues, int]:
     """Assign each molecular-layer voxel to the nearest subfield (distances in mm), and count them.
 
     By the rule ``nearest-label`` voxels nearer to another interior label are left out. A layer that
@@ -285,17 +264,19 @@ def _merge_layer(volume: LabelVolume, settings: BodySettings) -> tuple[Tissues, 
         rivals = [t for t in protocol.interior if t not in kinds]
         candidates[np.isin(volume.tissue, rivals)] = Tissue.OTHER
     # The nearest voxel always has a face neighbor outside.
-    border = (candidates > 0) & ~ndimage.binary_erosion(candidates > 0, structure=FACES)
-    nearest = value_of_nearest(
+    border = (candidates > 0) & ~ndimage.binary_erosion(candidates > 0, structure=digital.FACES)
+    nearest = completion.value_of_nearest(
         candidates[border],
-        voxel_points(border, volume.affine),
-        voxel_points(layer, volume.affine),
+        digital.voxel_points(border, volume.affine),
+        digital.voxel_points(layer, volume.affine),
     )
     tissue[layer] = np.where(nearest == Tissue.OTHER, 0, nearest)
     return tissue, int(np.count_nonzero(tissue[layer]))
 
 
-def join_cortex(volume: LabelVolume, hippocampal: Tissues, region: str) -> Tissues:
+def join_cortex(
+    volume: LabelVolume, hippocampal: completion.Tissues, region: str
+) -> completion.Tissues:
     """Add the neighboring cortex to the hippocampal sheet, or return it alone."""
     kinds = [t for t in for_region(volume.protocol, region).sheet if t in volume.protocol.neighbors]
     cortex = np.isin(volume.tissue, kinds)
@@ -305,11 +286,13 @@ def join_cortex(volume: LabelVolume, hippocampal: Tissues, region: str) -> Tissu
             "measure the body, or label the cortex beside it",
             reason="no-cortex-labels",
         )
-    kept = hippocampal if region == "extended" else np.zeros_like(hippocampal)
-    return np.where(cortex, volume.tissue, kept).astype(np.uint8)
+    base = hippocampal if region == "extended" else np.zeros_like(hippocampal)
+    return np.where(cortex, volume.tissue, base).astype(np.uint8)
 
 
-def check_reach(points: Float, tissue: Tissues, ends: EndPlanes, settings: BodySettings) -> None:
+def check_reach(
+    points: Float, tissue: completion.Tissues, ends: EndPlanes, settings: BodySettings
+) -> None:
     """Refuse cortex, among points (N, 3) of a region, that does not reach from end to end."""
     cortex = tissue > Tissue.HIPPOCAMPUS
     below, above = ends.depths(points[cortex])
@@ -328,27 +311,27 @@ def check_reach(points: Float, tissue: Tissues, ends: EndPlanes, settings: BodyS
 
 
 def _apply_mask(
-    volume: LabelVolume, tissue: Tissues, mask: EditedMask, ends: EndPlanes
-) -> tuple[LabelVolume, Tissues, MaskChange]:
+    volume: LabelVolume, tissue: completion.Tissues, mask: EditedMask, ends: EndPlanes
+) -> tuple[LabelVolume, completion.Tissues, MaskChange]:
     """Replace the body between its end planes by an edited mask.
 
     Voxels outside of the mask lose their label, and voxels of the mask without a sheet label get
     that of the nearest voxel of the mask that has one. Beyond the end planes nothing changes.
     """
-    region, points = between(mask.inside | (tissue > 0), volume.affine, ends)
-    index = positions(region)
+    region, points = completion.between(mask.inside | (tissue > 0), volume.affine, ends)
+    index = digital.positions(region)
     old, inside = tissue[tuple(index.T)], mask.inside[tuple(index.T)]
-    kept = inside & (old > 0)
-    if not kept.any():
+    retained = inside & (old > 0)
+    if not retained.any():
         raise GeometryError(
             "the edited mask and the sheet's labels have no voxel in common between the end "
             "planes: check that the mask is of this hemisphere and in the space of the labels",
             reason="edited-mask-elsewhere",
         )
-    new = np.where(kept, old, np.uint8(0))
+    new = np.where(retained, old, np.uint8(0))
     added = inside & (old == 0)
     if added.any():
-        new[added] = old[kept][cKDTree(points[kept]).query(points[added])[1]]
+        new[added] = old[retained][cKDTree(points[retained]).query(points[added])[1]]
     edited = tissue.copy()
     edited[tuple(index.T)] = new
     labels = np.where(edited == tissue, volume.tissue, edited)

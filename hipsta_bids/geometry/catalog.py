@@ -12,29 +12,15 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from hipsta_bids.geometry import measures
 from hipsta_bids.geometry.body import Body
-from hipsta_bids.geometry.measures import (
-    CrossSections,
-    at_columns,
-    away_from_edges,
-    column_area,
-    cut_sections,
-    extent_x,
-    extent_y,
-    gaussian_curvature,
-    mean_curvature,
-    measure_thickness,
-    subfield_areas,
-    subfield_volumes,
-    wall_area,
-)
 from hipsta_bids.protocols.protocol import Tissue
 from hipsta_bids.settings import Settings
 from hipsta_bids.types import Bool, Float, Sheet, Surface, TetMesh
 
 DIERS = "Diers et al. 2023, NeuroImage 276:120182, section 2.2"
 DO_CARMO = "do Carmo 1976, Differential Geometry of Curves and Surfaces, section 3.3"
-OURS = "this software"
+SOFTWARE = "this software"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -56,12 +42,12 @@ class Measured:
     @cached_property
     def areas(self) -> dict[Tissue, float]:
         """Area of the whole mid-surface in each subfield, mm2."""
-        return subfield_areas(self.whole, self.body)
+        return measures.subfield_areas(self.whole, self.body)
 
     @cached_property
     def volumes(self) -> dict[Tissue, float]:
         """Volume of each subfield between the end planes, mm3."""
-        return subfield_volumes(self.mesh, self.body)
+        return measures.subfield_volumes(self.mesh, self.body)
 
     @cached_property
     def volume(self) -> float:
@@ -71,54 +57,63 @@ class Measured:
     @cached_property
     def thickness(self) -> Float:
         """(Nx, Ny) length of the line from wall to wall, mm."""
-        return measure_thickness(self.sheet)
+        return measures.measure_thickness(self.sheet)
 
     @cached_property
-    def sections(self) -> CrossSections:
+    def sections(self) -> measures.CrossSections:
         """Cross-sections of the whole sheet."""
         means = np.average(self.thickness, axis=0, weights=self.area)
         extent = self.settings.sheet.y_extent
-        thickness = at_columns(means, 1 / extent, self.whole.points.shape[1])
-        return cut_sections(self.whole, thickness)
+        thickness = measures.at_columns(means, 1 / extent, self.whole.points.shape[1])
+        return measures.cut_sections(self.whole, thickness)
 
     @cached_property
     def area(self) -> Float:
         """(Nx, Ny) area of the mid-surface round each node, mm2."""
-        return column_area(self.sheet)
+        return measures.column_area(self.sheet)
 
     @cached_property
     def away(self) -> Bool:
         """(Nx, Ny) nodes so far from the edges that polynomials are fitted on both sides."""
-        return away_from_edges(self.thickness.shape, self.settings.measures)
+        return measures.away_from_edges(self.thickness.shape, self.settings.measures)
 
-    def mean(self, values: Float, where: Bool) -> float:
+    def mean(self, values: Float, mask: Bool) -> float:
         """Mean of a map (Nx, Ny) over columns of a part that were measured directly, or NaN.
 
         Every square millimeter counts the same: where the wall is thin, the lines of the grid lie
         closer together, and a mean over nodes would be biased to the thin parts.
         """
-        here = where & self.sheet.valid
-        return float(np.average(values[here], weights=self.area[here])) if here.any() else np.nan
+        selected = mask & self.sheet.valid
+        return (
+            float(np.average(values[selected], weights=self.area[selected]))
+            if selected.any()
+            else np.nan
+        )
 
     def wall_area(self, level: int) -> float:
         """Area of the interior (0) or exterior (-1) wall, mm2."""
-        return wall_area(self.whole, level)
+        return measures.wall_area(self.whole, level)
 
     def mean_curvature(self, level: int) -> Float:
         """(Nx, Ny) mean curvature of a level of the sheet, 1/mm."""
-        return mean_curvature(self.sheet, level, self.settings.measures)
+        return measures.mean_curvature(self.sheet, level, self.settings.measures)
 
     def gaussian_curvature(self, level: int) -> Float:
         """(Nx, Ny) Gaussian curvature of a level of the sheet, 1/mm2."""
-        return gaussian_curvature(self.sheet, level, self.settings.measures)
+        return measures.gaussian_curvature(self.sheet, level, self.settings.measures)
 
     def lines(self, axis: int) -> Float:
         """(Nx, Ny) length of the whole mid-surface line along an axis through each node, mm."""
         nx, ny = self.thickness.shape
         grid = self.settings.sheet
         if axis:
-            return np.tile(at_columns(extent_y(self.whole), grid.x_extent, nx)[:, None], (1, ny))
-        return np.tile(at_columns(extent_x(self.whole), grid.y_extent, ny), (nx, 1))
+            return np.tile(
+                measures.at_columns(measures.extent_y(self.whole), grid.x_extent, nx)[:, None],
+                (1, ny),
+            )
+        return np.tile(
+            measures.at_columns(measures.extent_x(self.whole), grid.y_extent, ny), (nx, 1)
+        )
 
 
 @dataclass(frozen=True)
@@ -155,7 +150,7 @@ class MapMeasure(Column):
 class SectionMeasure(Column):
     """One number per cross-section."""
 
-    compute: Callable[[CrossSections], Float]
+    compute: Callable[[measures.CrossSections], Float]
     """Function that returns the numbers, (Ny,)."""
 
 
@@ -180,7 +175,7 @@ _SHARPEST = 100.0
 #: Thickness of a sheet, mm, and sizes of subfields, which may be too small to measure.
 _THICKNESS, _OR_NONE = (0.0, 10.0), (-1e-9, np.inf)
 #: Lengths, areas and volumes that no hippocampus reaches, by unit.
-_MOST = {"mm": 1e3, "mm^2": 1e5, "mm^3": 1e6}
+_LARGEST = {"mm": 1e3, "mm^2": 1e5, "mm^3": 1e6}
 
 
 def _curvature(surface: str, ending: str, level: int | None) -> MapMeasure:
@@ -254,7 +249,7 @@ SECTIONS: tuple[SectionMeasure, ...] = (
         "mm",
         "distance from the posterior end plane along the mid-surface, mean over x",
         lambda s: s.position,
-        source=OURS,
+        source=SOFTWARE,
     ),
     SectionMeasure(
         "thickness", "mm", "mean thickness over the columns of the section", lambda s: s.thickness
@@ -294,12 +289,12 @@ SECTIONS: tuple[SectionMeasure, ...] = (
 )
 
 
-def _mean(row: Column, how: str, compute: Callable[[Measured], float]) -> SummaryMeasure:
+def _mean(row: Column, qualifier: str, compute: Callable[[Measured], float]) -> SummaryMeasure:
     """Describe the mean of a map or of a section's measure."""
     return SummaryMeasure(
         f"{row.name}_mean",
         row.unit,
-        f"{row.definition}{how}",
+        f"{row.definition}{qualifier}",
         compute,
         source=row.source,
         digits=row.digits,
@@ -309,16 +304,16 @@ def _mean(row: Column, how: str, compute: Callable[[Measured], float]) -> Summar
 
 def _over_body(row: SectionMeasure) -> SummaryMeasure:
     """Average a section's measure over the body's length."""
-    how = ", mean over the length of the body"
-    return _mean(row, how, lambda m: m.sections.mean(row.compute(m.sections)))
+    qualifier = ", mean over the length of the body"
+    return _mean(row, qualifier, lambda m: m.sections.mean(row.compute(m.sections)))
 
 
 def _over_sheet(row: MapMeasure) -> SummaryMeasure:
     """Average a map over the part of the sheet where it is reliable: away from the edges."""
-    how = (
+    qualifier = (
         "; mean over the mid-surface away from rims and ends, by half of measures.curvature_window"
     )
-    return _mean(row, how, lambda m: m.mean(row.compute(m), m.away))
+    return _mean(row, qualifier, lambda m: m.mean(row.compute(m), m.away))
 
 
 SUMMARY: tuple[SummaryMeasure, ...] = (
@@ -340,13 +335,13 @@ SUMMARY: tuple[SummaryMeasure, ...] = (
         "extent_x",
         "mm",
         "mean length of the mid-surface's lines from medial to lateral rim",
-        lambda m: float(extent_x(m.whole).mean()),
+        lambda m: float(measures.extent_x(m.whole).mean()),
     ),
     SummaryMeasure(
         "extent_y",
         "mm",
         "mean length of the mid-surface's lines from the posterior to the anterior end",
-        lambda m: float(extent_y(m.whole).mean()),
+        lambda m: float(measures.extent_y(m.whole).mean()),
     ),
     SummaryMeasure(
         "extent_z",
@@ -436,13 +431,13 @@ def average_profiles(maps: Mapping[str, Float], sheet: Sheet) -> dict[str, dict[
 
     ``x`` holds values (Nx,) averaged over y, and ``y`` values (Ny,) averaged over x, by name.
     """
-    weights = column_area(sheet) * sheet.valid
+    weights = measures.column_area(sheet) * sheet.valid
     profiles = {}
-    for axis, other in (("x", 1), ("y", 0)):
-        total = weights.sum(axis=other)
+    for axis, summed_axis in (("x", 1), ("y", 0)):
+        total = weights.sum(axis=summed_axis)
         profiles[axis] = {
             name: np.divide(
-                np.where(sheet.valid, values * weights, 0).sum(axis=other),
+                np.where(sheet.valid, values * weights, 0).sum(axis=summed_axis),
                 total,
                 out=np.full(len(total), np.nan),
                 where=total > 0,
@@ -459,14 +454,14 @@ def why_impossible(name: str, values: Float) -> str | None:
     """
     measure = next((row for row in (*MAPS, *SUMMARY) if row.name == name), None)
     measure = measure or next((r for r in PER_SUBFIELD if name.startswith(f"{r.name}_")), None)
-    known = values[~np.isnan(values)]
-    if measure is None or not known.size:
+    finite = values[~np.isnan(values)]
+    if measure is None or not finite.size:
         return None
-    least, most = float(known.min()), float(known.max())
-    limit = min(measure.possible[1], _MOST.get(measure.unit, np.inf))
-    worst = least if least <= measure.possible[0] else most
-    if least <= measure.possible[0] or most >= limit:
+    smallest, largest = float(finite.min()), float(finite.max())
+    limit = min(measure.possible[1], _LARGEST.get(measure.unit, np.inf))
+    worst = smallest if smallest <= measure.possible[0] else largest
+    if smallest <= measure.possible[0] or largest >= limit:
         return f"{name} reaches {worst:.3g} {measure.unit}, which no sheet does"
-    if least == most and known.size > 1:
-        return f"{name} is {least:.3g} {measure.unit} at all points"
+    if smallest == largest and finite.size > 1:
+        return f"{name} is {smallest:.3g} {measure.unit} at all points"
     return None

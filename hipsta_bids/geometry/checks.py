@@ -12,34 +12,16 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
+from hipsta_bids import types
 from hipsta_bids.errors import GeometryError
+from hipsta_bids.geometry import digital
 from hipsta_bids.geometry.body import Body
-from hipsta_bids.geometry.digital import (
-    FACES,
-    box_around,
-    low_corner,
-    piece_sizes,
-    positions,
-    to_ras,
-    voxel_points,
-    widened,
-)
 from hipsta_bids.geometry.grid import Field, continued_nodes, cut_across, in_plane_voxel
 from hipsta_bids.geometry.mesh import mean_wall_thickness
 from hipsta_bids.geometry.slices import points_of_ends
 from hipsta_bids.protocols.protocol import Part, Tissue, lateral_rank
 from hipsta_bids.settings import CheckSettings
-from hipsta_bids.types import (
-    Bool,
-    Coordinates,
-    End,
-    Finding,
-    Float,
-    LabelVolume,
-    Surface,
-    TetMesh,
-    position_text,
-)
+from hipsta_bids.types import Bool, Finding, Float
 
 #: A cut this near, mm, to both the subiculum and CA2 or CA3 severs but turns that touch.
 CONTACT_REACH = 1.2
@@ -53,13 +35,13 @@ BEYOND_REACH = 3.0
 BEYOND_SHARE = 0.7
 #: A cross-section is compared with those at these distances on both sides, mm.
 NOTCH_REACH = (1.0, 2.0, 3.0)
-#: What lies this near to a bridge that was cut is left out of that comparison, grid nodes.
+#: Cross-sections are compared without nodes this near to a bridge that was cut, grid nodes.
 STUB_NODES = 6.0
-#: Share of the area added to the usual before, per mm of distance (interior: in all).
+#: Share of the area by which cross-sections usually differ, per mm (interior: in all).
 SECTION_NOISE = 0.02
 
 
-def check_voxels_across(surface: Surface, body: Body, settings: CheckSettings) -> float:
+def check_voxels_across(surface: types.Surface, body: Body, settings: CheckSettings) -> float:
     """Refuse a sheet that is too thin for its voxels; return its thickness in voxels."""
     thickness, voxel = mean_wall_thickness(surface), _voxel_across(body)
     across = thickness / voxel
@@ -73,7 +55,7 @@ def check_voxels_across(surface: Surface, body: Body, settings: CheckSettings) -
 
 
 def check_label_order(
-    mesh: TetMesh, coordinates: Coordinates, body: Body, settings: CheckSettings
+    mesh: types.TetMesh, coordinates: types.Coordinates, body: Body, settings: CheckSettings
 ) -> float:
     """Refuse coordinates that do not follow the medial-to-lateral order of the subfields.
 
@@ -138,8 +120,8 @@ def name_subfields(body: Body) -> Callable[[Float], str]:
     tissue = body.tissue[body.inside]
 
     def names(at: Float) -> str:
-        found = np.unique(tissue[body.nearest(at)])
-        return ", ".join(Tissue(int(kind)).name for kind in found)
+        kinds = np.unique(tissue[body.nearest(at)])
+        return ", ".join(Tissue(int(kind)).name for kind in kinds)
 
     return names
 
@@ -161,7 +143,7 @@ def find_contacts(body: Body) -> Callable[[Float], bool]:
 
 def name_place(points: Float, body: Body) -> str:
     """Write the middle of (N, 3) points, RAS mm, and the subfields there."""
-    return position_text(points.mean(axis=0), name_subfields(body)(points))
+    return types.position_text(points.mean(axis=0), name_subfields(body)(points))
 
 
 def check_image(body: Body) -> list[Finding]:
@@ -197,10 +179,12 @@ def _voxel_across(body: Body) -> float:
     return in_plane_voxel(body.affine)
 
 
-def check_end_labels(volume: LabelVolume, body: Body, settings: CheckSettings) -> list[Finding]:
+def check_end_labels(
+    volume: types.LabelVolume, body: Body, settings: CheckSettings
+) -> list[Finding]:
     """Flag head or tail labels amid the body, and ends beyond which nothing is labeled."""
     labeled = np.isin(volume.part, (Part.HEAD, Part.TAIL)) & (volume.tissue > 0)
-    points = voxel_points(labeled, volume.affine)
+    points = digital.voxel_points(labeled, volume.affine)
     inside = points[body.ends.depth(points) > END_LABEL_DEPTH]
     amid = Finding(
         reason="end-labels-inside",
@@ -213,19 +197,19 @@ def check_end_labels(volume: LabelVolume, body: Body, settings: CheckSettings) -
     return [amid, *_check_beyond(volume, body)]
 
 
-def _check_beyond(volume: LabelVolume, body: Body) -> list[Finding]:
+def _check_beyond(volume: types.LabelVolume, body: Body) -> list[Finding]:
     """Flag ends without head or tail labels at which all labels end."""
     labeled = (volume.tissue > 0) & (volume.tissue <= Tissue.HIPPOCAMPUS)
-    points = voxel_points(labeled, volume.affine)
-    found = []
+    points = digital.voxel_points(labeled, volume.affine)
+    findings = []
     ends = body.ends
-    sides: tuple[End, ...] = ("posterior", "anterior")
+    sides: tuple[types.End, ...] = ("posterior", "anterior")
     for end, depth in zip(sides, ends.depths(points), strict=True):
         if ends[end].rule in ("labels", "user"):
             continue
         near = points[(depth > 0) & (depth < BEYOND_REACH)]
         beyond = np.count_nonzero((depth < 0) & (depth > -BEYOND_REACH))
-        found.append(
+        findings.append(
             Finding(
                 reason="labels-end",
                 value=1 - float(beyond) / max(len(near), 1),
@@ -235,14 +219,14 @@ def _check_beyond(volume: LabelVolume, body: Body) -> list[Finding]:
                 points=near,
             )
         )
-    return found
+    return findings
 
 
 def describe_uncus(body: Body, settings: CheckSettings) -> list[str]:
     """Say that the uncus was left out of the sheet, and warn if it begins far behind the head."""
     if not len(body.uncus):
         return []
-    points = to_ras(body.uncus, body.affine)
+    points = digital.to_ras(body.uncus, body.affine)
     volume = len(points) * body.voxel_volume
     reach = float(-body.ends.height(points, "anterior").min())
     far = f"; it begins {reach:.1f} mm behind the anterior end: does the head begin there?"
@@ -262,7 +246,7 @@ def check_cavities(body: Body, settings: CheckSettings) -> list[Finding]:
             "divided between the sheet and its interior, mean thickness may be off by "
             f"{len(cavity) / size / 2:.0%}",
             remedy="label what it is",
-            points=to_ras(cavity, body.affine),
+            points=digital.to_ras(cavity, body.affine),
         )
         for cavity in body.cavities.wide
     ]
@@ -270,20 +254,20 @@ def check_cavities(body: Body, settings: CheckSettings) -> list[Finding]:
 
 def check_labels(body: Body, settings: CheckSettings) -> list[Finding]:
     """Flag noise and thin gaps in the labels, which smoothing hides from the later steps."""
-    around = box_around(body.inside_points()[0])
-    low = low_corner(around) - 1
+    around = digital.box_around(body.inside_points()[0])
+    low = digital.low_corner(around) - 1
     sheet = np.pad(body.tissue[around] > 0, 1)
     within = np.pad(body.inside[around], 1)
     # Single voxels with the sheet on five or six of their sides, next to voxels of the body.
     sides = sum(
         np.roll(within, step, axis).astype(np.int8) for axis in range(3) for step in (-1, 1)
     )
-    near = widened(within)
-    pinholes = positions(~sheet & near & (sides >= 5))  # noqa: PLR2004 -- of six faces
+    near = digital.widened(within)
+    pinholes = digital.positions(~sheet & near & (sides >= 5))  # noqa: PLR2004 -- of six faces
     noise = len(pinholes) / int(np.count_nonzero(within))
     # The second piece of voxels that share faces.
-    pieces, _ = ndimage.label(within, structure=FACES)
-    sizes = piece_sizes(pieces)
+    pieces, _ = ndimage.label(within, structure=digital.FACES)
+    sizes = digital.piece_sizes(pieces)
     second = int(np.argsort(sizes)[-2])
     loose = float(sizes[second]) / float(sizes.sum())
     rows = (
@@ -305,7 +289,7 @@ def check_labels(body: Body, settings: CheckSettings) -> list[Finding]:
             "loose-part",
             (loose, settings.flag_loose_part),
             f"{loose:.0%} of the sheet do not touch the rest by any face of a voxel",
-            positions(pieces == second) + low if loose else np.zeros((0, 3)),
+            digital.positions(pieces == second) + low if loose else np.zeros((0, 3)),
             "fill the gap in the labels",
         ),
     )
@@ -316,7 +300,7 @@ def check_labels(body: Body, settings: CheckSettings) -> list[Finding]:
             limit=limit,
             what=what,
             remedy=remedy,
-            points=to_ras(voxels, body.affine),
+            points=digital.to_ras(voxels, body.affine),
         )
         for reason, (value, limit), what, voxels, remedy in rows
     ]
@@ -337,7 +321,7 @@ def check_cross_sections(
     if cuts is not None and cuts.any():
         counted = ndimage.distance_transform_edt(~cuts) > STUB_NODES
     if field.cavities is not None:
-        counted &= ~widened(widened(field.cavities))
+        counted &= ~digital.widened(digital.widened(field.cavities))
     levels = slice(field.beyond, solid.shape[2] - field.beyond)
     solid, interior, counted = (part[:, :, levels] for part in (solid, interior, counted))
     step = field.grid.step
@@ -347,11 +331,11 @@ def check_cross_sections(
         k = max(round(reach / step), 1)
         if 2 * k >= solid.shape[2]:
             continue
-        before, here, after = solid[:, :, : -2 * k], solid[:, :, k:-k], solid[:, :, 2 * k :]
-        missing = before & after & ~here
-        lacking = missing.sum(axis=(0, 1)) / here.sum(axis=(0, 1))
+        before, current, after = solid[:, :, : -2 * k], solid[:, :, k:-k], solid[:, :, 2 * k :]
+        missing = before & after & ~current
+        lacking = missing.sum(axis=(0, 1)) / current.sum(axis=(0, 1))
         notch.update(missing, lacking, limit, k + field.beyond)
-        unexplained = here & counted[:, :, k:-k]
+        unexplained = current & counted[:, :, k:-k]
         enclosed = unexplained & interior[:, :, : -2 * k] & interior[:, :, 2 * k :]
         added = unexplained & ~before & ~after
         noise = SECTION_NOISE
@@ -411,5 +395,5 @@ class _Outlier:
         at = int(share.argmax())
         if share[at] / limit > self.share / self.limit:
             self.share, self.limit = float(share[at]), limit
-            nodes = positions(part[:, :, at]).astype(float)
+            nodes = digital.positions(part[:, :, at]).astype(float)
             self.nodes = np.column_stack([nodes, np.full(len(nodes), at + first)])

@@ -13,18 +13,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from hipsta_bids.geometry.digital import (
-    ALL,
-    FACES,
-    Box,
-    box,
-    box_around,
-    low_corner,
-    piece_sizes,
-    positions,
-    to_ras,
-    widened,
-)
+from hipsta_bids.geometry import digital
 from hipsta_bids.geometry.ends import EndPlanes
 from hipsta_bids.protocols.protocol import LATERAL_END, MEDIAL_END, Tissue
 from hipsta_bids.settings import BodySettings
@@ -67,8 +56,8 @@ _DIRECTIONS = [step for step in product((-1, 0, 1), repeat=3) if step > (0, 0, 0
 
 def between(mask: Bool, affine: Float, ends: EndPlanes) -> tuple[Bool, Float]:
     """Part of a mask between the end planes, (I, J, K), and its voxels in RAS mm, (N, 3)."""
-    index = positions(mask)
-    points = to_ras(index, affine)
+    index = digital.positions(mask)
+    points = digital.to_ras(index, affine)
     between = ends.depth(points) > 0
     inside = np.zeros(mask.shape, dtype=bool)
     inside[tuple(index[between].T)] = True
@@ -80,12 +69,12 @@ def value_of_nearest(values: NDArray[np.integer], points: Float, at: Float) -> I
 
     So the way in which voxels are stored decides nothing.
     """
-    found = cKDTree(points).query(at, k=_TIES)
-    distance, index = (np.asarray(part) for part in found)
+    neighbors = cKDTree(points).query(at, k=_TIES)
+    distance, index = (np.asarray(part) for part in neighbors)
     tied = distance < distance[:, :1] + 1e-6
-    most = np.iinfo(np.intp).max  # also for fewer points than asked
-    ranked = np.append(values.astype(np.intp), most)[index]
-    return np.asarray(np.where(tied, ranked, most).min(axis=1))
+    padding = np.iinfo(np.intp).max  # also for fewer points than asked
+    ranked = np.append(values.astype(np.intp), padding)[index]
+    return np.asarray(np.where(tied, ranked, padding).min(axis=1))
 
 
 class Cavities(NamedTuple):
@@ -109,8 +98,8 @@ def find_uncus(tissue: Tissues, affine: Float, ends: EndPlanes) -> Index:
     first. The part of CA1 that is nearer to it than to the rest, on the way through the sheet, goes
     with it.
     """
-    index = positions(tissue > 0)
-    points = to_ras(index, affine)
+    index = digital.positions(tissue > 0)
+    points = digital.to_ras(index, affine)
     near = ends.beyond(1.0).depth(points) > 0
     index, points = index[near], points[near]
     low = index.min(axis=0) if len(index) else np.zeros(3, np.intp)
@@ -119,7 +108,7 @@ def find_uncus(tissue: Tissues, affine: Float, ends: EndPlanes) -> Index:
     medial = np.isin(kinds, MEDIAL_END)
     grid = np.zeros(index.max(axis=0, initial=-1) - low + 1, dtype=np.int32)
     grid[at] = lateral & (ends.depth(points) > 0)
-    pieces = ndimage.label(grid, structure=ALL)[0][at]
+    pieces = ndimage.label(grid, structure=digital.CUBE)[0][at]
     sizes = np.bincount(pieces)[1:] * abs(np.linalg.det(affine[:3, :3]))
     if len(sizes) < 2 or not medial.any():  # noqa: PLR2004 -- the body's own is the first
         return np.zeros((0, 3), np.intp)
@@ -128,48 +117,50 @@ def find_uncus(tissue: Tissues, affine: Float, ends: EndPlanes) -> Index:
     towards /= np.linalg.norm(towards)
     depth = -ends.height(points, "anterior")
     main = pieces == sizes.argmax() + 1
-    found = np.zeros(len(points), dtype=bool)
+    uncus = np.zeros(len(points), dtype=bool)
     for number in np.flatnonzero(sizes > UNCUS_SIZE) + 1:
         piece = pieces == number
         beside = main & (depth < depth[piece].max() + ends.half_slice)
         body = points[beside if beside.any() else main]
-        aside = (points[piece].mean(axis=0) - body.mean(axis=0)) @ towards
-        if depth[piece].min() < 3 * ends.half_slice and aside > UNCUS_OFFSET:
-            found |= piece
-    if not found.any():
+        offset = (points[piece].mean(axis=0) - body.mean(axis=0)) @ towards
+        if depth[piece].min() < 3 * ends.half_slice and offset > UNCUS_OFFSET:
+            uncus |= piece
+    if not uncus.any():
         return np.zeros((0, 3), np.intp)
-    beside = depth < depth[found].max() + 1.0
-    own, rest, free = (np.zeros(grid.shape, dtype=bool) for _ in range(3))
-    own[at], rest[at], free[at] = found, (lateral | medial) & beside & ~found, beside
-    return np.asarray(index[_nearer_to(own, rest, free)[at]])
+    beside = depth < depth[uncus].max() + 1.0
+    uncus_grid, body_grid, free = (np.zeros(grid.shape, dtype=bool) for _ in range(3))
+    uncus_grid[at], body_grid[at], free[at] = uncus, (lateral | medial) & beside & ~uncus, beside
+    return np.asarray(index[_nearer_to(uncus_grid, body_grid, free)[at]])
 
 
-def _nearer_to(own: Bool, rest: Bool, free: Bool) -> Bool:
+def _nearer_to(first: Bool, second: Bool, free: Bool) -> Bool:
     """Grow two masks through free voxels, a voxel at a time; return the first.
 
     What both reach at once goes to the second, whatever the order in which voxels are stored.
     """
-    free = free & ~own & ~rest
+    free = free & ~first & ~second
     while True:
-        to_own, to_rest = (widened(part) & free for part in (own, rest))
-        if not (to_own | to_rest).any():
-            return own
-        rest = rest | to_rest
-        own = own | (to_own & ~to_rest)
-        free &= ~(to_own | to_rest)
+        to_first, to_second = (digital.widened(part) & free for part in (first, second))
+        if not (to_first | to_second).any():
+            return first
+        second = second | to_second
+        first = first | (to_first & ~to_second)
+        free &= ~(to_first | to_second)
 
 
 def _like_nearest(
-    volume: LabelVolume, tissue: Tissues, where: Index, donors: Bool
+    volume: LabelVolume, tissue: Tissues, voxels: Index, donors: Bool
 ) -> tuple[LabelVolume, Tissues]:
     """Give voxels (N, 3) the label and the part of the sheet that the nearest donor has."""
-    around = box(np.maximum(where.min(axis=0) - _NEAR, 0), where.max(axis=0) + _NEAR + 1)
-    index = positions(donors[around]) + low_corner(around)
+    around = digital.box(np.maximum(voxels.min(axis=0) - _NEAR, 0), voxels.max(axis=0) + _NEAR + 1)
+    index = digital.positions(donors[around]) + digital.low_corner(around)
     pairs = volume.tissue.astype(np.intp) * 256 + tissue
     nearest = value_of_nearest(
-        pairs[tuple(index.T)], to_ras(index, volume.affine), to_ras(where, volume.affine)
+        pairs[tuple(index.T)],
+        digital.to_ras(index, volume.affine),
+        digital.to_ras(voxels, volume.affine),
     )
-    at = tuple(where.T)
+    at = tuple(voxels.T)
     labels, sheet = volume.tissue.copy(), tissue.copy()
     labels[at], sheet[at] = np.divmod(nearest, 256)
     return replace(volume, tissue=labels), sheet
@@ -188,13 +179,13 @@ def hand_over(
 
     No plane separates labels perfectly; left out, these voxels would be holes in the sheet.
     """
-    index = positions(volume.tissue == Tissue.HIPPOCAMPUS)
-    depth = ends.depth(to_ras(index, volume.affine))
-    where = index[(depth > 0) & (depth < reach)]
-    if not len(where):
+    index = digital.positions(volume.tissue == Tissue.HIPPOCAMPUS)
+    depth = ends.depth(digital.to_ras(index, volume.affine))
+    voxels = index[(depth > 0) & (depth < reach)]
+    if not len(voxels):
         return volume, tissue, 0
-    volume, tissue = _like_nearest(volume, tissue, where, _subfields(volume))
-    return volume, tissue, len(where)
+    volume, tissue = _like_nearest(volume, tissue, voxels, _subfields(volume))
+    return volume, tissue, len(voxels)
 
 
 def find_cavities(
@@ -206,26 +197,30 @@ def find_cavities(
     enclosed in three dimensions, or in a slice if little of it is open to the next slices.
     """
     solid = _subfields(volume) | np.isin(volume.tissue, (Tissue.HIPPOCAMPUS, Tissue.FISSURE))
-    around = box_around(positions(between(solid, volume.affine, ends)[0]))
+    around = digital.box_around(digital.positions(between(solid, volume.affine, ends)[0]))
     solid, sheet = solid[around], tissue[around] > 0
     inner = np.isin(volume.tissue[around], volume.protocol.interior)
     edges = np.linalg.norm(volume.affine[:3, :3], axis=0)
     through = int(np.argmax(np.abs(ends.axis @ volume.affine[:3, :3]) / edges))
-    in_slice = FACES & (np.arange(3) == 1).reshape([3 if n == through else 1 for n in range(3)])
+    in_slice = digital.FACES & (np.arange(3) == 1).reshape(
+        [3 if n == through else 1 for n in range(3)]
+    )
     # What cannot leave in three dimensions cannot in its slices.
     enclosed = _cannot_leave(solid, in_slice, through)
     enclosed &= np.isin(volume.tissue[around], (Tissue.BACKGROUND, Tissue.CYST))
-    pieces, _ = ndimage.label(enclosed, structure=ALL)
+    pieces, _ = ndimage.label(enclosed, structure=digital.CUBE)
     most_open = 1.0 if edges[through] > settings.slit_voxel else CAVITY_OPENNESS
     narrow, wide = list[Index](), list[Index]()
     for number, part in enumerate(ndimage.find_objects(pieces), 1):
-        room = box_around(positions(pieces[part] == number) + low_corner(part))
+        room = digital.box_around(
+            digital.positions(pieces[part] == number) + digital.low_corner(part)
+        )
         piece = pieces[room] == number
-        ring = widened(piece) & ~piece
+        ring = digital.widened(piece) & ~piece
         is_open = (ring & ~solid[room] & ~enclosed[room]).sum() > most_open * ring.sum()
         beside = ring & solid[room]
-        index = positions(piece) + low_corner(around) + low_corner(room)
-        index = index[ends.depth(to_ras(index, volume.affine)) > 0]
+        index = digital.positions(piece) + digital.low_corner(around) + digital.low_corner(room)
+        index = index[ends.depth(digital.to_ras(index, volume.affine)) > 0]
         if not len(index) or is_open or not (beside & sheet[room]).any():
             continue
         if (beside & inner[room]).any():
@@ -257,9 +252,9 @@ def fill_cavities(
     if settings.layer_rule == "nearest-sheet" and layer.any():
         merged = tissue[layer].any()
         narrow = donors & ((tissue > 0) if merged else (tissue == 0))
-    for group, chosen in ((cavities.wide, donors), (cavities.narrow, narrow)):
+    for group, candidates in ((cavities.wide, donors), (cavities.narrow, narrow)):
         if group:
-            volume, tissue = _like_nearest(volume, tissue, np.concatenate(group), chosen)
+            volume, tissue = _like_nearest(volume, tissue, np.concatenate(group), candidates)
     return volume, tissue
 
 
@@ -283,16 +278,16 @@ def fill_slits(
     directions. A slit opens on both sides of the sheet; a crevice between two folds, which opens
     on one side, is left as it is.
     """
-    around = box_around(positions(inside))
+    around = digital.box_around(digital.positions(inside))
     sheet = np.pad(tissue[around] > 0, 1)
     # Between the end planes: next to voxels that lie there.
-    beside = widened(np.pad(inside[around], 1))
+    beside = digital.widened(np.pad(inside[around], 1))
     empty = np.pad(unlabeled[around], 1)
     edges = np.linalg.norm(affine[:3, :3], axis=0)
     coarse = edges > settings.slit_voxel
     enclosed = _enclosed(sheet, GAP_DIRECTIONS, coarse)
-    pieces, _ = ndimage.label(empty & beside & enclosed, structure=ALL)
-    sizes = piece_sizes(pieces)
+    pieces, _ = ndimage.label(empty & beside & enclosed, structure=digital.CUBE)
+    sizes = digital.piece_sizes(pieces)
     small = np.sort(edges)[:2]
     least = settings.slit_area / float(small[0] * small[1])
     through = [
@@ -300,9 +295,13 @@ def fill_slits(
         for number in np.flatnonzero(sizes > least)
         if not coarse.any() and _opens_on_both_sides(pieces == number, sheet, SLIT_OPENINGS)
     ]
-    filled = positions(np.isin(pieces, through)) + low_corner(around) - 1
+    filled = digital.positions(np.isin(pieces, through)) + digital.low_corner(around) - 1
     sizes[through] = 0
-    gap = positions((pieces == sizes.argmax()) & (pieces > 0)) + low_corner(around) - 1
+    gap = (
+        digital.positions((pieces == sizes.argmax()) & (pieces > 0))
+        + digital.low_corner(around)
+        - 1
+    )
     return Slits(_with_nearest(tissue, filled, around), filled, gap)
 
 
@@ -318,7 +317,7 @@ def fill_pits(
     edges = np.linalg.norm(affine[:3, :3], axis=0)
     if edges.max() > settings.slit_voxel:
         return tissue, np.zeros((0, 3), np.intp)
-    around = box_around(positions(inside))
+    around = digital.box_around(digital.positions(inside))
     steps = np.maximum(np.rint(PIT_REACH / edges), 1).astype(int)
     room = [(int(n), int(n)) for n in steps + 1]
     sheet = np.pad(tissue[around] > 0, room)
@@ -328,22 +327,22 @@ def fill_pits(
             rolled = (np.roll(sheet, sign * n, axis) for n in range(1, count + 1))
             sides += np.logical_or.reduce(list(rolled))
     # Between the end planes: next to voxels that lie there.
-    beside = widened(np.pad(inside[around], room))
+    beside = digital.widened(np.pad(inside[around], room))
     empty = np.pad(unlabeled[around], room) & ~sheet & beside
-    pieces, _ = ndimage.label(empty & (sides >= PIT_SIDES), structure=FACES)
-    sizes = piece_sizes(pieces) * float(np.prod(edges))
-    least, most = PIT_SIZE
-    pits = np.flatnonzero((sizes >= least) & (sizes <= most))
-    where = positions(np.isin(pieces, pits)) + low_corner(around) - steps - 1
-    if not len(where):
-        return tissue, where
-    donors = positions(tissue[around] > 0) + low_corner(around)
+    pieces, _ = ndimage.label(empty & (sides >= PIT_SIDES), structure=digital.FACES)
+    sizes = digital.piece_sizes(pieces) * float(np.prod(edges))
+    smallest, largest = PIT_SIZE
+    pits = np.flatnonzero((sizes >= smallest) & (sizes <= largest))
+    voxels = digital.positions(np.isin(pieces, pits)) + digital.low_corner(around) - steps - 1
+    if not len(voxels):
+        return tissue, voxels
+    donors = digital.positions(tissue[around] > 0) + digital.low_corner(around)
     nearest = value_of_nearest(
-        tissue[tuple(donors.T)], to_ras(donors, affine), to_ras(where, affine)
+        tissue[tuple(donors.T)], digital.to_ras(donors, affine), digital.to_ras(voxels, affine)
     )
     filled = tissue.copy()
-    filled[tuple(where.T)] = nearest
-    return filled, where
+    filled[tuple(voxels.T)] = nearest
+    return filled, voxels
 
 
 def _enclosed(sheet: Bool, directions: int, coarse: Bool) -> Bool:
@@ -357,28 +356,28 @@ def _enclosed(sheet: Bool, directions: int, coarse: Bool) -> Bool:
     least = max(round(directions * len(steps) / len(_DIRECTIONS)), 1)
     opposite = np.zeros(sheet.shape, dtype=np.int8)
     for step in steps:
-        back = tuple(-s for s in step)
-        opposite += np.roll(sheet, step, (0, 1, 2)) & np.roll(sheet, back, (0, 1, 2))
+        reverse = tuple(-s for s in step)
+        opposite += np.roll(sheet, step, (0, 1, 2)) & np.roll(sheet, reverse, (0, 1, 2))
     return np.asarray(~sheet & (opposite >= least))
 
 
 def _opens_on_both_sides(piece: Bool, sheet: Bool, least: float) -> bool:
     """Whether what surrounds a gap, outside of the sheet, has two pieces of at least this share."""
-    border = widened(piece) & ~sheet & ~piece
-    openings, count = ndimage.label(border, structure=ALL)
-    sizes = np.sort(piece_sizes(openings))
+    border = digital.widened(piece) & ~sheet & ~piece
+    openings, count = ndimage.label(border, structure=digital.CUBE)
+    sizes = np.sort(digital.piece_sizes(openings))
     return count > 1 and bool(sizes[-2] >= least * sizes.sum())
 
 
-def _with_nearest(tissue: Tissues, index: Index, around: Box) -> Tissues:
+def _with_nearest(tissue: Tissues, index: Index, around: digital.Box) -> Tissues:
     """Label voxels (N, 3) with the nearest label within a box."""
     if not len(index):
         return tissue
     nearest = ndimage.distance_transform_edt(
         tissue[around] == 0, return_distances=False, return_indices=True
     )
-    low = low_corner(around)
-    found = nearest[:, *(index - low).T].T + low
+    low = digital.low_corner(around)
+    sources = nearest[:, *(index - low).T].T + low
     filled = tissue.copy()
-    filled[tuple(index.T)] = tissue[tuple(found.T)]
+    filled[tuple(index.T)] = tissue[tuple(sources.T)]
     return filled

@@ -30,7 +30,7 @@ from hipsta_bids.types import Bool, Float
 
 #: Steps in which field values are ordered while growing and shrinking.
 FIELD_LEVELS = 6
-#: Share of the field that each grid node of depth adds to the order of that.
+#: Share of the field that each grid node of depth adds to the order of growing and shrinking.
 DEPTH_RANK = 0.05
 #: Membranes cheaper than this are applied together; costlier ones one per round.
 SMALL_COST = 5.0
@@ -46,17 +46,17 @@ CUT_ACROSS = 0.3
 SEVER_REACH = 2
 #: Share of the cut's nodes at which the body has to go on.
 SEVER_SHARE = 0.1
-#: A cut severs in any case if the line between its stumps is more along the axis than this,
+#: A cut severs if the line between its stumps is more along the axis than this (squared cosine).
 SEVER_ALONG = 0.5
-#: and in no case if it is less than this (squared cosines with the axis).
+#: A cut does not sever if that line is less along the axis than this (squared cosine).
 BRIDGE_ALONG = 0.25
-#: Such cuts cost this much more: where one is the only way, the hemisphere is flagged.
+#: Cuts that sever cost this many times more: where one is the only way, the hemisphere is flagged.
 SEVER_FACTOR = 1000.0
 #: A fill spans the inside of a bend rather than a hole if this share lies across the axis.
 FILL_ACROSS = 0.5
 #: A fill within this distance of an end plane closes an end and no bend, grid nodes.
 LID_NODES = 6.0
-#: Such fills cost this much more.
+#: Fills that span a bend cost this many times more.
 ACROSS_FACTOR = 40.0
 
 Bits = NDArray[np.uint32]
@@ -66,7 +66,7 @@ Kind = Literal["part", "slit", "cut", "fill", "island", "cavity", "uncus"]
 
 FACES = ndimage.generate_binary_structure(3, 1)
 """Structuring element: voxels that share a face."""
-ALL = np.ones((3, 3, 3), dtype=bool)
+CUBE = np.ones((3, 3, 3), dtype=bool)
 """Structuring element: voxels that share a face, an edge or a corner."""
 
 PAD = ((1, 1), (1, 1), (2, 2))
@@ -161,10 +161,10 @@ def grow(start: Bool, allowed: Bool, field: NDArray[np.float32], levels: int) ->
     return state
 
 
-def shrink(start: Bool, kept: Bool, field: NDArray[np.float32], levels: int) -> Bool:
-    """Shrink a set towards ``kept``, a part of it, by simple points, lowest field value first."""
+def shrink(start: Bool, core: Bool, field: NDArray[np.float32], levels: int) -> Bool:
+    """Shrink a set towards ``core``, a part of it, by simple points, lowest field value first."""
     state = start.copy()
-    free = start & ~kept
+    free = start & ~core
     if free.any():
         for level in np.quantile(field[free], np.linspace(0, 1, levels + 1)[1:]):
             _sweep(state, free & (field <= level), add=False)
@@ -178,7 +178,7 @@ def are_simple(neighbors: Bool) -> Bool:
     table = _table()
     close = bits >> np.uint32(len(_CORNERS))
     bare = table.bare_but_for[close] & bits.astype(np.uint8)
-    return np.asarray(np.bitwise_count(bare) == table.wanted[close])
+    return np.asarray(np.bitwise_count(bare) == table.simple_bare[close])
 
 
 def _sweep(state: Bool, free: Bool, *, add: bool) -> None:
@@ -203,8 +203,8 @@ def _sweep(state: Bool, free: Bool, *, add: bool) -> None:
 
 def _change_simple(flat: Bool, queue: Index, shifts: Index, strides: Index, add: bool) -> Index:
     """Change the simple ones of some voxels in place, sub-grid by sub-grid, and return them."""
-    first, rest = np.divmod(queue, strides[0])
-    second, third = np.divmod(rest, strides[1])
+    first, remainder = np.divmod(queue, strides[0])
+    second, third = np.divmod(remainder, strides[1])
     part = ((first & 1) << 2 | (second & 1) << 1 | third & 1).astype(np.uint8)
     queue = queue[np.argsort(part, kind="stable")]
     ends = np.bincount(part, minlength=8).cumsum()
@@ -231,7 +231,7 @@ class _Table(NamedTuple):
 
     bare_but_for: NDArray[np.uint8]
     """Corners of the cube that are bare if the voxel beyond them is object: a byte of bits."""
-    wanted: NDArray[np.int8]
+    simple_bare: NDArray[np.int8]
     """Bare corners that a simple voxel has; -1 if there is not one piece of object."""
 
 
@@ -242,12 +242,12 @@ def _table() -> _Table:
     for number, corner in enumerate(_CORNERS):
         corners |= _is_bare(bits, corner).astype(np.uint8) << np.uint8(number)
     # 8 - bare corners - covered edges + covered faces = 1.
-    wanted = np.full(len(bits), len(_CORNERS) - 1, dtype=np.int8)
+    count = np.full(len(bits), len(_CORNERS) - 1, dtype=np.int8)
     for edge in _EDGES:
-        wanted -= ~_is_bare(bits, edge)
+        count -= ~_is_bare(bits, edge)
     for face in _SIDES:
-        wanted += ~_is_bare(bits, face)
-    return _Table(corners, np.where(_is_one_piece(bits), wanted, np.int8(-1)))
+        count += ~_is_bare(bits, face)
+    return _Table(corners, np.where(_is_one_piece(bits), count, np.int8(-1)))
 
 
 def _is_bare(bits: Bits, part: Index) -> Bool:
@@ -276,7 +276,7 @@ class Edit(NamedTuple):
     """One change of a padded body."""
 
     kind: Kind
-    where: Index
+    nodes: Index
     """(N, 3) nodes of the padded array."""
     cost: float = 0.0
     """Evidence overruled by a membrane, before it was thickened: sum of the field."""
@@ -318,27 +318,27 @@ def apply_membranes(
         ranked = with_plates(ranked, float(ranked.max()) + 1.0)
     grown = grow(_inner_ball(solid, ranked), solid, ranked, FIELD_LEVELS)
     shrunk = shrink(_outer_ball(solid, ranked), solid, ranked, FIELD_LEVELS)
-    both: tuple[tuple[Kind, Bool], ...] = (("cut", solid & ~grown), ("fill", shrunk & ~solid))
-    found = [
-        Edit(kind, where)
-        for kind, membrane in both
-        for where in _pieces(membrane)
+    membranes: tuple[tuple[Kind, Bool], ...] = (("cut", solid & ~grown), ("fill", shrunk & ~solid))
+    proposals = [
+        Edit(kind, nodes)
+        for kind, membrane in membranes
+        for nodes in _pieces(membrane)
         # Nothing can be changed in the plates.
-        if not (plates and np.isin(where[:, 2], (1, solid.shape[2] - 2)).any())
+        if not (plates and np.isin(nodes[:, 2], (1, solid.shape[2] - 2)).any())
     ]
-    candidates = _priced(found, solid, values, settings, contact)
+    candidates = _priced(proposals, solid, values, settings, contact)
     edits: list[Edit] = []
     for cost, edit in candidates:
-        kind, where = edit.kind, edit.where
+        kind, nodes = edit.kind, edit.nodes
         if edits and cost > SMALL_COST:
             break
-        if edits and _gain(solid, where, kind) <= 0:
+        if edits and _gain(solid, nodes, kind) <= 0:
             continue  # another membrane has already removed this tunnel
-        solid[tuple(where.T)] = kind == "fill"
-        state[tuple(where.T)] = kind == "fill"
+        solid[tuple(nodes.T)] = kind == "fill"
+        state[tuple(nodes.T)] = kind == "fill"
         if kind == "fill":
-            where = _thicken(state, lifted, where)
-        edits.append(edit._replace(where=where))
+            nodes = _thicken(state, lifted, nodes)
+        edits.append(edit._replace(nodes=nodes))
         if cost > SMALL_COST:
             break
     return edits
@@ -346,7 +346,7 @@ def apply_membranes(
 
 def _pieces(membrane: Bool) -> list[Index]:
     """Nodes (N, 3) of each connected piece."""
-    pieces, _ = ndimage.label(membrane, structure=ALL)
+    pieces, _ = ndimage.label(membrane, structure=CUBE)
     return [
         positions(pieces[around] == number) + low_corner(around)
         for number, around in enumerate(ndimage.find_objects(pieces), start=1)
@@ -354,7 +354,7 @@ def _pieces(membrane: Bool) -> list[Index]:
 
 
 def _priced(
-    found: list[Edit],
+    proposals: list[Edit],
     solid: Bool,
     values: NDArray[np.float32],
     settings: TopologySettings,
@@ -370,17 +370,17 @@ def _priced(
     open_tunnels = euler_number(closed) - euler_number(solid)
     any_hole = euler_number(closed) != 1
     candidates = []
-    for kind, where, *_ in found:
-        gain = _gain(solid, where, kind)
+    for kind, nodes, *_ in proposals:
+        gain = _gain(solid, nodes, kind)
         if gain <= 0:
             continue
-        cost = float(np.abs(values[tuple(where.T)]).sum())
-        factor = _implausibility(kind, where, solid)
-        if kind == "cut" and factor > 1 and contact(where):
+        cost = float(np.abs(values[tuple(nodes.T)]).sum())
+        factor = _implausibility(kind, nodes, solid)
+        if kind == "cut" and factor > 1 and contact(nodes):
             factor = 1.0
-        at_end = kind == "cut" and any_hole and _gain(closed, where, kind) <= 0
+        at_end = kind == "cut" and any_hole and _gain(closed, nodes, kind) <= 0
         doubtful = factor > 1 and (kind == "cut" or cost > settings.doubtful_fill_cost)
-        candidates.append((factor * cost / gain, Edit(kind, where, cost, doubtful), at_end))
+        candidates.append((factor * cost / gain, Edit(kind, nodes, cost, doubtful), at_end))
     candidates.sort(key=lambda c: c[0])
     priced = []
     for price, edit, at_end in candidates:
@@ -431,19 +431,19 @@ def _outer_ball(solid: Bool, values: NDArray[np.float32]) -> Bool:
 
 def _is_ball(mask: Bool) -> bool:
     """Whether one 6-connected piece has neither tunnels nor cavities."""
-    return euler_number(mask) == 1 and ndimage.label(~mask, structure=ALL)[1] == 1
+    return euler_number(mask) == 1 and ndimage.label(~mask, structure=CUBE)[1] == 1
 
 
-def _gain(state: Bool, where: Index, kind: Kind) -> int:
+def _gain(state: Bool, nodes: Index, kind: Kind) -> int:
     """Change of the Euler number if these voxels change sides."""
-    low, high = where.min(axis=0) - 1, where.max(axis=0) + 2
+    low, high = nodes.min(axis=0) - 1, nodes.max(axis=0) + 2
     block = state[box(low, high)].copy()
     before = euler_number(block)
-    block[tuple((where - low).T)] = kind == "fill"
+    block[tuple((nodes - low).T)] = kind == "fill"
     return euler_number(block) - before
 
 
-def _implausibility(kind: Kind, where: Index, solid: Bool) -> float:
+def _implausibility(kind: Kind, nodes: Index, solid: Bool) -> float:
     """Factor by which the price of membranes across the long axis rises.
 
     The ribbon runs along the axis, so what fills a hole in it lies along the axis too, and so does
@@ -453,35 +453,35 @@ def _implausibility(kind: Kind, where: Index, solid: Bool) -> float:
     the inside of a bend, unless it is the lid of a tunnel that opens at an end plane.
     """
     areas = np.array(
-        [len(np.unique(np.delete(where, axis, axis=1), axis=0)) for axis in range(3)],
+        [len(np.unique(np.delete(nodes, axis, axis=1), axis=0)) for axis in range(3)],
         dtype=float,
     )
-    oriented = len(where) >= ORIENTED_NODES
+    oriented = len(nodes) >= ORIENTED_NODES
     across = areas[2] ** 2 / float(areas @ areas)
     if kind == "cut":
-        along = _stumps_along(where, solid)
+        along = _stumps_along(nodes, solid)
         lies_across = oriented and across > CUT_ACROSS and along > BRIDGE_ALONG
-        severs = along > SEVER_ALONG or (lies_across and _continues(where, solid))
+        severs = along > SEVER_ALONG or (lies_across and _continues(nodes, solid))
         return SEVER_FACTOR if severs else 1.0
-    level = float(where[:, 2].mean()) - FIRST[2]
+    level = float(nodes[:, 2].mean()) - FIRST[2]
     last = solid.shape[2] - 2 * FIRST[2] - 1
     lid = min(level, last - level) < LID_NODES
     spans = oriented and across > FILL_ACROSS and not lid
     return ACROSS_FACTOR if spans else 1.0
 
 
-def _stumps_along(where: Index, solid: Bool) -> float:
+def _stumps_along(nodes: Index, solid: Bool) -> float:
     """Squared cosine between the axis and the line that joins the two stumps of a cut.
 
     Stumps are the largest two pieces of what lies within a few nodes of the cut; 0 if there is only
     one, or the cut is a single node, which has no direction.
     """
-    if len(where) == 1:
+    if len(nodes) == 1:
         return 0.0
-    low = np.maximum(where.min(axis=0) - _STUMP, 0)
-    high = np.minimum(where.max(axis=0) + _STUMP + 1, solid.shape)
+    low = np.maximum(nodes.min(axis=0) - _STUMP, 0)
+    high = np.minimum(nodes.max(axis=0) + _STUMP + 1, solid.shape)
     cut = np.zeros(high - low, dtype=bool)
-    cut[tuple((where - low).T)] = True
+    cut[tuple((nodes - low).T)] = True
     near = ndimage.distance_transform_edt(~cut) <= _STUMP
     pieces, count = ndimage.label(solid[box(low, high)] & near & ~cut, structure=FACES)
     if count < 2:  # noqa: PLR2004 -- one on each side
@@ -492,25 +492,25 @@ def _stumps_along(where: Index, solid: Bool) -> float:
     return float(line[2] ** 2 / (line @ line))
 
 
-def _continues(where: Index, solid: Bool) -> bool:
+def _continues(nodes: Index, solid: Bool) -> bool:
     """Whether the body continues along the axis on both sides of most of a membrane's nodes.
 
     It may deviate by a node; beyond an end plane it counts as continued.
     """
     wide = ndimage.maximum_filter(solid, size=(3, 3, 1))
-    both = np.ones(len(where), dtype=bool)
-    a, b, w = where.T
+    continued = np.ones(len(nodes), dtype=bool)
+    a, b, w = nodes.T
     for step in range(1, SEVER_REACH + 1):
         for level in (w - step, w + step):
             beyond = (level < FIRST[2]) | (level >= solid.shape[2] - FIRST[2])
-            both &= beyond | wide[a, b, np.clip(level, 0, solid.shape[2] - 1)]
-    return bool(both.mean() > SEVER_SHARE)
+            continued &= beyond | wide[a, b, np.clip(level, 0, solid.shape[2] - 1)]
+    return bool(continued.mean() > SEVER_SHARE)
 
 
 def _thicken(
     state: Bool,
     lifted: NDArray[np.float32],
-    where: Index,
+    nodes: Index,
 ) -> Index:
     """Make a filled membrane as thick as the wall around it (in place), if the topology allows.
 
@@ -518,26 +518,26 @@ def _thicken(
     the wall's middle, which are sought within ``plug_reach`` nodes.
     """
     reach = PLUG_REACH
-    low = np.maximum(where.min(axis=0) - reach, FIRST)
-    high = np.minimum(where.max(axis=0) + reach + 1, np.array(state.shape) - FIRST)
+    low = np.maximum(nodes.min(axis=0) - reach, FIRST)
+    high = np.minimum(nodes.max(axis=0) + reach + 1, np.array(state.shape) - FIRST)
     around = box(low, high)
     block = state[around]
     membrane = np.zeros_like(block)
-    membrane[tuple((where - low).T)] = True
+    membrane[tuple((nodes - low).T)] = True
     off, nearest = ndimage.distance_transform_edt(~membrane, return_indices=True)
-    at = _half_thickness(block & ~membrane, where - low)
+    at = _half_thickness(block & ~membrane, nodes - low)
     thickness = np.zeros(block.shape)
-    thickness[tuple((where - low).T)] = at
+    thickness[tuple((nodes - low).T)] = at
     half = thickness[tuple(nearest)]
     plug = np.clip(_SLOPE * (half - off), -0.5, 0.5).astype(np.float32)
     added = (plug > 0) & ~block
     trial = state.copy()
     trial[around] |= added
     if euler_number(trial) != euler_number(state):
-        return where
+        return nodes
     state[around] |= added
     lifted[around] = np.maximum(lifted[around], np.where(off < half + 1, plug, -1))
-    return np.vstack([where, positions(added) + low])
+    return np.vstack([nodes, positions(added) + low])
 
 
 def _half_thickness(wall: Bool, nodes: Index) -> Float:
@@ -551,5 +551,5 @@ def _half_thickness(wall: Bool, nodes: Index) -> Float:
     count = min(PLUG_NEIGHBORS, len(middle))
     _, nearest = cKDTree(middle).query(nodes, k=count)
     # A node's depth is the distance from the next node outside, half a step beyond the surface.
-    found = depth[tuple(middle.T)][nearest.reshape(len(nodes), count)]
-    return np.asarray(found.mean(axis=1) - 0.5)
+    depths = depth[tuple(middle.T)][nearest.reshape(len(nodes), count)]
+    return np.asarray(depths.mean(axis=1) - 0.5)

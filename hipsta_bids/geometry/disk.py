@@ -44,14 +44,16 @@ class Disk:
     """(F,) tetrahedron in which each triangle lies; -1 where it fills a hole."""
 
     @cached_property
-    def from_rims(self) -> Float:
+    def from_edges(self) -> Float:
         """(V,) distance along the sheet from its edges, ends and filled holes, mm."""
         edges = unique_edges(self.triangles[self.cell >= 0])
         lengths = np.linalg.norm(np.diff(self.vertices[edges], axis=1)[:, 0], axis=1)
-        rims = np.union1d(self.loop, self.triangles[self.cell < 0])
+        edge_points = np.union1d(self.loop, self.triangles[self.cell < 0])
         graph = edge_graph(edges, lengths, len(self.vertices))
-        found: Float = sparse.csgraph.dijkstra(graph, directed=False, indices=rims, min_only=True)
-        return found
+        distance: Float = sparse.csgraph.dijkstra(
+            graph, directed=False, indices=edge_points, min_only=True
+        )
+        return distance
 
     @cached_property
     def stiffness(self) -> sparse.csr_array:
@@ -116,8 +118,8 @@ def make_disk(points: Float, triangles: Int, cell: NDArray[np.intp]) -> Disk:
     graph = edge_graph(unique_edges(triangles), np.ones(len(unique_edges(triangles))), len(points))
     piece = sparse.csgraph.connected_components(graph, directed=False)[1]
     area = np.bincount(piece[triangles[:, 0]], triangle_areas(points, triangles))
-    kept = piece[triangles[:, 0]] == area.argmax()
-    triangles, cell = triangles[kept], cell[kept]
+    main = piece[triangles[:, 0]] == area.argmax()
+    triangles, cell = triangles[main], cell[main]
     loops = _loops(triangles)
     if not loops:
         raise GeometryError("the mid-surface is closed: check the labels", reason="whole-topology")
@@ -135,13 +137,13 @@ def make_disk(points: Float, triangles: Int, cell: NDArray[np.intp]) -> Disk:
         filled.append(np.column_stack([np.roll(loop, -1), loop, np.full(len(loop), center)]))
     added = np.concatenate(filled) if filled else np.zeros((0, 3), np.int32)
     vertices = np.vstack([points, *[c[None] for c in centers]])
-    every = np.vstack([triangles, added])
+    closed = np.vstack([triangles, added])
     cell = np.concatenate([cell, np.full(len(added), -1)])
-    used = np.unique(every)
+    corners = np.unique(closed)
     index = np.full(len(vertices), -1, dtype=np.int32)
-    index[used] = np.arange(len(used), dtype=np.int32)
-    every = index[every]
-    euler = len(used) - len(unique_edges(every)) + len(every)
+    index[corners] = np.arange(len(corners), dtype=np.int32)
+    closed = index[closed]
+    euler = len(corners) - len(unique_edges(closed)) + len(closed)
     if euler != 1:
         raise GeometryError(
             f"the sheet has {(1 - euler) // 2} handles: parts of it touch or are bridged; "
@@ -149,8 +151,8 @@ def make_disk(points: Float, triangles: Int, cell: NDArray[np.intp]) -> Disk:
             reason="whole-topology",
         )
     return Disk(
-        vertices=vertices[used],
-        triangles=every,
+        vertices=vertices[corners],
+        triangles=closed,
         holes=tuple(length[n] for n in order[1:]),
         centers=tuple(centers),
         beside=float(area.sum() / area.max() - 1),
@@ -163,21 +165,21 @@ def _loops(triangles: Int) -> list[Int]:
     """Find the boundaries, in the direction in which their triangles run."""
     ways = triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2).astype(np.int64)
     size = int(ways.max()) + 1
-    code, back = ways[:, 0] * size + ways[:, 1], ways[:, 1] * size + ways[:, 0]
-    open_ = ways[~np.isin(code, back)]
+    code, reverse = ways[:, 0] * size + ways[:, 1], ways[:, 1] * size + ways[:, 0]
+    open_ = ways[~np.isin(code, reverse)]
     after: dict[int, list[int]] = {}
     for a, b in open_.tolist():
         after.setdefault(a, []).append(b)
     loops = []
     while after:
         start = next(iter(after))
-        loop, here = [], start
-        while here in after:
-            ahead = after[here]
-            loop.append(here)
-            here, rest = ahead[-1], ahead[:-1]
-            if rest:
-                after[loop[-1]] = rest
+        loop, vertex = [], start
+        while vertex in after:
+            targets = after[vertex]
+            loop.append(vertex)
+            vertex, branches = targets[-1], targets[:-1]
+            if branches:
+                after[loop[-1]] = branches
             else:
                 del after[loop[-1]]
         loops.append(np.array(loop, dtype=np.int32))
@@ -204,10 +206,10 @@ def find_edges(disk: Disk, medial: Float, lateral: Float, height: Float) -> Edge
     step = np.linalg.norm(points - np.roll(points, 1, axis=0), axis=1)
     length = (step + np.roll(step, -1)) / 2
     first = _best_arc(medial * length)
-    taken = np.isin(np.arange(len(length)), first)
+    excluded = np.isin(np.arange(len(length)), first)
     for step_aside in (1, -1):  # a vertex of each end lies between
-        taken |= np.roll(taken, step_aside)
-    second = _best_arc(np.where(taken, -length.sum(), lateral * length))
+        excluded |= np.roll(excluded, step_aside)
+    second = _best_arc(np.where(excluded, -length.sum(), lateral * length))
     if not (len(first) and len(second)):
         raise GeometryError(
             "the sheet has no medial or no lateral edge: check the labels of the subiculum, and of "
@@ -253,16 +255,16 @@ def map_to_rectangle(
     mean distance along the sheet, from the body, of what lies on a line.
     """
     matrix = disk.stiffness
-    inside = (disk.from_rims > NEAR) & np.isfinite(body).all(axis=1)
-    known = np.flatnonzero(inside)
-    x = _harmonic(matrix, (edges.medial, -1.0), (edges.lateral, 1.0), (known, body[known, 0]))
+    inside = (disk.from_edges > NEAR) & np.isfinite(body).all(axis=1)
+    inner = np.flatnonzero(inside)
+    x = _harmonic(matrix, (edges.medial, -1.0), (edges.lateral, 1.0), (inner, body[inner, 0]))
     pulled = [end * _PULL if abs(end) > extent else end for end in ends]
     sides = (edges.posterior, pulled[0]), (edges.anterior, pulled[1])
-    y = _harmonic(matrix, *sides, (known, body[known, 1]))
-    every = unique_edges(disk.triangles)
-    lengths = np.linalg.norm(np.diff(disk.vertices[every], axis=1)[:, 0], axis=1)
+    y = _harmonic(matrix, *sides, (inner, body[inner, 1]))
+    links = unique_edges(disk.triangles)
+    lengths = np.linalg.norm(np.diff(disk.vertices[links], axis=1)[:, 0], axis=1)
     far = sparse.csgraph.dijkstra(
-        edge_graph(every, lengths, len(y)),
+        edge_graph(links, lengths, len(y)),
         directed=False,
         indices=np.flatnonzero(np.abs(y) <= extent),
         min_only=True,
@@ -295,8 +297,8 @@ def _harmonic(matrix: sparse.csr_array, *fixed: tuple[NDArray[np.integer], Float
     """Harmonic function (V,) with given values at some vertices."""
     count = matrix.shape[0]
     result, free = np.zeros(count), np.ones(count, dtype=bool)
-    for where, value in fixed:
-        result[where], free[where] = value, False
+    for nodes, value in fixed:
+        result[nodes], free[nodes] = value, False
     factor = splu(
         sparse.csc_array(matrix[free][:, free]),
         permc_spec="MMD_AT_PLUS_A",
@@ -355,5 +357,5 @@ def locate_nodes(disk: Disk, plane: Float, x: Float, y: Float) -> tuple[NDArray[
 def at_nodes(disk: Disk, plane: Float, values: Float, x: Float, y: Float) -> Float:
     """Values (V,) of a disk at the nodes (Nx, Ny) of a grid; NaN where there is none."""
     triangle, weights = locate_nodes(disk, plane, x, y)
-    found: Float = (weights * values[disk.triangles[triangle]]).sum(axis=2)
-    return np.where(triangle < 0, np.nan, found)
+    sampled: Float = (weights * values[disk.triangles[triangle]]).sum(axis=2)
+    return np.where(triangle < 0, np.nan, sampled)

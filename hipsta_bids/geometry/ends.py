@@ -14,20 +14,20 @@ from scipy.special import expit
 
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.automatic_ends import find_ends
-from hipsta_bids.geometry.digital import ALL, box_around, piece_sizes, positions, voxel_points
+from hipsta_bids.geometry.digital import CUBE, box_around, piece_sizes, positions, voxel_points
 from hipsta_bids.protocols.protocol import Part, Tissue
 from hipsta_bids.settings import BodySettings
 from hipsta_bids.types import Bool, End, Float, GivenEnd, LabelVolume, position_text
 
 #: Where slices are thicker than this many pixels, they have a say in the tilt of the planes.
 PLANE_RATIO = 1.8
-#: There, planes are fitted to labels within this many slices of the interface.
+#: Planes of thick slices are fitted to labels within this many slices of the interface.
 PLANE_SLICES = 1.5
-#: Width of the logistic function, slices.
+#: Width of the logistic function by which planes are fitted, slices.
 PLANE_WIDTH = 0.05
 #: Tilts against the slices are expected to be of this size, degrees (standard deviation).
 PLANE_TILT = 10.0
-#: Weight of that expectation; all labels together weigh 1.
+#: Weight of the expected tilt; all labels together weigh 1.
 PLANE_PRIOR = 0.05
 
 _FAR = 10.0
@@ -133,15 +133,17 @@ def find_end_planes(
                 else _plane_along_slices(points[below], points[above], across)
             )
             planes[end] = EndPlane(point, normal, "labels")
-    for given in volume.given_ends:
-        _check_inside(given, points)
-        without = planes[given.end].normal if given.end in planes else axis
-        planes[given.end] = _given_plane(given, without, axis)
+    for user_end in volume.given_ends:
+        _check_inside(user_end, points)
+        without = planes[user_end.end].normal if user_end.end in planes else axis
+        planes[user_end.end] = _given_plane(user_end, without, axis)
     if len(planes) < 2:  # noqa: PLR2004 -- two ends
         across = _body_axis(points[~is_head & ~is_tail], axis, planes)
-        known = {end: _level(plane, points, across) for end, plane in planes.items()}
-        for end, found in find_ends(volume, sheet, across, known, settings).items():
-            plane = EndPlane(found.level * across, across, found.rule, found.uncertainty)
+        known_levels = {end: _level(plane, points, across) for end, plane in planes.items()}
+        for end, automatic in find_ends(volume, sheet, across, known_levels, settings).items():
+            plane = EndPlane(
+                automatic.level * across, across, automatic.rule, automatic.uncertainty
+            )
             planes.setdefault(end, plane)
     return _checked(planes, axis, half_slice)
 
@@ -152,36 +154,36 @@ def _level(plane: EndPlane, points: Float, axis: Float) -> float:
     return float((near.mean(axis=0) if len(near) else plane.point) @ axis)
 
 
-def _check_inside(given: GivenEnd, points: Float) -> None:
+def _check_inside(user_end: GivenEnd, points: Float) -> None:
     """Refuse a plane that a person has placed far from the hippocampus, at points (N, 3)."""
-    distance = float(np.linalg.norm(points - given.point, axis=1).min())
+    distance = float(np.linalg.norm(points - user_end.point, axis=1).min())
     if distance > _FAR:
         raise GeometryError(
-            f"the given {given.end} end at {position_text(np.array(given.point))} lies "
+            f"the given {user_end.end} end at {position_text(np.array(user_end.point))} lies "
             f"{distance:.0f} mm from the labels: give a point in the hippocampus, in scanner "
             "coordinates (RAS, mm)",
             reason="given-end-outside",
         )
 
 
-def _given_plane(given: GivenEnd, without: Float, axis: Float) -> EndPlane:
+def _given_plane(user_end: GivenEnd, without: Float, axis: Float) -> EndPlane:
     """Place a user's plane; its normal is that of the plane without it, if none is given."""
-    if given.normal is None:
-        return EndPlane(np.array(given.point), without, "user")
-    normal = np.array(given.normal) / np.linalg.norm(given.normal)
-    return EndPlane(np.array(given.point), normal if normal @ axis > 0 else -normal, "user")
+    if user_end.normal is None:
+        return EndPlane(np.array(user_end.point), without, "user")
+    normal = np.array(user_end.normal) / np.linalg.norm(user_end.normal)
+    return EndPlane(np.array(user_end.point), normal if normal @ axis > 0 else -normal, "user")
 
 
 def _largest_ends(part: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Keep the largest piece each of head and tail: stray voxels must not move the end planes."""
-    kept = part.copy()
+    cleaned = part.copy()
     for end in (Part.HEAD, Part.TAIL):
         index = positions(part == end)
         if len(index):
             around = box_around(index)
-            pieces, _ = ndimage.label(part[around] == end, structure=ALL)
-            kept[around][(pieces > 0) & (pieces != piece_sizes(pieces).argmax())] = Part.UNKNOWN
-    return kept
+            pieces, _ = ndimage.label(part[around] == end, structure=CUBE)
+            cleaned[around][(pieces > 0) & (pieces != piece_sizes(pieces).argmax())] = Part.UNKNOWN
+    return cleaned
 
 
 def _checked(planes: dict[End, EndPlane], axis: Float, half_slice: float) -> EndPlanes:
@@ -244,13 +246,13 @@ def _long_axis(points: Float, parts: NDArray[np.uint8]) -> Float:
     if not len(head) and not len(tail):
         axis: Float = vectors[:, -1]
         return axis if axis[1] >= 0 else -axis
-    rest = points[(parts != Part.HEAD) & (parts != Part.TAIL)]
-    rest = rest if len(rest) else points
-    below, above = (rest, head) if len(head) else (tail, rest)
+    middle = points[(parts != Part.HEAD) & (parts != Part.TAIL)]
+    middle = middle if len(middle) else points
+    below, above = (middle, head) if len(head) else (tail, middle)
     direction = above.mean(axis=0) - below.mean(axis=0)
     direction = direction / np.linalg.norm(direction)
     along = float(vectors[:, -1] @ direction)
-    if abs(along) < 0.8:  # noqa: PLR2004 -- 37 degrees
+    if abs(along) < 0.8:  # noqa: PLR2004 -- 37°
         return np.asarray(direction)
     return np.asarray(vectors[:, -1] if along > 0 else -vectors[:, -1])
 
@@ -262,9 +264,9 @@ def _body_axis(points: Float, axis: Float, planes: dict[End, EndPlane]) -> Float
     """
     centered = points - points.mean(axis=0)
     spread, vectors = np.linalg.eigh(centered.T @ centered)
-    own: Float = vectors[:, -1] * np.sign(vectors[:, -1] @ axis)
-    if spread[-1] > _ELONGATED**2 * spread[-2] and own @ axis > 0.8:  # noqa: PLR2004 -- 37 degrees
-        return own
+    direction: Float = vectors[:, -1] * np.sign(vectors[:, -1] @ axis)
+    if spread[-1] > _ELONGATED**2 * spread[-2] and direction @ axis > 0.8:  # noqa: PLR2004 -- 37°
+        return direction
     return next((plane.normal for plane in planes.values()), axis)
 
 

@@ -15,16 +15,9 @@ from scipy.spatial import cKDTree
 from skimage.measure import marching_cubes
 
 from hipsta_bids.errors import GeometryError
+from hipsta_bids.geometry import mesh
 from hipsta_bids.geometry.digital import FACES, piece_sizes, to_ras
 from hipsta_bids.geometry.fem import compact_groups, solve_two_level
-from hipsta_bids.geometry.mesh import (
-    close_gaps,
-    edge_graph,
-    signed_volume,
-    smooth_vertices,
-    unique_edges,
-    vertex_areas,
-)
 from hipsta_bids.geometry.wall import vertex_normals
 from hipsta_bids.protocols.protocol import CORE, Tissue
 from hipsta_bids.settings import SurfaceSettings
@@ -32,7 +25,7 @@ from hipsta_bids.types import Bool, Float, Int, LabelVolume, Surface
 
 SMOOTHING, MIN_SMOOTHING = 0.83, 0.25
 """Standard deviation of the Gaussian, in-plane voxels, and its least, mm."""
-RIM_BEND = 0.35
+EDGE_BEND = 0.35
 """Neighbors across a sharper convex bend than this hardly have to be alike, 1/mm."""
 OPPOSITE = 0.6
 """How much it weighs that opposite walls are different faces; that neighbors are alike: 2."""
@@ -91,9 +84,9 @@ def whole_tissue(volume: LabelVolume, body: NDArray[np.uint8]) -> NDArray[np.uin
         raise GeometryError(
             "no voxel of the sheet's subfields: check the protocol", reason="no-sheet-labels"
         )
-    kept = pieces == piece_sizes(pieces).argmax()
-    inside = ndimage.binary_fill_holes(kept)
-    nearest = ndimage.distance_transform_edt(~kept, return_distances=False, return_indices=True)
+    main = pieces == piece_sizes(pieces).argmax()
+    inside = ndimage.binary_fill_holes(main)
+    nearest = ndimage.distance_transform_edt(~main, return_distances=False, return_indices=True)
     return np.where(inside, tissue[tuple(nearest)], 0).astype(np.uint8)
 
 
@@ -117,14 +110,14 @@ def whole_surface(
     grid[:3, :3] = affine[:3, :3] * steps
     grid[:3, 3] = to_ras(-room, affine)
     nodes, faces, _, _ = marching_cubes(field, level=0.0)  # type: ignore[no-untyped-call]
-    faces = close_gaps(faces.astype(np.int32), len(nodes))
-    nodes = smooth_vertices(nodes.astype(np.float64), faces, surface)
+    faces = mesh.close_gaps(faces.astype(np.int32), len(nodes))
+    nodes = mesh.smooth_vertices(nodes.astype(np.float64), faces, surface)
     vertices = to_ras(nodes, grid)
-    if signed_volume(vertices, faces) < 0:
+    if mesh.signed_volume(vertices, faces) < 0:
         faces = faces[:, ::-1]
-    none = np.zeros(len(vertices), dtype=bool)
+    no_caps = np.zeros(len(vertices), dtype=bool)
     return (
-        Surface(vertices=vertices, triangles=faces, posterior_cap=none, anterior_cap=none),
+        Surface(vertices=vertices, triangles=faces, posterior_cap=no_caps, anterior_cap=no_caps),
         field,
         grid,
     )
@@ -139,7 +132,7 @@ def find_faces(
     """Find the interior and the exterior face, and the strip between them."""
     points, triangles = surface.vertices, surface.triangles
     count = len(points)
-    edges = unique_edges(triangles)
+    edges = mesh.unique_edges(triangles)
     normals = vertex_normals(points, triangles)
     across, opposite, touching = _opposite(points, normals, field, grid)
     step, turn = (
@@ -148,11 +141,11 @@ def find_faces(
     )
     lengths = np.linalg.norm(step, axis=1)
     bend = np.maximum((step * turn).sum(axis=1) / lengths**2, 0)  # 1/mm along the edge, convex
-    weight = 2 / (1 + (bend / RIM_BEND) ** 4) + 0.02
-    graph = edge_graph(edges, weight, count)
+    weight = 2 / (1 + (bend / EDGE_BEND) ** 4) + 0.02
+    graph = mesh.edge_graph(edges, weight, count)
     diagonal: Float = np.asarray(graph.sum(axis=1), dtype=np.float64).ravel()
     mated = np.flatnonzero(opposite >= 0)
-    pairs = edge_graph(
+    pairs = mesh.edge_graph(
         np.column_stack([mated, opposite[mated]]).astype(np.int32),
         np.full(len(mated), OPPOSITE),
         count,
@@ -169,7 +162,11 @@ def find_faces(
     reach = STRIP * float(np.nanmedian(across))
     rim = np.unique(edges[crossing])
     near = sparse.csgraph.dijkstra(
-        edge_graph(edges, lengths, count), directed=False, indices=rim, limit=reach, min_only=True
+        mesh.edge_graph(edges, lengths, count),
+        directed=False,
+        indices=rim,
+        limit=reach,
+        min_only=True,
     )
     return Faces(side=side, free=np.isfinite(near), opposite=touching)
 
@@ -190,14 +187,14 @@ def _opposite(
         inside[row] = ndimage.map_coordinates(field, (start + far * way).T, order=1) > 0
     out = inside & ~np.vstack([inside[1:], inside[-1:]])  # the next one is outside
     first = out.argmax(axis=0)
-    found = out.any(axis=0) & (first < len(depth) - 1)
-    across = np.where(found, depth[first] + step / 2, np.nan)
+    is_hit = out.any(axis=0) & (first < len(depth) - 1)
+    across = np.where(is_hit, depth[first] + step / 2, np.nan)
     mate = cKDTree(points).query(points - np.nan_to_num(across)[:, None] * normals)[1]
-    back = across[mate]
+    reverse = across[mate]
     facing = (normals * normals[mate]).sum(axis=1) < -0.5  # noqa: PLR2004 -- 60 degrees
-    mutual = np.abs(back - across) < 0.5 * np.fmin(across, back)
-    mutual &= facing & found
-    near = mutual & (np.fmax(across, back) < REACH - step)
+    mutual = np.abs(reverse - across) < 0.5 * np.fmin(across, reverse)
+    mutual &= facing & is_hit
+    near = mutual & (np.fmax(across, reverse) < REACH - step)
     return np.where(near, across, np.nan), np.where(near, mate, -1), np.where(mutual, mate, -1)
 
 
@@ -217,10 +214,10 @@ def _label_evidence(
 
 def _without_islands(side: Float, edges: Int, points: Float, triangles: Int) -> Float:
     """Give islands of one face in the other, up to an area, to what is round them."""
-    share = vertex_areas(points, triangles)
+    share = mesh.vertex_areas(points, triangles)
     for _ in range(2):
-        same = (side[edges[:, 0]] > 0) == (side[edges[:, 1]] > 0)
-        graph = edge_graph(edges[same], np.ones(int(same.sum())), len(side))
+        uncut = (side[edges[:, 0]] > 0) == (side[edges[:, 1]] > 0)
+        graph = mesh.edge_graph(edges[uncut], np.ones(int(uncut.sum())), len(side))
         piece = sparse.csgraph.connected_components(graph, directed=False)[1]
         small = np.bincount(piece, share)[piece] < ISLAND
         side = np.where(small, -side, side)

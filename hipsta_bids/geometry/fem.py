@@ -18,7 +18,7 @@ from hipsta_bids import types
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.types import Bool, Float, Int
 
-_MANY = 4000  # vertices of a volume from which on iterating is faster than factorizing
+_ITERATED_SIZE = 4000  # vertices of a volume from which on iterating is faster than factorizing
 _RESIDUAL = 1e-9  # of the right-hand side; it leaves errors of 1e-7 mm in the sheet
 DIRECTION_RESIDUAL = 1e-6  # for directions, which are averaged over many tetrahedra
 _MAX_STEPS = 1000  # bodies take 100 to 150
@@ -64,8 +64,8 @@ class Laplace:
     def edges(self) -> Int:
         """(E, 2), lower vertex first, in order."""
         first = np.arange(len(self.points), dtype=np.int32).repeat(np.diff(self.stiffness.indptr))
-        once = self.stiffness.indices > first
-        return np.column_stack([first[once], self.stiffness.indices[once]])
+        upper = self.stiffness.indices > first
+        return np.column_stack([first[upper], self.stiffness.indices[upper]])
 
     def solve(
         self, fixed: NDArray[np.integer], values: Float, residual: float = _RESIDUAL
@@ -78,8 +78,8 @@ class Laplace:
         result[fixed], free[fixed] = values, False
         with _solvable():
             if self._solver == "lapy":
-                known = np.flatnonzero(~free)
-                result = self._fem.poisson(0.0, (known, result[known]))
+                fixed_vertices = np.flatnonzero(~free)
+                result = self._fem.poisson(0.0, (fixed_vertices, result[fixed_vertices]))
             else:
                 result += self._rest(-(self.stiffness @ result), free, residual)
         if not np.isfinite(result).all():
@@ -129,7 +129,7 @@ class Laplace:
     def _rest(self, right: Float, free: Bool, residual: float) -> Float:
         """Solve for the free vertices; zero at the others."""
         volume = self.cells.shape[1] == 4  # noqa: PLR2004 -- corners of a tetrahedron
-        if volume and len(free) > _MANY and free.mean() > 0.5:  # noqa: PLR2004 -- most
+        if volume and len(free) > _ITERATED_SIZE and free.mean() > 0.5:  # noqa: PLR2004 -- most
             return solve_two_level(self.stiffness, right, free, self._groups, residual)
         result = np.zeros(len(free))
         result[free] = _factor(self.stiffness[free][:, free].tocsc()).solve(right[free])
@@ -247,9 +247,9 @@ def solve_two_level(
     )
     coarse = _coarse_inverse(matrix, free, groups)
 
-    def both_levels(rest: Float) -> Float:
-        sums = coarse @ np.bincount(groups, root * rest, len(coarse))
-        return np.asarray(rest + root * sums[groups])
+    def both_levels(residual: Float) -> Float:
+        sums = coarse @ np.bincount(groups, root * residual, len(coarse))
+        return np.asarray(residual + root * sums[groups])
 
     levels = linalg.LinearOperator(matrix.shape, matvec=both_levels, dtype=np.float64)
     result, unfinished = linalg.cg(

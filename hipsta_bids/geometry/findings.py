@@ -15,7 +15,7 @@ from hipsta_bids.types import Bool, Finding, Flag, Float, Sheet
 #: A flag concerns the columns within this distance of what was found, mm.
 FLAG_REACH = 1.0
 
-_SAME = 0.005
+_NEGLIGIBLE = 0.005
 """mm; means that differ by less read the same."""
 
 
@@ -37,21 +37,24 @@ def raise_flags(
     ``place`` writes the place of (N, 3) points, RAS mm.
     """
     flags = []
-    for found in findings:
-        if found.raised:
-            known = add_consequence(found, sheet)
-            where = (
-                f", near {place(found.points)}" if len(found.points) and not found.placed else ""
+    for finding in findings:
+        if finding.raised:
+            consequence = add_consequence(finding, sheet)
+            location = (
+                f", near {place(finding.points)}"
+                if len(finding.points) and not finding.placed
+                else ""
             )
             flags.append(
                 Flag(
-                    reason=found.reason,
-                    message=f"{found.what}{where}: {found.remedy}{consequence_text(known)}",
-                    value=float(found.value),
-                    limit=float(found.limit),
-                    points=found.points,
-                    share=known.share,
-                    change=known.change,
+                    reason=finding.reason,
+                    message=f"{finding.what}{location}: {finding.remedy}"
+                    + consequence_text(consequence),
+                    value=float(finding.value),
+                    limit=float(finding.limit),
+                    points=finding.points,
+                    share=consequence.share,
+                    change=consequence.change,
                 )
             )
     return flags
@@ -67,26 +70,26 @@ def add_consequence(finding: Finding, sheet: Sheet) -> Finding:
         return finding
     near = columns_near(sheet, finding.points, FLAG_REACH)
     thickness, area = measure_thickness(sheet), column_area(sheet)
-    known = np.isfinite(thickness) & np.isfinite(area)
+    valid = np.isfinite(thickness) & np.isfinite(area)
     change = float("nan")
-    if (known & ~near).any():
-        step = np.where(near, thickness - spread_over(thickness, near | ~known), 0.0)[known]
-        change = float((step * area[known]).sum() / area[known].sum())
+    if (valid & ~near).any():
+        step = np.where(near, thickness - spread_over(thickness, near | ~valid), 0.0)[valid]
+        change = float((step * area[valid]).sum() / area[valid].sum())
     return replace(finding, share=float(near.mean()), change=change)
 
 
 def columns_near(sheet: Sheet, points: Float, reach: float) -> Bool:
     """Columns (Nx, Ny) of which any point lies within ``reach`` mm of points (N, 3)."""
-    known = np.isfinite(sheet.points).all(axis=-1)
-    near = np.zeros(known.shape, dtype=bool)
-    gap = cKDTree(points).query(sheet.points[known], distance_upper_bound=reach)[0]
-    near[known] = np.isfinite(gap)
+    valid = np.isfinite(sheet.points).all(axis=-1)
+    near = np.zeros(valid.shape, dtype=bool)
+    gap = cKDTree(points).query(sheet.points[valid], distance_upper_bound=reach)[0]
+    near[valid] = np.isfinite(gap)
     return np.asarray(near.any(axis=2))
 
 
-def spread_over(values: Float, where: Bool) -> Float:
+def spread_over(values: Float, mask: Bool) -> Float:
     """Replace values (Nx, Ny) by the smoothest continuation of the others, a harmonic function."""
-    inner, outer = np.flatnonzero(where), np.flatnonzero(~where)
+    inner, outer = np.flatnonzero(mask), np.flatnonzero(~mask)
     result = values.ravel().copy()
     if len(inner) and len(outer):
         rows = _grid_laplace(values.shape)[inner]
@@ -105,18 +108,18 @@ def _grid_laplace(shape: tuple[int, int]) -> sparse.csr_array:
     return sparse.csr_array(sparse.diags_array(weights.sum(axis=1)) - weights)
 
 
-def consequence_text(found: Finding) -> str:
+def consequence_text(finding: Finding) -> str:
     """Write what a finding means for the map, to follow its message; empty if that is unknown."""
-    if np.isnan(found.share):
+    if np.isnan(finding.share):
         return ""
-    if found.share == 0:
+    if finding.share == 0:
         return "; no measured column lies near"
-    which = "all columns" if found.share == 1 else f"{found.share:.1%} of the columns"
-    if np.isnan(found.change):
-        return f"; it concerns {which}"
-    less = "the same" if abs(found.change) < _SAME else f"{abs(found.change):.2f} mm "
-    if abs(found.change) >= _SAME:
-        less += "less" if found.change > 0 else "more"
-    if found.share == 1:
-        return f"; it concerns all columns, the mean thickness may be {less}"
-    return f"; it concerns {which}: were they as those around them, the mean would be {less}"
+    extent = "all columns" if finding.share == 1 else f"{finding.share:.1%} of the columns"
+    if np.isnan(finding.change):
+        return f"; it concerns {extent}"
+    change = "the same" if abs(finding.change) < _NEGLIGIBLE else f"{abs(finding.change):.2f} mm "
+    if abs(finding.change) >= _NEGLIGIBLE:
+        change += "less" if finding.change > 0 else "more"
+    if finding.share == 1:
+        return f"; it concerns all columns, the mean thickness may be {change}"
+    return f"; it concerns {extent}: were they as those around them, the mean would be {change}"

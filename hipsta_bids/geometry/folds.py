@@ -34,7 +34,7 @@ class TouchingBanks:
     """(N, 3) midway between the two banks, RAS mm."""
     area: float
     """Of one bank, mm2."""
-    lost: str
+    side: str
     """The side on which the cleft is lost: ``interior`` or ``exterior``."""
 
 
@@ -52,16 +52,16 @@ def find_touching_banks(surface: Surface, faces: Faces) -> list[TouchingBanks]:
     )
     count, place = sparse.csgraph.connected_components(links, directed=False)
     area = vertex_areas(surface.vertices, surface.triangles)[first] / 2  # both banks are counted
-    found = [
+    banks = [
         TouchingBanks(
             points=middle[place == number],
             area=float(area[place == number].sum()),
             # The cleft of the other face is lost: both walls that are left are of one face.
-            lost="exterior" if side[first[place == number]].sum() > 0 else "interior",
+            side="exterior" if side[first[place == number]].sum() > 0 else "interior",
         )
         for number in range(count)
     ]
-    return sorted(found, key=lambda banks: -banks.area)
+    return sorted(banks, key=lambda bank: -bank.area)
 
 
 def find_ridges(sheet: Sheet, among: Bool) -> list[tuple[Bool, float]]:
@@ -70,10 +70,10 @@ def find_ridges(sheet: Sheet, among: Bool) -> list[tuple[Bool, float]]:
     Only columns ``among`` (Nx, Ny) belong to them; all that have a value are what is round them.
     """
     thickness, middle = measure_thickness(sheet), sheet.points[:, :, sheet.middle][sheet.valid]
-    known = thickness[sheet.valid]
+    values = thickness[sheet.valid]
     near = cKDTree(middle).query_ball_point(middle, AROUND)
     ratio = np.zeros(thickness.shape)
-    ratio[sheet.valid] = known / [np.median(known[own]) for own in near]
+    ratio[sheet.valid] = values / [np.median(values[own]) for own in near]
     places, count = ndimage.label(among & (ratio > SLOPE))
     if not count:
         return []

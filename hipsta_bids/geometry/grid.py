@@ -173,9 +173,9 @@ def _nodes_in(voxels: Index, body: Body, points: Float, shape: tuple[int, int, i
     """Which nodes, at points (N, 3), lie in some voxels (M, 3) of the body; None without any."""
     if not len(voxels):
         return None
-    chosen = np.zeros(body.inside.shape, dtype=np.uint8)
-    chosen[tuple(voxels.T)] = 1
-    hit = ndimage.map_coordinates(chosen, body.to_voxels(points).T, order=0) > 0
+    selection = np.zeros(body.inside.shape, dtype=np.uint8)
+    selection[tuple(voxels.T)] = 1
+    hit = ndimage.map_coordinates(selection, body.to_voxels(points).T, order=0) > 0
     return np.asarray(hit.reshape(shape))
 
 
@@ -224,8 +224,8 @@ def _smooth(values: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:
         mode=("constant", "constant", "nearest"),
         truncate=3.0,
     )
-    once = smooth(values)
-    return np.asarray(2 * once - smooth(once))
+    smoothed = smooth(values)
+    return np.asarray(2 * smoothed - smooth(smoothed))
 
 
 def in_plane_voxel(affine: Float) -> float:
@@ -277,13 +277,13 @@ def _fit_grid(body: Body, hemi: str, settings: GridSettings) -> WedgeGrid:
     flat = (points - anchor) - np.outer((points - anchor) @ axis, axis)
     across = _directions_across(body, hemi, flat)
     reach = flat @ across.T
-    aside = [settings.beyond * (way @ across.T) / abs(way @ axis) for way in body.outward.values()]
+    shifts = [settings.beyond * (way @ across.T) / abs(way @ axis) for way in body.outward.values()]
     margin = GRID_MARGIN + float(np.linalg.norm(body.affine[:3, :3], axis=0).min())
     first = np.floor(
-        (reach.min(axis=0) + np.min(aside, axis=0).clip(max=0) - margin) / settings.spacing
+        (reach.min(axis=0) + np.min(shifts, axis=0).clip(max=0) - margin) / settings.spacing
     )
     last = np.ceil(
-        (reach.max(axis=0) + np.max(aside, axis=0).clip(min=0) + margin) / settings.spacing
+        (reach.max(axis=0) + np.max(shifts, axis=0).clip(min=0) + margin) / settings.spacing
     )
     size = (last - first).astype(int) + 1
     origin = anchor + settings.spacing * first @ across

@@ -60,18 +60,18 @@ class Lines:
         steps = np.linalg.norm(np.diff(path, axis=1), axis=2)
         along = np.concatenate([np.zeros((len(path), 1)), steps.cumsum(axis=1)], axis=1)
         share = np.linspace(0, 1, count)
-        found = np.empty((len(path), count, 3))
+        samples = np.empty((len(path), count, 3))
         for row, (corners, length) in enumerate(zip(path, along, strict=True)):
             for axis in range(3):
-                found[row, :, axis] = np.interp(share * length[-1], length, corners[:, axis])
-        return found, first & second
+                samples[row, :, axis] = np.interp(share * length[-1], length, corners[:, axis])
+        return samples, first & second
 
     def _weights(self, cell: NDArray[np.intp], points: Float) -> Float:
         """Barycentric coordinates (N, 4) of points (N, 3) in their cells."""
         first = self.points[self.cells[cell, 0]]
-        found: Float = np.einsum("nij,nj->ni", self.gradients[cell], points - first)
-        found[:, 0] += 1
-        return found
+        weights: Float = np.einsum("nij,nj->ni", self.gradients[cell], points - first)
+        weights[:, 0] += 1
+        return weights
 
     def _follow(
         self, cell: NDArray[np.intp], points: Float, sign: float, limit: float
@@ -83,14 +83,14 @@ class Lines:
         """
         at, cell = points.copy(), cell.copy()
         path = [at.copy()]
-        going = np.arange(len(at))
+        active = np.arange(len(at))
         arrived = np.zeros(len(at), dtype=bool)
         length = np.zeros(len(at))
         for _ in range(_STEPS):
-            if not len(going):
+            if not len(active):
                 break
-            here, inside = at[going], cell[going]
-            weight = np.clip(self._weights(inside, here), 0, 1)
+            position, inside = at[active], cell[active]
+            weight = np.clip(self._weights(inside, position), 0, 1)
             way = sign * np.einsum("ni,nij->nj", weight, self.directions[self.cells[inside]])
             size = np.linalg.norm(way, axis=1)
             way /= np.maximum(size, 1e-12)[:, None]
@@ -98,13 +98,13 @@ class Lines:
             with np.errstate(divide="ignore", invalid="ignore"):
                 far = np.where(rate < -_LEVEL, weight / -rate, np.inf)
             exit_ = far.argmin(axis=1)
-            step = far[np.arange(len(going)), exit_]
+            step = far[np.arange(len(active)), exit_]
             step = np.where(np.isfinite(step), step, 0.0)
-            at[going] = here + step[:, None] * way
-            length[going] += step
+            at[active] = position + step[:, None] * way
+            length[active] += step
             beyond = self.neighbor[inside, exit_]
-            arrived[going[beyond < 0]] = True
-            cell[going] = np.where(beyond < 0, inside, beyond)
+            arrived[active[beyond < 0]] = True
+            cell[active] = np.where(beyond < 0, inside, beyond)
             path.append(at.copy())
-            going = going[(beyond >= 0) & (length[going] < limit) & (size > 0)]
+            active = active[(beyond >= 0) & (length[active] < limit) & (size > 0)]
         return np.stack(path, axis=1), arrived

@@ -16,7 +16,7 @@ from hipsta_bids.types import Bool, Float, Sheet, TetMesh
 #: Beyond this x, and its negative, the lengths and areas of both walls follow those of the mid-
 #: surface: where a rounded edge ends a wall is arbitrary.
 ROUNDED_EDGE_START = 0.8
-#: Extent in x, before that, over which the ratio of wall and mid-surface is taken.
+#: Extent in x, before rounded edges, over which the ratio of wall and mid-surface is taken.
 ROUNDED_EDGE_WINDOW = 0.2
 
 #: Points per cell along x and y, about a tenth of a millimeter apart along x on the default grid.
@@ -120,9 +120,9 @@ def column_area(sheet: Sheet) -> Float:
 def away_from_edges(shape: tuple[int, ...], settings: MeasureSettings) -> Bool:
     """Nodes (Nx, Ny) on both sides of which local polynomials are fitted, or else the middle."""
     margin = settings.curvature_window // 2
-    away = np.zeros(shape, dtype=np.bool_)
-    away[tuple(slice(m, n - m) for n in shape for m in (min(margin, (n - 1) // 2),))] = True
-    return away
+    inner = np.zeros(shape, dtype=np.bool_)
+    inner[tuple(slice(m, n - m) for n in shape for m in (min(margin, (n - 1) // 2),))] = True
+    return inner
 
 
 def node_shares(cells: Float) -> Float:

@@ -13,9 +13,9 @@ from hipsta_bids.geometry.tetgen_worker import TetgenClient
 from hipsta_bids.settings import SurfaceSettings, TetraSettings
 from hipsta_bids.types import Bool, Float, Int, Surface, TetMesh, position_text
 
-#: Step towards the mean of the neighbors, fraction.
+#: Taubin smoothing: step towards the mean of the neighbors, fraction.
 TAUBIN_SHRINK = 0.5
-#: Step back, fraction.
+#: Taubin smoothing: step back, fraction.
 TAUBIN_INFLATE = -0.53
 #: How often a surface that TetGen cannot fill is smoothed more.
 UNTANGLE_TRIES = 2
@@ -130,14 +130,14 @@ def _check_sphere(count: int, faces: Int, edges: Int) -> None:
 
 def smooth_vertices(nodes: Float, faces: Int, settings: SurfaceSettings) -> Float:
     """Smooth a closed surface without caps (Taubin 1995)."""
-    none = np.zeros(len(nodes), dtype=bool)
-    return _taubin(nodes, faces, unique_edges(faces), (none, none), settings)
+    no_caps = np.zeros(len(nodes), dtype=bool)
+    return _taubin(nodes, faces, unique_edges(faces), (no_caps, no_caps), settings)
 
 
 def edge_graph(edges: Int, weights: Float, count: int) -> sparse.csr_array:
     """Make a symmetric graph of edges (E, 2) with weights (E,)."""
-    both = np.vstack([edges, edges[:, ::-1]])
-    return sparse.csr_array((np.tile(weights, 2), (both[:, 0], both[:, 1])), shape=(count, count))
+    ways = np.vstack([edges, edges[:, ::-1]])
+    return sparse.csr_array((np.tile(weights, 2), (ways[:, 0], ways[:, 1])), shape=(count, count))
 
 
 def _adjacency(edges: Int, count: int) -> sparse.csr_array:
@@ -174,27 +174,27 @@ def _outline_edges(cap_faces: Int, count: int) -> Int:
     """Edges that belong to one cap triangle only."""
     pairs = np.sort(np.vstack([cap_faces[:, [0, 1]], cap_faces[:, [1, 2]], cap_faces[:, [2, 0]]]))
     code, times = np.unique(pairs[:, 0].astype(np.int64) * count + pairs[:, 1], return_counts=True)
-    once = code[times == 1]
-    return np.column_stack([once // count, once % count]).astype(np.int32)
+    single = code[times == 1]
+    return np.column_stack([single // count, single % count]).astype(np.int32)
 
 
 def fill_surface(
     surface: Surface,
-    again: Callable[[SurfaceSettings], Surface],
+    extract: Callable[[SurfaceSettings], Surface],
     settings: SurfaceSettings,
     tetra: TetraSettings,
     frame: Float | None = None,
 ) -> tuple[Surface, TetMesh, int]:
     """Fill a surface with tetrahedra; smooth it more while TetGen cannot, and count how often.
 
-    ``again`` makes the surface with other settings.
+    ``extract`` makes the surface with other settings.
     """
     for extra in range(UNTANGLE_TRIES):
         try:
             return surface, tetrahedralize(surface, tetra, frame), extra
         except GeometryError:
             steps = settings.taubin_iterations * (2 + extra)
-            surface = again(settings.changed(taubin_iterations=steps))
+            surface = extract(settings.changed(taubin_iterations=steps))
     return surface, tetrahedralize(surface, tetra, frame), UNTANGLE_TRIES
 
 

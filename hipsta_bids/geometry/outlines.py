@@ -28,7 +28,7 @@ MAX_FRAGMENTS = 8
 MAX_RANK_JUMP = 2
 #: Half width of a bridge between fragments, mm.
 BRIDGE_HALF_WIDTH = 0.45
-#: The same where a slice beside shows the ribbon, for pieces with a subfield of their own.
+#: Longest bridge where a slice beside shows the ribbon, to pieces with a subfield of their own, mm.
 MAX_BREAK = 3.0
 #: Fragments farther away are dropped if they are smaller than this, mm2.
 CRUMB_AREA = 1.5
@@ -41,7 +41,7 @@ RING_BESIDE = 2.0
 Stack = NDArray[np.float32]
 """Images, on fine pixels or on those of the segmentation."""
 
-_SHOWN = 0.2
+_VISIBLE_SHARE = 0.2
 """Share of the way across a gap that a slice beside shows as ribbon, where it is broken."""
 
 
@@ -120,7 +120,7 @@ def _join(
         jump = np.abs(ranks - ranks[tuple(nearest)]) > MAX_RANK_JUMP
         cost = pixel * gap + np.where(jump, DISTANCE_REACH, 0)
         lacked = _with_others(pieces, main, ranks)
-        found: list[tuple[float, int, Float | None]] = []
+        bridges: list[tuple[float, int, Float | None]] = []
         for number in range(1, count + 1):
             if number == largest:
                 continue
@@ -128,16 +128,16 @@ def _join(
             start = np.array([axis[place] for axis in nearest])
             way = pixel * _segment_distance(distance.shape, start, np.array(place))
             broken = number in lacked and not jump[place]
-            shown = (np.kron(image > 0, block)[way < pixel].mean() for image in beside)
-            broken = broken and any(share > _SHOWN for share in shown)
+            shares = (np.kron(image > 0, block)[way < pixel].mean() for image in beside)
+            broken = broken and any(share > _VISIBLE_SHARE for share in shares)
             limit = MAX_BREAK if broken else settings.max_gap
             if cost[place] <= limit:
-                found.append((float(cost[place]), number, way))
+                bridges.append((float(cost[place]), number, way))
             elif sizes[number] < CRUMB_AREA:
-                found.append((float(cost[place]), number, None))
-        if not found:
+                bridges.append((float(cost[place]), number, None))
+        if not bridges:
             break
-        _, number, bridge = min(found, key=lambda item: item[0])
+        _, number, bridge = min(bridges, key=lambda item: item[0])
         if bridge is None:
             distance = np.where(pieces == number, -0.5 * pixel, distance)
         else:
@@ -202,14 +202,14 @@ def _way_out(outline: Stack, beside: Stack) -> Bool | None:
         steps.append((first.ravel(), second.ravel(), length.ravel()))
     first, second, length = (np.concatenate(part) for part in zip(*steps, strict=True))
     graph = sparse.csr_array((length, (first, second)), shape=(cost.size,) * 2)
-    away, before, _ = csgraph.dijkstra(
+    distance, before, _ = csgraph.dijkstra(
         graph,
         directed=False,
         indices=nodes[hole],
         return_predecessors=True,
         min_only=True,
     )
-    at = int(nodes[outside][np.argmin(away[nodes[outside]])])
+    at = int(nodes[outside][np.argmin(distance[nodes[outside]])])
     path = np.zeros(cost.size, dtype=bool)
     while at >= 0:
         path[at] = True
@@ -226,8 +226,8 @@ def drop_doubles(outline: Stack, rank: Float) -> None:
     if count < 2:  # noqa: PLR2004 -- one piece is the ribbon
         return
     main = pieces == piece_sizes(pieces).argmax()
-    kept = np.isin(pieces, _with_others(pieces, main, rank)) | main
-    outline[(pieces > 0) & ~kept] = -DISTANCE_REACH
+    retained = np.isin(pieces, _with_others(pieces, main, rank)) | main
+    outline[(pieces > 0) & ~retained] = -DISTANCE_REACH
 
 
 def ranks_of(tissue: NDArray[np.uint8], upsampling: int) -> Float:
@@ -238,6 +238,6 @@ def ranks_of(tissue: NDArray[np.uint8], upsampling: int) -> Float:
 
 def keep_apart(medial: Stack, lateral: Stack) -> Stack:
     """Distance from a slit midway between the two ends of the ribbon, where both are near, mm."""
-    apart = 0.5 * np.abs(medial - lateral) - SLIT_HALF_WIDTH
+    separated = 0.5 * np.abs(medial - lateral) - SLIT_HALF_WIDTH
     far = -np.minimum(medial, lateral) - TOUCH_DISTANCE
-    return np.asarray(np.maximum(apart, far))
+    return np.asarray(np.maximum(separated, far))

@@ -99,10 +99,10 @@ def _triangles(field: Float, pixel: float) -> _Mesh | None:
     inside = ndimage.map_coordinates(field, points[cells].mean(axis=1).T, order=1) > 0
     cells = np.where((area > 0)[:, None], cells, cells[:, ::-1])
     cells = cells[inside & (np.abs(area) > 1e-6)]  # noqa: PLR2004 -- slivers on straight borders
-    used = np.zeros(len(points), dtype=bool)
-    used[cells] = True
-    number = np.cumsum(used) - 1
-    return _Mesh(points[used], number[cells], int(used[:count].sum()))
+    is_used = np.zeros(len(points), dtype=bool)
+    is_used[cells] = True
+    number = np.cumsum(is_used) - 1
+    return _Mesh(points[is_used], number[cells], int(is_used[:count].sum()))
 
 
 def _nodes(mesh: _Mesh, lateral: Float) -> Float:
@@ -132,18 +132,18 @@ def _nodes(mesh: _Mesh, lateral: Float) -> Float:
     scale = 0.5 * np.array([abs(area) / thickness, thickness])
     places = np.column_stack([laplace.between(medial, lateral_end), laplace.between(first, second)])
     rows, columns = np.meshgrid(np.linspace(-1, 1, RIBBON_NODES), _ACROSS, indexing="ij")
-    wanted = _WITHIN * np.stack([rows, columns], axis=-1)
-    return np.asarray(LinearNDInterpolator(places * scale, mesh.points)(wanted * scale))
+    targets = _WITHIN * np.stack([rows, columns], axis=-1)
+    return np.asarray(LinearNDInterpolator(places * scale, mesh.points)(targets * scale))
 
 
 def _rises(values: Float, points: Float, lateral: Float) -> float:
     """Covariance of values (V,) at points (V, 2), pixels, with how lateral these are."""
     index = np.clip(np.rint(points).astype(int), 0, np.array(lateral.shape) - 1)
     ranks = lateral[tuple(index.T)]
-    known = np.isfinite(ranks)
-    if not known.any():
+    finite = np.isfinite(ranks)
+    if not finite.any():
         return 0.0
-    return float(((ranks[known] - ranks[known].mean()) * values[known]).sum())
+    return float(((ranks[finite] - ranks[finite].mean()) * values[finite]).sum())
 
 
 def _numbers(start: int, stop: int, count: int) -> Int:
@@ -174,11 +174,11 @@ def align_nodes(ribbons: list[Float | None], pixel: float) -> list[Float | None]
             if nodes is None:
                 inside = None
                 continue
-            where = np.linspace(0, 1, len(nodes))
+            shares = np.linspace(0, 1, len(nodes))
             if inside is not None:
                 lines = pixel * _middle(inside), pixel * _middle(nodes)
-                where = match_lines(*lines, MATCH_STRETCH)
-            aligned[number] = inside = _nodes_at(nodes, where)
+                shares = match_lines(*lines, MATCH_STRETCH)
+            aligned[number] = inside = _nodes_at(nodes, shares)
     return aligned
 
 
@@ -197,38 +197,38 @@ def match_lines(first: Float, second: Float, stretching: float) -> Float:
     steps = np.maximum(np.diff(_along(first)), 1e-3 * along[-1] / count)
     stretch = stretching * (at[1] * moves / steps[:, None]) ** 2
     total = np.where(np.arange(count) == 0, cost[0], np.inf)
-    chosen = np.zeros((len(first), count), dtype=np.intp)
+    choices = np.zeros((len(first), count), dtype=np.intp)
     before = np.full(len(moves) - 1 + count, np.inf)
     moved = sliding_window_view(before, count)[::-1]  # by each of the moves
     for number in range(1, len(first)):
         before[-count:] = total
         ways = moved + stretch[number - 1][:, None]
-        chosen[number] = ways.argmin(axis=0)
+        choices[number] = ways.argmin(axis=0)
         total = ways.min(axis=0) + cost[number]
     place = count - 1
-    where = np.zeros(len(first))
+    shares = np.zeros(len(first))
     for number in range(len(first) - 1, -1, -1):
-        where[number] = place / (count - 1)
-        place -= chosen[number, place]
-    return where
+        shares[number] = place / (count - 1)
+        place -= choices[number, place]
+    return shares
 
 
-def _nodes_at(nodes: Float, where: Float) -> Float:
+def _nodes_at(nodes: Float, shares: Float) -> Float:
     """Nodes (M, Z, 2) at shares (M,) of the length of the mid-line."""
     along = _along(_middle(nodes))
-    row = np.interp(where * along[-1], along, np.arange(len(nodes)))
+    row = np.interp(shares * along[-1], along, np.arange(len(nodes)))
     below = np.clip(row.astype(int), 0, len(nodes) - 2)
     share = (row - below)[:, None, None]
     return np.asarray((1 - share) * nodes[below] + share * nodes[below + 1])
 
 
-def moves_between(first: Float, second: Float, where: Float) -> Float:
+def moves_between(first: Float, second: Float, points: Float) -> Float:
     """Displacement (N, 2) from one slice to the next at pixels (N, 2) halfway between both.
 
     Pixels move with the nodes (X, Z, 2) near to them.
     """
     first, second = first.reshape(-1, 2), second.reshape(-1, 2)
-    gap, nearest = cKDTree(0.5 * (first + second)).query(where, k=_NEIGHBORS)
+    gap, nearest = cKDTree(0.5 * (first + second)).query(points, k=_NEIGHBORS)
     weight = 1 / (np.asarray(gap) ** 2 + 0.25)  # within half a pixel all nodes count about the same
     weight /= np.sum(weight, axis=1, keepdims=True)
     return np.asarray(np.einsum("nk,nkd->nd", weight, (second - first)[nearest]))
@@ -250,8 +250,8 @@ def keep_whole(outline: Float, nodes: Float, pixel: float) -> None:
     line = np.stack([np.interp(at, along, middle[:, k]) for k in (0, 1)], axis=1)
     gap = np.asarray(cKDTree(line).query(index + low, distance_upper_bound=reach)[0])
     near = np.isfinite(gap)
-    chosen = tuple(index[near].T)
-    part[chosen] = np.maximum(part[chosen], LEAST_HALF_THICKNESS - pixel * gap[near])
+    pixels = tuple(index[near].T)
+    part[pixels] = np.maximum(part[pixels], LEAST_HALF_THICKNESS - pixel * gap[near])
 
 
 def part_turns(outline: Float, nodes: Float, pixel: float) -> None:

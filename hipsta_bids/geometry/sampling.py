@@ -64,13 +64,13 @@ def sample_on_sheet(
     values[~inside] = np.nan
     # Columns without a position are missing, but do not suggest a wrong field of view.
     defined = np.isfinite(points.reshape(-1, 3)).all(axis=1)
-    known = ~np.isnan(values[inside])
+    finite = ~np.isnan(values[inside])
     columns = values.reshape(*points.shape[:3], -1)
     merge = _mean if interpolation == "linear" else _most_frequent
     return SampledMap(
         values=merge(columns, settings.min_known),
         outside=float((~inside)[defined].mean()) if defined.any() else 0.0,
-        unknown=float(1 - known.mean()) if known.size else 0.0,
+        unknown=float(1 - finite.mean()) if finite.size else 0.0,
     )
 
 
@@ -94,18 +94,18 @@ def _linear(values: Float, index: Float, min_known: float) -> Float:
     total = np.zeros((len(index), values.shape[3]))
     weight = np.zeros_like(total)
     for corner in np.ndindex(2, 2, 2):
-        here = np.minimum(low + corner, last)
+        voxel = np.minimum(low + corner, last)
         part = np.prod(np.where(corner, share, 1 - share), axis=1)[:, None]
-        found = values[tuple(here.T)]
-        known = np.isfinite(found)
-        total += part * np.where(known, found, 0.0)
-        weight += part * known
+        sample = values[tuple(voxel.T)]
+        finite = np.isfinite(sample)
+        total += part * np.where(finite, sample, 0.0)
+        weight += part * finite
     return _quotient(total, weight, min_known)
 
 
 def _nearest(values: Float, index: Float, _: float) -> Float:
-    found = values[tuple(np.rint(index).astype(np.intp).T)]
-    return np.asarray(np.where(np.isfinite(found), found, np.nan))
+    sample = values[tuple(np.rint(index).astype(np.intp).T)]
+    return np.asarray(np.where(np.isfinite(sample), sample, np.nan))
 
 
 def _depth_weights(count: int) -> Float:
@@ -116,10 +116,10 @@ def _depth_weights(count: int) -> Float:
 
 
 def _mean(columns: Float, min_known: float) -> Float:
-    known = np.isfinite(columns)
+    finite = np.isfinite(columns)
     weights = _depth_weights(columns.shape[2])
-    total = (weights * np.where(known, columns, 0.0)).sum(axis=2)
-    return _quotient(total, (weights * known).sum(axis=2), min_known)
+    total = (weights * np.where(finite, columns, 0.0)).sum(axis=2)
+    return _quotient(total, (weights * finite).sum(axis=2), min_known)
 
 
 def _most_frequent(columns: Float, min_known: float) -> Float:
@@ -127,17 +127,17 @@ def _most_frequent(columns: Float, min_known: float) -> Float:
     count = columns.shape[2]
     order = np.argsort(np.abs(np.arange(count) - count // 2), kind="stable")
     columns, weights = columns[:, :, order], _depth_weights(count)[:, :, order]
-    same = columns[:, :, :, None] == columns[:, :, None]
-    votes = (same * weights[:, :, None]).sum(axis=3)
+    equal = columns[:, :, :, None] == columns[:, :, None]
+    votes = (equal * weights[:, :, None]).sum(axis=3)
     best = np.take_along_axis(columns, votes.argmax(axis=2)[:, :, None], axis=2)[:, :, 0]
-    known = (np.isfinite(columns) * weights).sum(axis=2)
-    return np.where(known >= min_known, best, np.nan)
+    known_weight = (np.isfinite(columns) * weights).sum(axis=2)
+    return np.where(known_weight >= min_known, best, np.nan)
 
 
 def _quotient(total: Float, weight: Float, least: float) -> Float:
     """Divide where the weight suffices; NaN elsewhere."""
-    enough = (weight >= least) & (weight > 0)
-    return np.where(enough, total / np.where(enough, weight, 1.0), np.nan)
+    sufficient = (weight >= least) & (weight > 0)
+    return np.where(sufficient, total / np.where(sufficient, weight, 1.0), np.nan)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -186,18 +186,18 @@ def summarize_regions(
 
 def _moments(member: Bool, values: Float) -> tuple[Float, Float]:
     """Mean and standard deviation (R,) of a map over its known members."""
-    known = np.where(member & np.isfinite(values), values, np.nan)
+    masked = np.where(member & np.isfinite(values), values, np.nan)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # of regions without two known points
-        mean, sd = np.nanmean(known, axis=(1, 2)), np.nanstd(known, axis=(1, 2), ddof=1)
+        mean, sd = np.nanmean(masked, axis=(1, 2)), np.nanstd(masked, axis=(1, 2), ddof=1)
     return np.asarray(mean), np.asarray(sd)
 
 
 def _mode(member: Bool, values: Float) -> Float:
     """Most frequent label (R,)."""
-    known = np.isfinite(values)
-    kinds, code = np.unique(values[known], return_inverse=True)
+    finite = np.isfinite(values)
+    kinds, code = np.unique(values[finite], return_inverse=True)
     if not len(kinds):
         return np.full(len(member), np.nan)
-    votes = (member[:, known][:, :, None] & (code[:, None] == np.arange(len(kinds)))).sum(axis=1)
+    votes = (member[:, finite][:, :, None] & (code[:, None] == np.arange(len(kinds)))).sum(axis=1)
     return np.where(votes.any(axis=1), kinds[votes.argmax(axis=1)], np.nan)

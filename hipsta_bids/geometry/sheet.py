@@ -132,10 +132,10 @@ def _evenly(points: Float) -> Float:
     count = points.shape[2]
     steps = np.linalg.norm(np.diff(points, axis=2), axis=3)
     depth = np.concatenate([np.zeros((*steps.shape[:2], 1)), steps.cumsum(axis=2)], axis=2)
-    wanted = depth[..., -1:] * np.linspace(0, 1, count)
-    below = (depth[..., None, :-1] <= wanted[..., 1:-1, None]).sum(axis=-1) - 1
+    targets = depth[..., -1:] * np.linspace(0, 1, count)
+    below = (depth[..., None, :-1] <= targets[..., 1:-1, None]).sum(axis=-1) - 1
     first = np.take_along_axis(depth, below, axis=2)
-    share = (wanted[..., 1:-1] - first) / np.take_along_axis(steps, below, axis=2)
+    share = (targets[..., 1:-1] - first) / np.take_along_axis(steps, below, axis=2)
     start = np.take_along_axis(points, below[..., None], axis=2)
     end = np.take_along_axis(points, below[..., None] + 1, axis=2)
     inner = start + share[..., None] * (end - start)
@@ -166,8 +166,8 @@ def _invert(mesh: TetMesh, values: Float, axes: tuple[Float, Float, Float]) -> F
         ]
     )
     node += low[cell]
-    weights, known = _barycentric(corners[:, cell], node.astype(float))
-    worst = np.where(known, weights.min(axis=0), -np.inf)
+    weights, regular = _barycentric(corners[:, cell], node.astype(float))
+    worst = np.where(regular, weights.min(axis=0), -np.inf)
     flat = np.ravel_multi_index(tuple(node.T), shape)
     inside = worst > -1e-3  # noqa: PLR2004 -- a thousandth of a tetrahedron bridges rounding gaps
     # Where folds make two tetrahedra claim a node, the one that holds it most centrally wins.
@@ -187,24 +187,24 @@ def _barycentric(corners: Float, points: Float) -> tuple[Float, Bool]:
     a, b, c = corners[1:] - corners[0]
     faces = np.stack([cross(b, c), cross(c, a), cross(a, b)])
     det = np.einsum("ij,ij->i", a, faces[0])
-    known = np.abs(det) > 1e-12  # noqa: PLR2004 -- grid steps cubed
+    regular = np.abs(det) > 1e-12  # noqa: PLR2004 -- grid steps cubed
     weights = np.empty((4, len(points)))
-    weights[1:] = np.einsum("ij,kij->ki", points - corners[0], faces) / np.where(known, det, 1.0)
+    weights[1:] = np.einsum("ij,kij->ki", points - corners[0], faces) / np.where(regular, det, 1.0)
     weights[0] = 1 - weights[1:].sum(axis=0)
-    return weights, known
+    return weights, regular
 
 
 def coordinates_at(mesh: TetMesh, coordinates: Coordinates, points: Float) -> Float:
     """Coordinates (N, 3) of points (N, 3), RAS mm; NaN outside of the mesh."""
     corners = mesh.vertices[mesh.tetrahedra.T]
     near = np.asarray(cKDTree(corners.mean(axis=0)).query(points, k=_CANDIDATES)[1])
-    weights, known = _barycentric(corners[:, near.ravel()], points.repeat(_CANDIDATES, axis=0))
-    worst = np.where(known, weights.min(axis=0), -np.inf).reshape(near.shape)
+    weights, regular = _barycentric(corners[:, near.ravel()], points.repeat(_CANDIDATES, axis=0))
+    worst = np.where(regular, weights.min(axis=0), -np.inf).reshape(near.shape)
     best = np.arange(len(points)), worst.argmax(axis=1)
     weights = weights.reshape(4, *near.shape)[:, *best]
     values = coordinates.values[mesh.tetrahedra[near[best]]]
-    found: Float = np.einsum("in,nik->nk", weights, values)
-    return np.where((worst[best] > -1e-3)[:, None], found, np.nan)  # noqa: PLR2004 -- rounding
+    inner: Float = np.einsum("in,nik->nk", weights, values)
+    return np.where((worst[best] > -1e-3)[:, None], inner, np.nan)  # noqa: PLR2004 -- rounding
 
 
 def fill_points(points: Float) -> Float:
@@ -212,17 +212,17 @@ def fill_points(points: Float) -> Float:
     missing = np.asarray(~np.isfinite(points).all(axis=-1))
     if not missing.any():
         return points
-    known = (~missing).astype(float)
+    filled = (~missing).astype(float)
     values = np.where(missing[..., None], 0.0, points)
     sigma = (1.0, 1.0, 0.0)
     while missing.any():
-        weight = ndimage.gaussian_filter(known, sigma, truncate=4.0)
+        weight = ndimage.gaussian_filter(filled, sigma, truncate=4.0)
         mean = ndimage.gaussian_filter(values, (*sigma, 0.0), truncate=4.0)
         reach = missing & (weight > 1e-4)  # noqa: PLR2004 -- some neighbor within the kernel
         if not reach.any():
             break
         values[reach] = mean[reach] / weight[reach][:, None]
-        known[reach] = 1.0
+        filled[reach] = 1.0
         missing &= ~reach
     return np.where(missing[..., None], np.nan, values)
 
@@ -273,12 +273,12 @@ def equal_volume_layers(sheet: Sheet) -> tuple[Sheet, Bool]:
     count = sheet.points.shape[2]
     volume = np.zeros_like(area)
     volume[:, :, 1:] = (0.5 * (area[:, :, 1:] + area[:, :, :-1])).cumsum(axis=2)
-    wanted = volume[:, :, -1:] * np.linspace(0, 1, count)[1:-1]
-    below = (volume[:, :, None, 1:-1] <= wanted[..., None]).sum(axis=-1)
+    targets = volume[:, :, -1:] * np.linspace(0, 1, count)[1:-1]
+    below = (volume[:, :, None, 1:-1] <= targets[..., None]).sum(axis=-1)
     lower = np.take_along_axis(area, below, axis=2)
     growth = np.take_along_axis(area, below + 1, axis=2) - lower
-    rest = wanted - np.take_along_axis(volume, below, axis=2)
-    share = 2 * rest / (lower + np.sqrt(np.maximum(lower**2 + 2 * growth * rest, 0)))
+    excess = targets - np.take_along_axis(volume, below, axis=2)
+    share = 2 * excess / (lower + np.sqrt(np.maximum(lower**2 + 2 * growth * excess, 0)))
     start = np.take_along_axis(sheet.points, below[..., None], axis=2)
     end = np.take_along_axis(sheet.points, below[..., None] + 1, axis=2)
     points = sheet.points.copy()

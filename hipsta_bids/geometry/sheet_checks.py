@@ -19,7 +19,7 @@ ROW_DIP_REACH = 8.0
 EDGE_REACH = (2.5, 3.5, 5.0)
 #: Thickness is compared with that at these distances along the axis on both sides, mm.
 RIDGE_REACH = (1.0, 2.0, 3.0)
-#: Number of neighboring columns of a row over which thickness is averaged for that.
+#: Number of neighboring columns over which thickness is averaged before ridges are sought.
 RIDGE_COLUMNS = 9
 
 _INWARD = 7
@@ -36,23 +36,23 @@ def check_rows(sheet: Sheet, settings: CheckSettings) -> list[Finding]:
     jumps = np.abs(np.diff(lengths)) / np.minimum(lengths[1:], lengths[:-1])
     jumps[[0, -1]] /= 2  # a plane may cut the sheet where it flares
     dips = 1 - lengths / _wider(lengths, middle, ROW_DIP_REACH)
-    found = []
-    for reason, change, limit, what in (
+    findings = []
+    for reason, change, limit, description in (
         ("extent-jump", jumps, settings.flag_row_jump, "changes by {} from one row to the next"),
         ("extent-dip", dips, settings.flag_row_dip, "dips by {}"),
     ):
         row = int(np.nanargmax(change))
-        found.append(
+        findings.append(
             Finding(
                 reason=reason,
                 value=float(change[row]),
                 limit=limit,
-                what=f"the sheet's width {what.format(f'{change[row]:.0%}')}",
+                what=f"the sheet's width {description.format(f'{change[row]:.0%}')}",
                 remedy="look for missing or added parts in the labels",
                 points=_known(middle[:, row]),
             )
         )
-    return found
+    return findings
 
 
 def check_edges(whole: Sheet, settings: CheckSettings) -> list[Finding]:
@@ -64,9 +64,9 @@ def check_edges(whole: Sheet, settings: CheckSettings) -> list[Finding]:
     middle = whole.points[:, :, whole.middle]
     step, count = _row_step(middle), middle.shape[1]
     inner = max(middle.shape[0] // _INWARD, 1)
-    found = []
+    findings = []
     for name, edge, beside in (("medial", 0, inner), ("lateral", -1, -1 - inner)):
-        rim, inward = middle[edge], middle[beside] - middle[edge]
+        outline, inward = middle[edge], middle[beside] - middle[edge]
         best = (0.0, 0.0, settings.flag_edge[0], 0, 0)
         for reach, limit in zip(EDGE_REACH, settings.flag_edge, strict=True):
             k = max(round(reach / step), 1)
@@ -74,23 +74,25 @@ def check_edges(whole: Sheet, settings: CheckSettings) -> list[Finding]:
                 continue
             towards = ndimage.uniform_filter1d(np.nan_to_num(inward), 2 * k + 1, axis=0)[k:-k]
             towards /= np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-9)
-            behind, ahead = (rim[k:-k] - rim[part] for part in (slice(-2 * k), slice(2 * k, None)))
-            depth = np.minimum(*((gap * towards).sum(axis=1) for gap in (behind, ahead)))
+            behind, front = (
+                outline[k:-k] - outline[part] for part in (slice(-2 * k), slice(2 * k, None))
+            )
+            depth = np.minimum(*((gap * towards).sum(axis=1) for gap in (behind, front)))
             row = int(np.nan_to_num(depth).argmax())
             size = max(float(np.nan_to_num(depth)[row]), 0.0)
             best = max(best, (size / limit, size, limit, row + k, k))
         _, size, limit, row, k = best
-        found.append(
+        findings.append(
             Finding(
                 reason="edge-notch",
                 value=size,
                 limit=limit,
                 what=f"the {name} edge of the sheet recedes by {size:.1f} mm",
                 remedy="look for a notch or a missing tip in the labels",
-                points=_known(rim[max(row - k // 2, 0) : row + k // 2 + 1]),
+                points=_known(outline[max(row - k // 2, 0) : row + k // 2 + 1]),
             )
         )
-    return found
+    return findings
 
 
 def check_subfields(
@@ -108,8 +110,8 @@ def check_subfields(
         for tissue in map(Tissue, np.unique(subfield[edge]).tolist()):
             widths = np.where(subfield == tissue, np.nan_to_num(lengths), 0.0).sum(axis=0)
             before, behind = (np.maximum.accumulate(widths[::way])[::way] for way in (1, -1))
-            gone = (widths == 0) & (np.minimum(before, behind) >= _LEAST_WIDTH)
-            for (part,) in ndimage.find_objects(ndimage.label(gone)[0]):
+            empty = (widths == 0) & (np.minimum(before, behind) >= _LEAST_WIDTH)
+            for (part,) in ndimage.find_objects(ndimage.label(empty)[0]):
                 size = (part.stop - part.start) * step
                 gaps.append((size, tissue, edge, part.start, part.stop))
     size, tissue, edge, first, last = max(gaps)
@@ -137,26 +139,26 @@ def check_ridges(sheet: Sheet, thickness: Float, settings: CheckSettings) -> lis
     of a whole sheet changes more slowly along the axis.
     """
     middle = sheet.points[:, :, sheet.middle]
-    found = []
-    for reason, sign, limits, what in (
+    findings = []
+    for reason, sign, limits, description in (
         ("thickness-ridge", 1, settings.flag_ridge, "thicker"),
         ("thickness-groove", -1, settings.flag_groove, "thinner"),
     ):
         bands = _bands(sign * thickness, limits, _row_step(middle))
         excess, size, (column, row) = max(bands, default=(0.0, 0.0, (0, 0)))
         half = RIDGE_COLUMNS // 2
-        found.append(
+        findings.append(
             Finding(
                 reason=reason,
                 value=size,
                 limit=size / excess if excess else limits[0],
-                what=f"a band of the sheet is {size:.1f} mm {what} than the sheet before and "
-                "behind it",
+                what=f"a band of the sheet is {size:.1f} mm {description} than the sheet before "
+                "and behind it",
                 remedy="look at the labels there",
                 points=_known(middle[max(column - half, 0) : column + half + 1, row]),
             )
         )
-    return found
+    return findings
 
 
 def _bands(

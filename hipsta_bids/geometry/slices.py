@@ -15,32 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from hipsta_bids.geometry import digital, outlines, ribbon
 from hipsta_bids.geometry.body import Body
-from hipsta_bids.geometry.digital import (
-    Box,
-    box,
-    low_corner,
-    positions,
-    to_ras,
-    voxel_points,
-)
-from hipsta_bids.geometry.outlines import (
-    DISTANCE_REACH,
-    Stack,
-    cut_rings,
-    drop_doubles,
-    keep_apart,
-    outline_slice,
-    part_distance,
-    ranks_of,
-)
-from hipsta_bids.geometry.ribbon import (
-    align_nodes,
-    keep_whole,
-    moves_between,
-    part_turns,
-    ribbon_nodes,
-)
+from hipsta_bids.geometry.outlines import Stack
 from hipsta_bids.protocols.protocol import LATERAL_END, MEDIAL_END
 from hipsta_bids.settings import SliceSettings
 from hipsta_bids.types import Bool, Float
@@ -62,23 +39,23 @@ FLOW_ITERATIONS = 5
 #: What lies less deep than this inside an end plane is taken from inside, where the sheet's
 #: labels end at the plane, mm.
 HIDDEN_DEPTH = 0.1
-#: There, and beyond the last slice, shapes go on changing at this fraction of their pace.
+#: At such ends, and beyond the last slice, shapes go on changing at this fraction of their pace.
 EXTRAPOLATION = 0.5
 
 _LEVELS = (2, 1)
 """Sizes of pixels in the registration, from coarse to those of the segmentation."""
 
 
-def register_slices(outlines: Stack, pixel: float, settings: SliceSettings) -> Stack:
+def register_slices(images: Stack, pixel: float, settings: SliceSettings) -> Stack:
     """Register each outline (N, I, J), mm, to the next; fine pixels, (2, N - 1, I', J').
 
     Lucas & Kanade 1981, IJCAI:674-679, with a Gaussian window, from coarse to fine, all slices at
     once, on the pixels of the segmentation (``pixel``, mm). Displacements are defined halfway
     between both slices, so that no direction is preferred.
     """
-    flow = np.zeros((2, len(outlines) - 1, 1, 1), dtype=np.float32)
+    flow = np.zeros((2, len(images) - 1, 1, 1), dtype=np.float32)
     for level in _LEVELS:
-        small = _shrunk(outlines, settings.upsampling * level)
+        small = _shrunk(images, settings.upsampling * level)
         flow = _doubled(flow, small.shape[1:])
         for _ in range(FLOW_ITERATIONS):
             flow = _improved(small, flow, pixel * level)
@@ -110,9 +87,9 @@ def _improved(images: Stack, flow: Stack, pixel: float) -> Stack:
 
 
 def _moved(images: Stack, by: Stack) -> Stack:
-    where = np.indices(images.shape, dtype=np.float32)
-    where[1:] += by
-    return _interpolated(images, *where)
+    grid = np.indices(images.shape, dtype=np.float32)
+    grid[1:] += by
+    return _interpolated(images, *grid)
 
 
 def _interpolated(images: Stack, number: Stack, row: Stack, column: Stack) -> Stack:
@@ -142,8 +119,8 @@ def _doubled(flow: Stack, shape: tuple[int, ...]) -> Stack:
     """Displacements at pixels of half the size, in these pixels."""
     images = flow.reshape(-1, *flow.shape[2:])
     at = (0.5 * np.arange(n, dtype=np.float32) - 0.25 for n in shape)
-    where = np.meshgrid(np.arange(len(images)), *at, indexing="ij")
-    return 2 * _interpolated(images, *where).reshape(*flow.shape[:2], *shape)
+    grid = np.meshgrid(np.arange(len(images)), *at, indexing="ij")
+    return 2 * _interpolated(images, *grid).reshape(*flow.shape[:2], *shape)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -163,25 +140,25 @@ class _SliceStack:
     settings: SliceSettings
     """Settings of the interpolation."""
 
-    def blend(self, level: Stack, where: Stack) -> Stack:
+    def blend(self, level: Stack, pixels: Stack) -> Stack:
         """Signed distance, mm, within the plane of the slices, from the outline at any level.
 
         Slits are left out of what is farther outside than the setting ``edge``.
 
-        ``level`` (N,) counts slices, ``where`` (2, N) fine pixels.
+        ``level`` (N,) counts slices, ``pixels`` (2, N) fine pixels.
         """
         last = len(self.outlines) - 1
         level = level + (EXTRAPOLATION - 1) * (level - np.clip(level, 0, last))
         below = np.clip(np.floor(level), 0, last - 1)
         share = level - below
         coarse = self.flows.shape[2] / self.outlines.shape[1]
-        where = where - self._departure(below, share, (where + 0.5) * coarse - 0.5)
-        step = np.zeros_like(where)
+        pixels = pixels - self._departure(below, share, (pixels + 0.5) * coarse - 0.5)
+        step = np.zeros_like(pixels)
         # The flow is known halfway between the slices: find the point there that moves to here.
         for _ in range(3):
-            middle = (where - (share - 0.5) * step + 0.5) * coarse - 0.5
+            middle = (pixels - (share - 0.5) * step + 0.5) * coarse - 0.5
             step = np.stack([_interpolated(part, below, *middle) for part in self.flows])
-        middle = where - (share - 0.5) * step
+        middle = pixels - (share - 0.5) * step
         first, second = middle - 0.5 * step, middle + 0.5 * step
 
         def mixed(images: Stack, at: Bool) -> Stack:
@@ -192,7 +169,7 @@ class _SliceStack:
         distance = mixed(self.outlines, np.ones(len(level), dtype=bool))
         near = distance > -RAMP_HALF_WIDTH
         medial, lateral = (mixed(images, near) for images in self.ends)
-        distance[near] = np.minimum(distance[near], keep_apart(medial, lateral))
+        distance[near] = np.minimum(distance[near], outlines.keep_apart(medial, lateral))
         return distance
 
     def _departure(self, below: Stack, share: Stack, middle: Stack) -> Stack:
@@ -231,15 +208,15 @@ def sample_slices(body: Body, points: Float, settings: SliceSettings) -> Stack:
     body = _in_own_order(body)
     pixel = float(np.linalg.norm(body.affine[:3, :3], axis=0)[1:].mean())
     labeled = _labeled_ends(body)
-    part = _bounds(body, DISTANCE_REACH / pixel, labeled)
+    part = _bounds(body, outlines.DISTANCE_REACH / pixel, labeled)
     tissue = body.tissue[part].copy()
-    for step, depth, known in zip((1, -1), _depths(body, part), labeled, strict=True):
-        if not known:
+    for step, depth, is_labeled in zip((1, -1), _depths(body, part), labeled, strict=True):
+        if not is_labeled:
             _extrapolate(tissue[::step], (depth < HIDDEN_DEPTH)[::step], pixel, settings)
     stack = _stacked(tissue, pixel, settings)
-    voxels = body.to_voxels(points) - low_corner(part)
-    where = ((voxels[:, 1:] + 0.5) * settings.upsampling - 0.5).astype(np.float32).T
-    distance = stack.blend(voxels[:, 0].astype(np.float32), where)
+    voxels = body.to_voxels(points) - digital.low_corner(part)
+    pixels = ((voxels[:, 1:] + 0.5) * settings.upsampling - 0.5).astype(np.float32).T
+    distance = stack.blend(voxels[:, 0].astype(np.float32), pixels)
     return np.asarray(np.clip(distance / (2 * RAMP_HALF_WIDTH) + 0.5, 0, 1), dtype=np.float32)
 
 
@@ -269,86 +246,92 @@ def _stacked(tissue: NDArray[np.uint8], pixel: float, settings: SliceSettings) -
     """Outline and align slices; a single one is taken twice."""
     if len(tissue) == 1:
         tissue = np.concatenate([tissue, tissue])
-    outlines = np.stack(
+    images = np.stack(
         [
-            outline_slice(image, pixel, settings, list(tissue[max(n - 1, 0) : n + 2]))
+            outlines.outline_slice(image, pixel, settings, list(tissue[max(n - 1, 0) : n + 2]))
             for n, image in enumerate(tissue)
         ]
     )
     ends = np.array(
         [
-            [part_distance(image, end, pixel, settings) for image in tissue]
+            [outlines.part_distance(image, end, pixel, settings) for image in tissue]
             for end in (MEDIAL_END, LATERAL_END)
         ]
     )
     fine = pixel / settings.upsampling
-    outlines = np.minimum(outlines, keep_apart(ends[0], ends[1]))
-    outlines = cut_rings(outlines, fine)
-    ranks = [ranks_of(image, settings.upsampling) for image in tissue]
-    for outline, rank in zip(outlines, ranks, strict=True):
-        drop_doubles(outline, rank)
+    images = np.minimum(images, outlines.keep_apart(ends[0], ends[1]))
+    images = outlines.cut_rings(images, fine)
+    ranks = [outlines.ranks_of(image, settings.upsampling) for image in tissue]
+    for outline, rank in zip(images, ranks, strict=True):
+        outlines.drop_doubles(outline, rank)
     ribbons = [
-        ribbon_nodes(outline, rank, fine) for outline, rank in zip(outlines, ranks, strict=True)
+        ribbon.ribbon_nodes(outline, rank, fine)
+        for outline, rank in zip(images, ranks, strict=True)
     ]
-    for outline, nodes in zip(outlines, ribbons, strict=True):
+    for outline, nodes in zip(images, ribbons, strict=True):
         if nodes is not None:
-            keep_whole(outline, nodes, fine)
-            part_turns(outline, nodes, fine)
+            ribbon.keep_whole(outline, nodes, fine)
+            ribbon.part_turns(outline, nodes, fine)
     if any(nodes is None for nodes in ribbons):
-        flows = register_slices(outlines, pixel, settings)
+        flows = register_slices(images, pixel, settings)
     else:
-        flows = np.zeros((2, len(outlines) - 1, *tissue.shape[1:]), dtype=np.float32)
-    bends = np.zeros((2, len(outlines), *flows.shape[2:]), dtype=np.float32)
-    _align(flows, bends, align_nodes(ribbons, fine), settings)
-    return _SliceStack(outlines=outlines, ends=ends, flows=flows, bends=bends, settings=settings)
+        flows = np.zeros((2, len(images) - 1, *tissue.shape[1:]), dtype=np.float32)
+    bends = np.zeros((2, len(images), *flows.shape[2:]), dtype=np.float32)
+    _align(flows, bends, ribbon.align_nodes(ribbons, fine), settings)
+    return _SliceStack(outlines=images, ends=ends, flows=flows, bends=bends, settings=settings)
 
 
 def _align(
-    flows: Stack, bends: Stack, ribbons: list[Float | None], settings: SliceSettings
+    flows: Stack,
+    bends: Stack,
+    ribbons: list[Float | None],
+    settings: SliceSettings,
 ) -> None:
     """Replace, in place, displacements between slices with nodes by those of the nodes."""
     up = settings.upsampling
     pixels = np.indices(flows.shape[2:]).reshape(2, -1).T.astype(np.float64)
-    where = (pixels + 0.5) * up - 0.5
+    points = (pixels + 0.5) * up - 0.5
     for number, (first, second) in enumerate(pairwise(ribbons)):
         if first is not None and second is not None:
-            moves = moves_between(first, second, where)
+            moves = ribbon.moves_between(first, second, points)
             flows[:, number] = moves.T.reshape(flows[:, number].shape)
     for number in range(1, len(ribbons) - 1):
-        before, here, after = ribbons[number - 1 : number + 2]
-        if before is not None and here is not None and after is not None:
-            half = 0.5 * (before - 2 * here + after)
-            bend = moves_between(here - half, here + half, where)
+        before, current, after = ribbons[number - 1 : number + 2]
+        if before is not None and current is not None and after is not None:
+            half = 0.5 * (before - 2 * current + after)
+            bend = ribbon.moves_between(current - half, current + half, points)
             bends[:, number] = bend.T.reshape(bends[:, number].shape)
 
 
 def _labeled_ends(body: Body) -> tuple[bool, bool]:
     """Whether the sheet's labels go on beyond the first and beyond the last slice of the body."""
-    points = voxel_points(body.tissue > 0, body.affine)
+    points = digital.voxel_points(body.tissue > 0, body.affine)
     thickness = float(np.linalg.norm(body.affine[:3, 0]))
-    known = []
+    are_labeled = []
     for depth in body.ends.depths(points):
         inner = np.count_nonzero((depth > 0) & (depth < thickness))
         outer = np.count_nonzero((depth < 0) & (depth > -thickness))
-        known.append(bool(outer > 0.5 * inner))  # a label that is only blurred at the plane is less
-    return known[0], known[1]
+        are_labeled.append(
+            bool(outer > 0.5 * inner)
+        )  # a label that is only blurred at the plane is less
+    return are_labeled[0], are_labeled[1]
 
 
-def _bounds(body: Body, margin: float, labeled: tuple[bool, bool]) -> Box:
+def _bounds(body: Body, margin: float, labeled: tuple[bool, bool]) -> digital.Box:
     """Box round the sheet in the body's slices, and in one slice more where labels go on."""
     levels = np.flatnonzero(body.inside.any(axis=(1, 2)))
     first = max(int(levels[0]) - labeled[0], 0)
     last = min(int(levels[-1]) + labeled[1], len(body.inside) - 1)
-    index = positions(body.tissue[first : last + 1] > 0) + np.array([first, 0, 0])
+    index = digital.positions(body.tissue[first : last + 1] > 0) + np.array([first, 0, 0])
     room = np.ceil([0, margin, margin]).astype(int)
     low, high = index.min(axis=0) - room, index.max(axis=0) + 1 + room
-    return box(np.maximum(low, 0), np.minimum(high, body.inside.shape))
+    return digital.box(np.maximum(low, 0), np.minimum(high, body.inside.shape))
 
 
-def _depths(body: Body, part: Box) -> tuple[Float, Float]:
+def _depths(body: Body, part: digital.Box) -> tuple[Float, Float]:
     """Depths of the box's voxels inside the planes at its first and last slices, mm."""
     index = np.meshgrid(*(np.arange(side.start, side.stop) for side in part), indexing="ij")
-    points = to_ras(np.stack(index, axis=-1), body.affine)
+    points = digital.to_ras(np.stack(index, axis=-1), body.affine)
     return body.ends.depths(points)
 
 
@@ -361,11 +344,11 @@ def _extrapolate(
     """
     cut = np.flatnonzero((hidden[:-2] & (tissue[1:-1] > 0)).any(axis=(1, 2)))
     up = settings.upsampling
-    where = np.indices(tissue.shape[1:], dtype=np.float32).reshape(2, -1) * up + 0.5 * (up - 1)
-    level = np.full(where.shape[1], -1.0, dtype=np.float32)
+    pixels = np.indices(tissue.shape[1:], dtype=np.float32).reshape(2, -1) * up + 0.5 * (up - 1)
+    level = np.full(pixels.shape[1], -1.0, dtype=np.float32)
     for number in range(int(cut.max(initial=-1)), -1, -1):
         stack = _stacked(tissue[number + 1 : number + 3], pixel, settings)
-        expected = stack.blend(level, where).reshape(tissue.shape[1:]) > 0
+        expected = stack.blend(level, pixels).reshape(tissue.shape[1:]) > 0
         inner = tissue[number + 1]
         nearest = ndimage.distance_transform_edt(
             inner == 0, return_distances=False, return_indices=True

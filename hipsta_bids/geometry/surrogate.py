@@ -185,7 +185,7 @@ def _medial_axis(cut: _Slice, position: float, settings: SurrogateSettings) -> F
     middle = (along > 0.2 * along[-1]) & (along < 0.8 * along[-1])  # without forks
     width = float(np.median(half[middle])) if middle.any() else 0.0
     trim = FORK_LENGTH * width
-    kept = (along >= trim) & (along <= along[-1] - trim)
+    trimmed = (along >= trim) & (along <= along[-1] - trim)
     if along[-1] < 4 * trim or not width:
         raise GeometryError(
             f"the medial axis is no line at {position:.0%} of the body's length: choose another"
@@ -193,10 +193,10 @@ def _medial_axis(cut: _Slice, position: float, settings: SurrogateSettings) -> F
             reason="surrogate-short",
         )
     sigma = AXIS_SMOOTHING / settings.pixel
-    smooth = ndimage.gaussian_filter1d(path, sigma, axis=0, mode="nearest")[kept]
-    back = min(max(int(2 * width), 2), len(smooth) - 1)
-    start = _to_the_edge(cut, smooth[0], smooth[0] - smooth[back])[::-1]
-    stop = _to_the_edge(cut, smooth[-1], smooth[-1] - smooth[-1 - back])
+    smooth = ndimage.gaussian_filter1d(path, sigma, axis=0, mode="nearest")[trimmed]
+    lag = min(max(int(2 * width), 2), len(smooth) - 1)
+    start = _to_the_edge(cut, smooth[0], smooth[0] - smooth[lag])[::-1]
+    stop = _to_the_edge(cut, smooth[-1], smooth[-1] - smooth[-1 - lag])
     return np.concatenate([start, smooth, stop])
 
 
@@ -225,15 +225,15 @@ def _from_medial(body: Body, cut: _Slice, axis: Float) -> Float:
     """Order the axis from medial to lateral, by the labels along it."""
     index = body.to_voxels(cut.to_ras(axis))
     labels = ndimage.map_coordinates(body.tissue, index.T, order=0)
-    known = np.flatnonzero(labels)
-    trend = float(((known - known.mean()) * labels[known]).sum()) if known.size else 0.0
+    labeled = np.flatnonzero(labels)
+    trend = float(((labeled - labeled.mean()) * labels[labeled]).sum()) if labeled.size else 0.0
     return axis if trend >= 0 else axis[::-1]
 
 
 def _sides(cut: _Slice, axis: Float) -> tuple[Float, Float]:
     """Cut the contour at both ends of the axis into two lines of points, (M, 2) each."""
-    held = np.where(cut.inside, np.maximum(cut.values, 0.5 + 1e-6), np.minimum(cut.values, 0.5))
-    lines = find_contours(held, 0.5 + 5e-7)  # type: ignore[no-untyped-call]
+    clipped = np.where(cut.inside, np.maximum(cut.values, 0.5 + 1e-6), np.minimum(cut.values, 0.5))
+    lines = find_contours(clipped, 0.5 + 5e-7)  # type: ignore[no-untyped-call]
     contour = max(lines, key=len)[:-1]
     first, second = (int(cKDTree(contour).query(end)[1]) for end in (axis[0], axis[-1]))
     contour = np.roll(contour, -first, axis=0)
@@ -262,21 +262,21 @@ def compare_nearby(points: Float, surface: Float, values: Float, reach: float) -
 
     The result is NaN where no known value is near.
     """
-    known = np.isfinite(surface).all(axis=-1) & np.isfinite(values)
-    if not known.any():
+    finite = np.isfinite(surface).all(axis=-1) & np.isfinite(values)
+    if not finite.any():
         return np.full(len(points), np.nan)
-    count = min(4, int(known.sum()))
-    found = cKDTree(surface[known]).query(points, k=count)
-    distance, index = (np.asarray(part).reshape(-1, count) for part in found)
+    count = min(4, int(finite.sum()))
+    neighbors = cKDTree(surface[finite]).query(points, k=count)
+    distance, index = (np.asarray(part).reshape(-1, count) for part in neighbors)
     weight = 1 / np.maximum(distance, 1e-6)
-    mean = (weight * values[known][index]).sum(axis=1) / weight.sum(axis=1)
+    mean = (weight * values[finite][index]).sum(axis=1) / weight.sum(axis=1)
     return np.where(distance[:, 0] <= reach, mean, np.nan)
 
 
 def agreement(first: Float, second: Float) -> Agreement:
     """Compare two measures (N,), mm, where both are known; NaN with fewer than three points."""
-    known = np.isfinite(first) & np.isfinite(second)
-    a, b = first[known], second[known]
+    finite = np.isfinite(first) & np.isfinite(second)
+    a, b = first[finite], second[finite]
     difference = float((a - b).mean()) if len(a) else np.nan
     correlation = slope = deviation = np.nan
     # A line through two points is always perfect.

@@ -138,8 +138,8 @@ def _mesh(vertices: Float, triangles: Int, options: dict[str, Any]) -> tuple[Flo
     # as those of `io.files.scratch_folder`, so that it goes if this process is killed.
     name = f"hipsta-bids-{platform.node()}-{os.getpid()}-tetgen-"
     with (
-        tempfile.TemporaryDirectory(prefix=name, ignore_cleanup_errors=True) as aside,
-        contextlib.chdir(aside),
+        tempfile.TemporaryDirectory(prefix=name, ignore_cleanup_errors=True) as folder,
+        contextlib.chdir(folder),
     ):
         points, cells, *_ = TetGen(vertices, triangles).tetrahedralize(**options)
     return np.asarray(points), np.asarray(cells)

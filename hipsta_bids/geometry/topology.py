@@ -15,23 +15,7 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from hipsta_bids.errors import GeometryError
-from hipsta_bids.geometry.digital import (
-    ALL,
-    FACES,
-    FIRST,
-    INNER,
-    PAD,
-    Edit,
-    Index,
-    Kind,
-    apply_membranes,
-    box_around,
-    euler,
-    low_corner,
-    positions,
-    widened,
-    with_plates,
-)
+from hipsta_bids.geometry import digital
 from hipsta_bids.geometry.grid import Field
 from hipsta_bids.settings import MeasureSettings, TopologySettings
 from hipsta_bids.types import Bool, Float, Sheet, position_text
@@ -50,7 +34,7 @@ Contact = Callable[[Float], bool]
 class Repair:
     """One change of the body's shape."""
 
-    kind: Kind
+    kind: digital.Kind
     """``part`` turns that touch, fill a ``slit`` of the labels, ``cut`` a bridge, ``fill`` a hole,
     remove an ``island``, fill a ``cavity``, leave out the ``uncus``."""
     voxels: int
@@ -74,7 +58,7 @@ class Repair:
         return self.excess > 1
 
     def __str__(self) -> str:
-        what = {
+        noun = {
             "part": "parted two turns that touch, by a slit",
             "slit": "filled a slit or pit",
             "cut": "cut a bridge",
@@ -84,7 +68,7 @@ class Repair:
             "uncus": "left out the uncus, a piece",
         }[self.kind]
         return (
-            f"{what} of {self.voxels} grid nodes at {position_text(self.position, self.subfield)}"
+            f"{noun} of {self.voxels} grid nodes at {position_text(self.position, self.subfield)}"
         )
 
 
@@ -127,33 +111,33 @@ def repair_topology(
             "use a finer segmentation",
             reason="sheet-too-thin",
         )
-    state = np.pad(before, PAD)
-    euler_before = euler(state)
-    padded = np.pad(values, PAD, constant_values=-1.0)
+    state = np.pad(before, digital.PAD)
+    euler_before = digital.euler(state)
+    padded = np.pad(values, digital.PAD, constant_values=-1.0)
     lifted = padded.copy()
     _refuse_strips(state, field, settings, locate)
 
-    def touching(where: Index) -> bool:
-        return contact(field.grid.to_ras((where - FIRST).astype(float)))
+    def touching(nodes: digital.Index) -> bool:
+        return contact(field.grid.to_ras((nodes - digital.FIRST).astype(float)))
 
     edits = _before_smoothing(field)
     edits += _remove_islands(state, field, locate) + _fill_cavities(state)
     for _ in range(settings.rounds):
-        wrong = [plates for plates in (False, True) if euler(state, plates=plates) != 1]
+        wrong = [plates for plates in (False, True) if digital.euler(state, plates=plates) != 1]
         if not wrong:
             break
         # Pits only once the body itself is sound: the inside of a closed tube is none.
         pits = _fill_cavities(state, plates=True) if wrong[0] else []
-        found = pits or apply_membranes(
+        proposals = pits or digital.apply_membranes(
             state, padded, lifted, settings, plates=wrong[0], contact=touching
         )
-        edits += found
-        if not found or _has_strips(state, settings):
+        edits += proposals
+        if not proposals or _has_strips(state, settings):
             raise _unrepaired(edits, state, field, locate)
         edits += _remove_islands(state, field, locate) + _fill_cavities(state)
     else:
         raise _unrepaired(edits, state, field, locate)
-    after = state[INNER]
+    after = state[digital.INNER]
     size = int(np.count_nonzero(before))
     changed, touched = _changes(field, after, edits)
     repairs = tuple(
@@ -163,28 +147,31 @@ def repair_topology(
     )
     return SolidField(
         field=replace(
-            field, values=_consistent_values(lifted[INNER], after), separated=None, slits=None
+            field,
+            values=_consistent_values(lifted[digital.INNER], after),
+            separated=None,
+            slits=None,
         ),
         repairs=repairs,
         touched=touched,
         euler_before=euler_before,
-        euler_after=euler(state),
+        euler_after=digital.euler(state),
         changed_fraction=float(np.count_nonzero(changed) / size),
     )
 
 
-def _between_planes(edit: Edit, field: Field) -> Bool:
+def _between_planes(edit: digital.Edit, field: Field) -> Bool:
     """Which nodes (N,) of a change lie between the end planes."""
-    level = (edit.where - FIRST)[:, 2]
+    level = (edit.nodes - digital.FIRST)[:, 2]
     return np.asarray((level >= field.beyond) & (level < field.grid.shape[2] - field.beyond))
 
 
-def _changes(field: Field, after: Bool, edits: Sequence[Edit]) -> tuple[Bool, Bool]:
+def _changes(field: Field, after: Bool, edits: Sequence[digital.Edit]) -> tuple[Bool, Bool]:
     """Nodes that repairs of the sheet changed, and all for which columns of the map are marked."""
     changed = after != (field.values > 0)
     for edit in edits:
         if edit.kind == "uncus":  # no part of the sheet
-            changed[tuple((edit.where - FIRST).T)] = False
+            changed[tuple((edit.nodes - digital.FIRST).T)] = False
     if field.slits is not None:
         changed |= field.slits
     touched = changed.copy()
@@ -194,19 +181,22 @@ def _changes(field: Field, after: Bool, edits: Sequence[Edit]) -> tuple[Bool, Bo
     return changed, touched
 
 
-def _before_smoothing(field: Field) -> list[Edit]:
+def _before_smoothing(field: Field) -> list[digital.Edit]:
     """List what was removed between turns that touch, and what was filled, before smoothing."""
     edits = []
     if field.separated is not None and field.separated.any():
-        edits.append(Edit("part", positions(field.separated) + FIRST))
-    kinds: tuple[tuple[Kind, Bool | None], ...] = (
+        edits.append(digital.Edit("part", digital.positions(field.separated) + digital.FIRST))
+    kinds: tuple[tuple[digital.Kind, Bool | None], ...] = (
         ("slit", field.slits),
         ("cavity", field.cavities),
     )
     for kind, nodes in kinds:
         if nodes is not None:
-            pieces, count = ndimage.label(nodes, structure=ALL)
-            edits += [Edit(kind, positions(pieces == n + 1) + FIRST) for n in range(count)]
+            pieces, count = ndimage.label(nodes, structure=digital.CUBE)
+            edits += [
+                digital.Edit(kind, digital.positions(pieces == n + 1) + digital.FIRST)
+                for n in range(count)
+            ]
     return edits
 
 
@@ -215,7 +205,7 @@ def _through_pieces(state: Bool) -> tuple[NDArray[Any], int, NDArray[Any]]:
 
     The plates are left out, or a fragment that touches one of them would count as connected.
     """
-    pieces, count = ndimage.label(state[INNER], structure=FACES)
+    pieces, count = ndimage.label(state[digital.INNER], structure=digital.FACES)
     through = np.intersect1d(pieces[:, :, 0], pieces[:, :, -1])
     through = through[through > 0]
     sizes = np.bincount(pieces.ravel(), minlength=count + 1)[through]
@@ -235,10 +225,12 @@ def _refuse_strips(state: Bool, field: Field, settings: TopologySettings, locate
         return
     pieces, _, through = _through_pieces(state)
     gap, nearest = ndimage.distance_transform_edt(pieces != through[0], return_indices=True)
-    facing = positions((pieces == through[1]) & (gap <= gap[pieces == through[1]].min() + 1))
-    other = nearest[:, *facing.T].T
-    center = 0.5 * (facing.mean(axis=0) + other.mean(axis=0))
-    names = locate(field.grid.to_ras(np.vstack([facing, other]).astype(float)))
+    facing = digital.positions(
+        (pieces == through[1]) & (gap <= gap[pieces == through[1]].min() + 1)
+    )
+    opposite = nearest[:, *facing.T].T
+    center = 0.5 * (facing.mean(axis=0) + opposite.mean(axis=0))
+    names = locate(field.grid.to_ras(np.vstack([facing, opposite]).astype(float)))
     at = position_text(field.grid.to_ras(center[None])[0], names)
     raise GeometryError(
         f"a gap divides the sheet into {len(through)} strips from end to end, at {at}: "
@@ -247,24 +239,26 @@ def _refuse_strips(state: Bool, field: Field, settings: TopologySettings, locate
     )
 
 
-def _unrepaired(edits: list[Edit], state: Bool, field: Field, locate: Locate) -> GeometryError:
+def _unrepaired(
+    edits: list[digital.Edit], state: Bool, field: Field, locate: Locate
+) -> GeometryError:
     """Report the largest of the repairs that did not lead to one solid piece."""
-    nothing = Edit("cut", positions(state))
-    where = max(edits, key=lambda edit: len(edit.where), default=nothing).where
-    point = field.grid.to_ras((where - FIRST).mean(axis=0, keepdims=True))
+    fallback = digital.Edit("cut", digital.positions(state))
+    nodes = max(edits, key=lambda edit: len(edit.nodes), default=fallback).nodes
+    point = field.grid.to_ras((nodes - digital.FIRST).mean(axis=0, keepdims=True))
     at = position_text(point[0], locate(point))
     return GeometryError(
         f"the labels have holes or bridges that could not be repaired (Euler number "
-        f"{euler(state)}, with closed ends {euler(state, plates=True)}, instead of 1), the "
-        f"largest near {at}: correct the labels there by hand",
+        f"{digital.euler(state)}, with closed ends {digital.euler(state, plates=True)}, instead of "
+        f"1), the largest near {at}: correct the labels there by hand",
         reason="topology",
     )
 
 
-def _interrupted(pieces: Index, field: Field, locate: Locate) -> GeometryError:
+def _interrupted(pieces: digital.Index, field: Field, locate: Locate) -> GeometryError:
     """Report where the body ends that begins at the posterior plane."""
     first = int(np.flatnonzero((pieces > 0).any(axis=(0, 1)))[0])
-    nodes = positions(np.isin(pieces, np.unique(pieces[:, :, first])) & (pieces > 0))
+    nodes = digital.positions(np.isin(pieces, np.unique(pieces[:, :, first])) & (pieces > 0))
     level = nodes[:, 2].max() if first == 0 else first
     point = field.grid.to_ras(nodes[nodes[:, 2] == level].astype(float))
     at = position_text(point.mean(axis=0), locate(point))
@@ -276,7 +270,7 @@ def _interrupted(pieces: Index, field: Field, locate: Locate) -> GeometryError:
     )
 
 
-def _remove_islands(state: Bool, field: Field, locate: Locate) -> list[Edit]:
+def _remove_islands(state: Bool, field: Field, locate: Locate) -> list[digital.Edit]:
     """Remove (in place) all but the largest piece that reaches from plate to plate."""
     pieces, count, through = _through_pieces(state)
     if not len(through):
@@ -284,9 +278,12 @@ def _remove_islands(state: Bool, field: Field, locate: Locate) -> list[Edit]:
     if count == 1:
         return []
     main = pieces == through[0]
-    state[INNER] &= main
+    state[digital.INNER] &= main
     return [
-        Edit("uncus" if _is_uncus(piece, main) else "island", positions(piece) + FIRST)
+        digital.Edit(
+            "uncus" if _is_uncus(piece, main) else "island",
+            digital.positions(piece) + digital.FIRST,
+        )
         for piece in (pieces == n for n in range(1, count + 1) if n != through[0])
     ]
 
@@ -297,50 +294,54 @@ def _is_uncus(piece: Bool, main: Bool) -> bool:
     if levels[-1] < piece.shape[2] - 1:
         return False
     # The first direction across the axis points laterally.
-    medial = positions(piece)[:, 0].mean()
-    return bool(medial < positions(main[:, :, levels[0] :])[:, 0].mean())
+    medial = digital.positions(piece)[:, 0].mean()
+    return bool(medial < digital.positions(main[:, :, levels[0] :])[:, 0].mean())
 
 
-def _fill_cavities(state: Bool, *, plates: bool = False) -> list[Edit]:
+def _fill_cavities(state: Bool, *, plates: bool = False) -> list[digital.Edit]:
     """Fill (in place) background that does not reach the border, or with plates that cannot."""
-    solid = with_plates(state, True) if plates else state
-    pieces, count = ndimage.label(~solid, structure=ALL)
+    solid = digital.with_plates(state, True) if plates else state
+    pieces, count = ndimage.label(~solid, structure=digital.CUBE)
     if count == 1:
         return []
     outside = int(pieces[0, 0, 0])
     state |= (pieces > 0) & (pieces != outside)
-    return [Edit("cavity", positions(pieces == n)) for n in range(1, count + 1) if n != outside]
+    return [
+        digital.Edit("cavity", digital.positions(pieces == n))
+        for n in range(1, count + 1)
+        if n != outside
+    ]
 
 
 def _describe(
-    edit: Edit, field: Field, size: int, settings: TopologySettings, locate: Locate
+    edit: digital.Edit, field: Field, size: int, settings: TopologySettings, locate: Locate
 ) -> Repair:
     """Locate one change, and find out whether it is large."""
-    kind, where = edit.kind, edit.where
-    points = field.grid.to_ras((where - FIRST).astype(np.float64))
+    kind, nodes = edit.kind, edit.nodes
+    points = field.grid.to_ras((nodes - digital.FIRST).astype(np.float64))
     center = points.mean(axis=0)
-    inside = np.clip(where - FIRST, 0, np.array(field.grid.shape) - 1)
+    inside = np.clip(nodes - digital.FIRST, 0, np.array(field.grid.shape) - 1)
     cost = edit.cost or float(np.abs(field.values[tuple(inside.T)]).sum())
     share = settings.flag_part if kind == "part" else settings.flag_fraction
     limit = {"cut": settings.flag_cut_cost, "fill": settings.flag_fill_cost}.get(kind, np.inf)
     return Repair(
         kind=kind,
-        voxels=len(where),
+        voxels=len(nodes),
         cost=cost,
         position=(float(center[0]), float(center[1]), float(center[2])),
         subfield=locate(center[None]),
         excess=float("inf")
         if edit.doubtful or (kind == "fill" and _beside_slit(inside, field))
-        else max(cost / max(limit, 1e-9), 0.0 if kind == "uncus" else len(where) / (share * size)),
+        else max(cost / max(limit, 1e-9), 0.0 if kind == "uncus" else len(nodes) / (share * size)),
         points=points,
     )
 
 
-def _beside_slit(nodes: Index, field: Field) -> bool:
+def _beside_slit(nodes: digital.Index, field: Field) -> bool:
     """Whether a hole lies next to a slit between turns, which then went through a wall."""
     if field.separated is None:
         return False
-    near = widened(widened(field.separated))
+    near = digital.widened(digital.widened(field.separated))
     return bool(near[tuple(nodes.T)].any())
 
 
@@ -385,16 +386,18 @@ def repaired_columns(sheet: Sheet, solid: SolidField, settings: MeasureSettings)
     marked = np.zeros(sheet.valid.shape, dtype=bool)
     if not solid.touched.any():
         return marked
-    known = np.asarray(np.isfinite(sheet.points).all(axis=(2, 3)))
-    if not known.any():
+    valid = np.asarray(np.isfinite(sheet.points).all(axis=(2, 3)))
+    if not valid.any():
         return marked
-    nodes, radii = _changed_nodes(solid, sheet.points[known].reshape(-1, 3), settings)
+    nodes, radii = _changed_nodes(solid, sheet.points[valid].reshape(-1, 3), settings)
     gaps = np.stack([_gaps(sheet.points, axis) for axis in (0, 1)], axis=-1)
     # Most columns are far from all repairs: only the others are interpolated.
-    reach = float(radii.max() + gaps[known].max())
+    reach = float(radii.max() + gaps[valid].max())
     tree = cKDTree(nodes)
-    near = np.asarray(tree.query(sheet.points[known], distance_upper_bound=reach)[0])
-    candidates = positions(known)[near.min(axis=1) <= radii.max() + gaps[known].mean(axis=-1)]
+    near = np.asarray(tree.query(sheet.points[valid], distance_upper_bound=reach)[0])
+    candidates = digital.positions(valid)[
+        near.min(axis=1) <= radii.max() + gaps[valid].mean(axis=-1)
+    ]
     if not len(candidates):
         return marked
     widest = gaps[tuple(candidates.T)].max(axis=0)
@@ -423,25 +426,25 @@ def _changed_nodes(
     solid: SolidField, points: Float, settings: MeasureSettings
 ) -> tuple[Float, Float]:
     """Points (N, 3), RAS mm, of changed nodes and faces of cuts, and the reach (N,) of each, mm."""
-    box = box_around(positions(solid.touched))
+    box = digital.box_around(digital.positions(solid.touched))
     inside, touched = solid.field.values[box] > 0, solid.touched[box]
-    faces = widened(touched & ~inside) & inside
+    faces = digital.widened(touched & ~inside) & inside
     cuts, _ = ndimage.label(faces & ~touched)
-    low = low_corner(box)
-    changed = solid.field.grid.to_ras((positions(touched) + low).astype(np.float64))
+    low = digital.low_corner(box)
+    changed = solid.field.grid.to_ras((digital.positions(touched) + low).astype(np.float64))
     radius = np.full(len(changed), settings.repair_reach)
-    where = positions(cuts > 0)
-    if not len(where):
+    nodes = digital.positions(cuts > 0)
+    if not len(nodes):
         return changed, radius
-    face = solid.field.grid.to_ras((where + low).astype(np.float64))
-    number = cuts[tuple(where.T)]
+    face = solid.field.grid.to_ras((nodes + low).astype(np.float64))
+    number = cuts[tuple(nodes.T)]
     distance, _ = cKDTree(points).query(face)
     nearest = np.asarray(ndimage.minimum(distance, number, np.arange(number.max() + 1)))
     stumps = nearest[number] + STUMP_REACH
     return np.vstack([changed, face]), np.concatenate([radius, stumps])
 
 
-def _cells(points: Float, columns: Index, parts: Index) -> Float:
+def _cells(points: Float, columns: digital.Index, parts: digital.Index) -> Float:
     """Interpolate round columns, up to halfway to their neighbors; NaN beside undefined ones."""
     steps = [np.linspace(-0.5, 0.5, int(n) + 1) for n in parts]
     offsets = np.stack(np.meshgrid(*steps, indexing="ij"), axis=-1).reshape(-1, 2)

@@ -294,7 +294,7 @@ def _sample(
     points = np.full((len(x), len(y), len(z), 3), np.nan)
     points[known] = columns
     thickness = np.linalg.norm(np.diff(points, axis=2), axis=3).sum(axis=2)
-    far = np.einsum("xyk,xyk->xy", weights, disk.from_rims[corner]) > margin * np.fmax(
+    far = np.einsum("xyk,xyk->xy", weights, disk.from_edges[corner]) > margin * np.fmax(
         thickness, 1.0
     )
     valid = np.isfinite(points).all(axis=(2, 3)) & far
@@ -320,7 +320,7 @@ def _lost_clefts(
             beside = thick & columns_near(sheet, banks.points, THICK_NEAR)
             columns = sheet.valid & (beside | columns_near(sheet, banks.points, MARGIN))
             what = f"two banks of a fold touch over {banks.area:.0f} mm2: the cleft between them"
-            what += f" on the {banks.lost} side is not in the labels"
+            what += f" on the {banks.side} side is not in the labels"
             found.append(_lost(what, banks.area, FLAG_TOUCHING, banks.points, columns))
             without |= columns
     sheet = replace(sheet, valid=~without)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hipsta_bids.geometry import body as geometry_body
+from hipsta_bids.geometry import completion
 from hipsta_bids.protocols.protocol import Tissue
 from validation import mending
 from validation.cases import Refusal, attempt, measure_reference
@@ -56,7 +56,7 @@ def test_tail_labels_in_the_body_make_a_map_impossible_if_they_are_not_handed_ov
     right = measure_trial(trial)
     assert 0 < right.found <= right.planted
     assert right.same_plane <= right.off + 0.01
-    monkeypatch.setattr(geometry_body, "hand_over", without_handing_over)
+    monkeypatch.setattr(completion, "hand_over", without_handing_over)
     wrong = attempt(measure_trial, trial)
     assert isinstance(wrong, Refusal)
     assert wrong.reason == "label-order"
@@ -70,7 +70,7 @@ def test_an_uncus_is_left_out_with_a_warning_and_noticed_if_it_is_not(monkeypatc
     assert (detached.injury[0], attached.injury[0]) == ("uncus", "attached-uncus")
     right = [measure_trial(detached), measure_trial(attached)]
     assert [outcome.warned for outcome in right] == [True, False]
-    monkeypatch.setattr(geometry_body, "find_uncus", lambda *_: np.zeros((0, 3), np.intp))
+    monkeypatch.setattr(completion, "find_uncus", lambda *_: np.zeros((0, 3), np.intp))
     wrong = measure_trial(attached)
     assert wrong.found == 0
     table = mending._uncus([detached, attached, attached], [*right, wrong])
