@@ -233,9 +233,9 @@ def analyze(cohort: SimulatedCohort, plan: SimulationPlan, settings: GroupSettin
         contrasts=(Contrast(_GROUP, np.array([0.0, 1.0, 0.0, 0.0])),),
     )
     side = thickness_side(warp_values(cohort.thickness, warps))
-    model = RowModel(design)
-    fitted = {"L": fit_maps("L", side, model, settings)}
-    flags = correct(fitted, model, pd.DataFrame(index=range(n)), settings)
+    model = RowModel(design, settings.glm)
+    fitted = {"L": fit_maps("L", side, model)}
+    flags = correct(fitted, model, pd.DataFrame(index=range(n)), settings.multiplicity)
     found = flags[MapKey("thickness", _GROUP, "L")].rejected.reshape(cohort.affected.shape)
     (test,) = (t for t in fitted["L"].fits["thickness"].tests if t.contrast.name == _GROUP)
     count = int(found.sum())

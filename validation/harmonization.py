@@ -116,7 +116,9 @@ def left_over(plan: SitesPlan, seeds: Sequence[int], settings: GroupSettings) ->
     for seed in seeds:
         cohort = simulate_sites(plan, seed)
         visits = cohort.visits(repeated=False)
-        effects, _ = fit_effects(cohort.values, visits, len(plan.sizes), settings, pooled=True)
+        effects, _ = fit_effects(
+            cohort.values, visits, len(plan.sizes), settings.longitudinal, pooled=True
+        )
         weights = np.array(plan.sizes) / sum(plan.sizes)
         truth = np.stack([cohort.shift, np.log(cohort.scale)])
         taken = np.stack([effects.shift * effects.sd, np.log(effects.scale * effects.sd)])
@@ -147,7 +149,9 @@ def analyze_sites(
         values = cohort.values
         if with_combat:
             visits = cohort.visits(repeated=repeated)
-            effects, _ = fit_effects(values, visits, len(plan.sizes), settings, pooled=True)
+            effects, _ = fit_effects(
+                values, visits, len(plan.sizes), settings.longitudinal, pooled=True
+            )
             values = harmonize(values, visits, effects)
         member = np.eye(len(plan.sizes))[cohort.site]
         means = member if with_site else np.ones((len(member), 1))

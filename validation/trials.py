@@ -117,8 +117,12 @@ def simulate_design(design: TrialDesign, trials: int, seed: int = 0) -> dict[str
     random = np.random.default_rng(seed)
     reference = _reference(design, random)
     settings = design.settings
-    alpha = point_level(settings) if design.is_map else settings.power.alpha
-    found = sample_size(design.effect, reference, settings, alpha=alpha)
+    alpha = (
+        point_level(settings.multiplicity, settings.power)
+        if design.is_map
+        else settings.power.alpha
+    )
+    found = sample_size(design.effect, reference, settings.power, alpha=alpha)
     per_arm, enrolled = int(np.median(found["per_arm"])), int(np.median(found["enrolled_per_arm"]))
     if design.is_map:
         shares = [_map_trial(design, per_arm, random) for _ in range(trials)]

@@ -95,14 +95,14 @@ def longitudinal_by_loops(values, site, columns, person):
 
 def test_agrees_with_the_formulas_of_the_papers():
     values, visits = cohort()
-    effects, _ = fit_effects(values, visits, 4, SETTINGS, pooled=True)
+    effects, _ = fit_effects(values, visits, 4, SETTINGS.longitudinal, pooled=True)
     reference = combat_by_loops(values, visits.site, visits.columns)
     np.testing.assert_allclose(harmonize(values, visits, effects), reference, atol=1e-10)
 
 
 def test_repeated_sessions_agree_with_the_formulas_of_the_paper():
     values, visits = cohort(n=60, points=5, visits=3)
-    effects, _ = fit_effects(values, visits, 4, SETTINGS, pooled=True)
+    effects, _ = fit_effects(values, visits, 4, SETTINGS.longitudinal, pooled=True)
     reference = longitudinal_by_loops(values, visits.site, visits.columns, visits.participant)
     # statsmodels' optimum is good to some 1e-6 of a variance.
     np.testing.assert_allclose(harmonize(values, visits, effects), reference, atol=2e-6)
@@ -114,21 +114,23 @@ def test_without_effects_of_sites_values_stay():
     site = np.repeat(np.arange(2), 4000)
     visits = Visits(site=site, columns=np.empty((8000, 0)), participant=None)
     values = random.normal(2.0, 0.3, (8000, 20))
-    effects, _ = fit_effects(values, visits, 2, SETTINGS, pooled=True)
+    effects, _ = fit_effects(values, visits, 2, SETTINGS.longitudinal, pooled=True)
     changed = harmonize(values, visits, effects) - values
     assert np.abs(changed).max() < 0.3 * 0.15
     person = np.arange(8000) // 2
     repeated = Visits(site=site, columns=visits.columns, participant=person)
-    effects, _ = fit_effects(values, repeated, 2, SETTINGS, pooled=True)
+    effects, _ = fit_effects(values, repeated, 2, SETTINGS.longitudinal, pooled=True)
     changed = harmonize(values, repeated, effects) - values
     assert np.abs(changed).max() < 0.3 * 0.15
 
 
 def test_unpooled_sites_have_the_same_mean_and_sd_of_residuals():
     values, visits = cohort()
-    effects, moments = fit_effects(values, visits, 4, SETTINGS, pooled=False)
+    effects, moments = fit_effects(values, visits, 4, SETTINGS.longitudinal, pooled=False)
     assert np.ptp(moments.mean, axis=0).min() > 0.5
-    again = fit_effects(harmonize(values, visits, effects), visits, 4, SETTINGS, pooled=False)[1]
+    again = fit_effects(
+        harmonize(values, visits, effects), visits, 4, SETTINGS.longitudinal, pooled=False
+    )[1]
     np.testing.assert_allclose(moments.after(effects).mean, 0, atol=1e-12)
     np.testing.assert_allclose(moments.after(effects).sd, 1, atol=1e-12)
     # Residuals are those of another fit now, as slopes change a little where scales did.
@@ -141,17 +143,17 @@ def test_missing_values_are_left_out_point_by_point():
     holes[5:30, 2] = np.nan  # of all sites
     holes[visits.site == 1, 3] = np.nan  # a site that lacks a point
     holes[:, 4] = np.nan
-    effects, _ = fit_effects(holes, visits, 4, SETTINGS, pooled=True)
+    effects, _ = fit_effects(holes, visits, 4, SETTINGS.longitudinal, pooled=True)
     found = harmonize(holes, visits, effects)
     np.testing.assert_array_equal(np.isnan(found), np.isnan(holes))
     # Unpooled, a point does not know of others.
-    whole, _ = fit_effects(values, visits, 4, SETTINGS, pooled=False)
-    parts, _ = fit_effects(holes, visits, 4, SETTINGS, pooled=False)
+    whole, _ = fit_effects(values, visits, 4, SETTINGS.longitudinal, pooled=False)
+    parts, _ = fit_effects(holes, visits, 4, SETTINGS.longitudinal, pooled=False)
     apart = harmonize(holes, visits, parts)
     np.testing.assert_allclose(apart[:, :2], harmonize(values, visits, whole)[:, :2], rtol=1e-12)
     kept = np.isfinite(holes[:, 2])
     alone = fit_effects(
-        values[kept, 2:3], visits.take(np.flatnonzero(kept)), 4, SETTINGS, pooled=False
+        values[kept, 2:3], visits.take(np.flatnonzero(kept)), 4, SETTINGS.longitudinal, pooled=False
     )
     np.testing.assert_allclose(
         apart[kept, 2],
@@ -166,7 +168,7 @@ def test_new_people_of_known_sites_are_treated_alike(visits_each):
     old, new = np.arange(0, 200), np.arange(200, len(values))
     if visits_each == 1:
         old, new = np.arange(0, 150), np.arange(150, 200)
-    effects, _ = fit_effects(values[old], visits.take(old), 4, SETTINGS, pooled=True)
+    effects, _ = fit_effects(values[old], visits.take(old), 4, SETTINGS.longitudinal, pooled=True)
     everyone = harmonize(values, visits, effects)
     wide, _ = extend_effects(effects, values[new], visits.take(new), pooled=True)
     np.testing.assert_allclose(
@@ -179,7 +181,7 @@ def test_a_new_site_gets_the_scale_of_the_old_ones():
     old, new = np.flatnonzero(visits.site != 3), np.flatnonzero(visits.site == 3)
     moved = values.copy()
     moved[new] = 2 * moved[new] + 1
-    effects, _ = fit_effects(values[old], visits.take(old), 3, SETTINGS, pooled=True)
+    effects, _ = fit_effects(values[old], visits.take(old), 3, SETTINGS.longitudinal, pooled=True)
     wide, moments = extend_effects(effects, moved[new], visits.take(new), pooled=True)
     np.testing.assert_array_equal(wide.shift[:3], effects.shift)
     found = harmonize(moved[new], visits.take(new), wide)

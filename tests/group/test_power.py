@@ -51,7 +51,7 @@ def test_numbers_at_the_ends():
 
 def test_end_point_of_one_visit_is_a_value():
     effect = TrialEffect(kind="thinning", share=0.05)
-    found = sample_size(effect, REFERENCE, SETTINGS, alpha=0.05, limits=True)
+    found = sample_size(effect, REFERENCE, SETTINGS.power, alpha=0.05, confidence=0.95)
     assert found["arm_difference"][0] == pytest.approx(0.08)
     assert found["sd_endpoint"][0] == pytest.approx(0.2)
     assert found["per_arm"][0] == np.ceil(TTestIndPower().solve_power(0.4, alpha=0.05, power=0.8))
@@ -63,7 +63,7 @@ def test_end_point_of_one_visit_is_a_value():
 def test_end_point_of_several_visits_is_the_slope():
     effect = TrialEffect(kind="slowing", share=0.25, visits=(0, 12, 24))
     settings = SETTINGS.changed(power={"dropout": 0.2})
-    found = sample_size(effect, REFERENCE, settings, alpha=0.05, limits=True)
+    found = sample_size(effect, REFERENCE, settings.power, alpha=0.05, confidence=0.95)
     # Squared deviations of 0, 12 and 24 months from 12 are 288 in all.
     sd = found["sd_endpoint"][0] / 12
     assert sd == pytest.approx(np.sqrt(1e-5 + 0.04 / 288))
@@ -75,10 +75,10 @@ def test_end_point_of_several_visits_is_the_slope():
     assert found["per_arm"][0] < found["enrolled_per_arm"][0] < np.ceil(found["per_arm"][0] / 0.8)
     assert found["per_arm_low"][0] < found["per_arm"][0] < found["per_arm_high"][0]
     over_zero = Reference(**vars(REFERENCE) | {"slope_limits": np.array([[-0.01], [0.002]])})
-    uncertain = sample_size(effect, over_zero, settings, alpha=0.05, limits=True)
+    uncertain = sample_size(effect, over_zero, settings.power, alpha=0.05, confidence=0.95)
     assert np.isnan(uncertain["per_arm_high"][0])
     thinner = TrialEffect(kind="thinning", share=0.05, visits=(0, 12, 24))
-    thinned = sample_size(thinner, REFERENCE, settings, alpha=0.05)
+    thinned = sample_size(thinner, REFERENCE, settings.power, alpha=0.05)
     assert thinned["arm_difference"][0] == pytest.approx(0.08 / 2)
 
 
@@ -88,7 +88,7 @@ def test_slowing_needs_change_and_visits():
     effect = TrialEffect(kind="slowing", share=0.25, visits=(0, 12))
     plain = Reference(**vars(REFERENCE) | {"slope": None})
     with pytest.raises(ModelError, match="was followed"):
-        sample_size(effect, plain, SETTINGS, alpha=0.05)
+        sample_size(effect, plain, SETTINGS.power, alpha=0.05)
 
 
 @pytest.mark.parametrize("method", ["bh", "fdr2"])
@@ -96,7 +96,7 @@ def test_slowing_needs_change_and_visits():
 def test_level_solves_the_procedure_on_average(method, affected):
     """The shares found at the level give the level back, by the definition of the procedure."""
     settings = SETTINGS.changed(power={"affected": affected}, multiplicity={"method": method})
-    level = point_level(settings)
+    level = point_level(settings.multiplicity, settings.power)
     found = affected * 0.8 + (1 - affected) * level
     if method == "bh":
         assert level == pytest.approx(0.05 * found, rel=1e-9)
@@ -114,4 +114,4 @@ def test_level_solves_the_procedure_on_average(method, affected):
 def test_family_wise_corrections_are_refused():
     settings = SETTINGS.changed(multiplicity={"method": "permutation-max"})
     with pytest.raises(UsageError, match="give --correction fdr2 or bh"):
-        point_level(settings)
+        point_level(settings.multiplicity, settings.power)

@@ -16,7 +16,6 @@ from hipsta_bids.geometry.catalog import MAPS, why_impossible
 from hipsta_bids.geometry.sheet import sheet_levels
 from hipsta_bids.group.cohort.collect import Exclusion, SheetRecord
 from hipsta_bids.group.cohort.data import Measures
-from hipsta_bids.group.design.settings import GroupSettings
 from hipsta_bids.group.stats.arrays import MOST_KEPT, Float, SideMaps, blocks
 from hipsta_bids.protocols import EXPERIMENTAL
 from hipsta_bids.settings import SheetSettings
@@ -116,12 +115,13 @@ def read_sheets(
     maps: Sequence[str],
     visits: Sequence[VisitKey] | None = None,
     *,
-    rules: GroupSettings,
+    max_gap: float,
     error_window: int = 0,
 ) -> Measured:
     """Read all sheets and summaries, and the SDs of the maps if they have a window.
 
-    Hemispheres with empty or impossible maps or summaries are left out by ``rules``.
+    Hemispheres with empty or impossible maps or summaries are left out, as those of which a larger
+    share of the curvature profile than ``max_gap`` has no value.
     """
     if error_window:
         _check_errors(records, maps)
@@ -140,7 +140,7 @@ def read_sheets(
             side = _read_side(records_of_side, np.array(rows, dtype=np.int64), shape, names)
             columns = {str(name): one.to_numpy() for name, one in side.summary.items()}
             doubtful = {name: one for name, one in columns.items() if why_impossible(name, one)}
-            problems = [_damage(side, i, doubtful, rules) for i in range(len(records_of_side))]
+            problems = [_damage(side, i, doubtful, max_gap) for i in range(len(records_of_side))]
             found = [
                 Exclusion.of_sheet(record.place.name, "damaged-map", text)
                 for record, text in zip(records_of_side, problems, strict=True)
@@ -191,13 +191,11 @@ def leave_rare(values: Float) -> None:
     values[:, finite[measured].sum(axis=0) < LEAST_SHARE * measured.sum()] = np.nan
 
 
-def _damage(
-    side: SideMaps, i: int, doubtful: Mapping[str, Float], rules: GroupSettings
-) -> str | None:
+def _damage(side: SideMaps, i: int, doubtful: Mapping[str, Float], max_gap: float) -> str | None:
     """Say why a hemisphere cannot be used, if it cannot, by maps and ``doubtful`` summaries."""
     curvature = side.maps[CURVATURE][i]
     gap = float((~np.isfinite(curvature)).all(axis=1).mean())
-    if gap > rules.registration.max_gap:
+    if gap > max_gap:
         return f"{gap:.0%} of the curvature profile has no value"
     if THICKNESS in side.maps and not np.isfinite(side.maps[THICKNESS][i]).any():
         return "no point of the thickness map has a value"

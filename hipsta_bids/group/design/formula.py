@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.design.grammar import CONTEXT, closed_formula
-from hipsta_bids.group.design.settings import DesignSettings, GroupSettings
+from hipsta_bids.group.design.settings import DefaultModelSettings, DesignSettings
 from hipsta_bids.types import Float, Int64
 
 #: A column with text is taken for a damaged number if more of it than this is numbers.
@@ -260,9 +260,11 @@ def check_names(names: Iterable[str], columns: pd.Index) -> None:
             raise ModelError(f"model: the table has no column {name!r}; {hint}")
 
 
-def with_factors(table: pd.DataFrame, settings: GroupSettings) -> pd.DataFrame:
+def with_factors(
+    table: pd.DataFrame, design: DesignSettings, model: DefaultModelSettings
+) -> pd.DataFrame:
     """Make factors, of pandas' type, of the columns that are some by their name."""
-    factor_names = (*settings.design.factors, *settings.model.group_columns)
+    factor_names = (*design.factors, *model.group_columns)
     names = {name.casefold() for name in factor_names}
     factors = [
         column

@@ -8,7 +8,6 @@ import numpy as np
 import pandas as pd
 
 from hipsta_bids.group.cohort.data import Cohort
-from hipsta_bids.group.design.settings import GroupSettings
 from hipsta_bids.group.output.columns import find_clusters, frame_of
 from hipsta_bids.group.output.panels import Row, Views, draw_pages
 from hipsta_bids.group.output.shapes import AverageShape
@@ -68,7 +67,7 @@ def joint_points(joint_map: JointMap) -> pd.DataFrame:
     return pd.DataFrame(columns)
 
 
-def joint_peaks(joint: Sequence[JointMap], settings: GroupSettings) -> pd.DataFrame:
+def joint_peaks(joint: Sequence[JointMap], neighbors: int) -> pd.DataFrame:
     """List clusters with their peaks; of a map without findings its strongest point."""
     rows = []
     for joint_map in joint:
@@ -77,7 +76,7 @@ def joint_peaks(joint: Sequence[JointMap], settings: GroupSettings) -> pd.DataFr
             joint_map.tests,
             joint_map.test.statistic,
         )
-        edges = edges_of(joint_map.place.maps, settings.multiplicity.neighbors)
+        edges = edges_of(joint_map.place.maps, neighbors)
         for cluster in find_clusters(joint_map.found.rejected, z, frame.subfield, edges):
             at = cluster.peak
             words = [

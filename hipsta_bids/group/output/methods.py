@@ -513,7 +513,7 @@ def power_text(
         f" power of {plan.power:g}{dropout}. {end} Means, changes and variances are those of"
         f" {source(cite)}. Power is that of Student's two-sided t test (non-central t), at the"
         f" level {plan.alpha:g} for a summary measure, without correction, since a trial has one"
-        f" primary end point. At single points the level is {point_level(settings):.2g}: at that"
+        f" primary end point. At single points the level is {point_level(rules, plan):.2g}: at that"
         f" level {PROCEDURES[rules.method]} {cite(rules.method)} holds the false discovery rate at"
         f" {rules.alpha:g} if"
         f" {100 * plan.affected:g} % of the points of a map differ and are found with this power"

@@ -13,7 +13,7 @@ from hipsta_bids.geometry.sheet import is_left_handed
 from hipsta_bids.group.cohort.collect import SheetRecord
 from hipsta_bids.group.cohort.data import Cohort
 from hipsta_bids.group.cohort.read import visit_name
-from hipsta_bids.group.design.settings import GroupSettings
+from hipsta_bids.group.design.settings import ShapeSettings
 from hipsta_bids.group.output.results import Analysis, members_of
 from hipsta_bids.group.stats.arrays import Float, mean_of_known
 from hipsta_bids.group.stats.warps import warp_values
@@ -130,7 +130,7 @@ def _read_layers(places: Sequence[ResultPlace], shape: tuple[int, int]) -> tuple
 
 
 def average_shapes(
-    records: Sequence[SheetRecord], cohort: Cohort, analysis: Analysis, settings: GroupSettings
+    records: Sequence[SheetRecord], cohort: Cohort, analysis: Analysis, settings: ShapeSettings
 ) -> dict[str, AverageShape]:
     """Average the surfaces of each hemisphere, of the first visit of each participant."""
     names = [(record.place.name, record.place) for record in records]
@@ -139,7 +139,7 @@ def average_shapes(
     for hemi, side in analysis.sides.items() if records else ():
         visits = cohort.table.iloc[side.registered.rows]
         first = np.flatnonzero(~visits[PARTICIPANT].duplicated().to_numpy())
-        count = min(len(first), settings.shapes.most)
+        count = min(len(first), settings.most)
         rows = first[np.linspace(0, len(first) - 1, count).round().astype(np.int64)]
         keys = [(str(name), hemi) for name in visits.index[rows]]
         rows = rows[[key in place_of for key in keys]]

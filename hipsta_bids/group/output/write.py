@@ -416,7 +416,10 @@ def _write_joint(folder: Path, joint: Sequence[JointMap], settings: GroupSetting
     if not joint:
         return
     write_table(
-        folder, f"{JOINT}_peaks", joint_peaks(joint, settings), meaning=tables.JOINT_COLUMNS
+        folder,
+        f"{JOINT}_peaks",
+        joint_peaks(joint, settings.multiplicity.neighbors),
+        meaning=tables.JOINT_COLUMNS,
     )
     for joint_map in joint:
         name = tables.map_name(joint_map.key.hemi, joint_map.key.measure, joint_map.key.contrast)

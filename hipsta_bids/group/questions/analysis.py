@@ -100,11 +100,18 @@ def analyze_cohort(
     if comparison.pair or not design.contrasts:
         design = replace(design, contrasts=with_mean(design))
 
-    make_rows: Callable[[designs.Design], RowModel] = RowModel
+    make_rows: Callable[[designs.Design], RowModel] = partial(RowModel, settings=settings.glm)
     if comparison.longitudinal:
-        make_rows = partial(longitudinal_model, table=table, time=time, settings=settings)
+        make_rows = partial(
+            longitudinal_model,
+            table=table,
+            time=time,
+            settings=settings.glm,
+            longitudinal=settings.longitudinal,
+        )
     rows = make_rows(design)
-    inference.check_permutations(settings)
+    joint = bool(settings.joint.measures)
+    inference.check_permutations(settings.multiplicity, settings.glm, joint=joint)
     _check_weights(comparison, settings)
     sides = {
         hemi: register_side(cohort, hemi, groups=groups, settings=settings, templates=templates)
@@ -140,7 +147,7 @@ def analyze_cohort(
         compared,
         model,
         design,
-        settings,
+        settings.design,
         names=measures.summaries,
         references=references,
         icv=icv,
@@ -150,7 +157,7 @@ def analyze_cohort(
     if done is not None and groups is not None and done.leaks(groups.column):
         told = data.compare_sessions(measured, comparison)
     once = told.take(~table[PARTICIPANT].duplicated().to_numpy())
-    pairs, more = classify_groups(once, groups, settings) if groups else ([], [])
+    pairs, more = classify_groups(once, groups, settings.classification) if groups else ([], [])
     return results.Analysis(
         model=model,
         comparison=comparison,
@@ -251,7 +258,7 @@ def _fit_cohort(
         cohort if harmonization is None else harmonization.cohort, comparison
     )
     fitted = {
-        hemi: fit_maps(hemi, side.only(maps), rows, settings)
+        hemi: fit_maps(hemi, side.only(maps), rows)
         for hemi, side in each("models", list(compared.sides.items()) if maps else [])
     }
     if comparison.asymmetry and maps:
@@ -259,14 +266,12 @@ def _fit_cohort(
         relative = () if comparison.pair else settings.asymmetry.relative
         difference = data.asymmetry_maps(compared, maps, relative)
         contrasts = with_mean(rows.design)
-        fitted[designs.BOTH] = fit_maps(
-            designs.BOTH, difference, rows, settings, contrasts=contrasts
-        )
+        fitted[designs.BOTH] = fit_maps(designs.BOTH, difference, rows, contrasts=contrasts)
     return (
         harmonization,
         compared,
         fitted,
-        inference.correct(fitted, rows, compared.table, settings),
+        inference.correct(fitted, rows, compared.table, settings.multiplicity),
     )
 
 
@@ -426,7 +431,12 @@ def combine_maps(
         raise ModelError(f"--joint {' '.join(names)}: no side has them all; leave one out")
     model = analyses[0].row_model
     tests_found = inference.correct_joint(
-        groups, contrasts, model, analyses[0].compared.table, settings
+        groups,
+        contrasts,
+        model,
+        analyses[0].compared.table,
+        settings.multiplicity,
+        combine=settings.joint.combine,
     )
     return {
         key: JointMap(key=key, parts=groups[key], cohort=cohort, test=test, found=own)

@@ -87,7 +87,7 @@ def _analyze(options: study.GroupOptions, settings: GroupSettings) -> study.Grou
     notes = [*inputs.notes, *_notes(options, inputs, analysis, settings)]
     summary = _summary(options, inputs, analysis, settings, notes)
     tell("average surfaces")
-    shapes = average_shapes(inputs.found.records, cohort, analysis, settings)
+    shapes = average_shapes(inputs.found.records, cohort, analysis, settings.shapes)
     # One is enough from here on, and all may take much memory.
     inputs = replace(inputs, found=replace(inputs.found, records=inputs.found.records[:1]))
 

@@ -348,7 +348,8 @@ def _effects(
 ) -> tuple[combat.SiteEffects, combat.SiteMoments]:
     pooled = settings.harmonization.pooling and not summary
     if plan.saved is None:
-        return combat.fit_effects(values, visits, len(plan.sites), settings, pooled=pooled)
+        n, longitudinal = len(plan.sites), settings.longitudinal
+        return combat.fit_effects(values, visits, n, longitudinal, pooled=pooled)
     saved_effects = plan.saved.effects_on_summaries if summary else plan.saved.effects_on_maps
     if key not in saved_effects:
         raise ModelError(

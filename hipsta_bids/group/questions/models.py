@@ -15,7 +15,7 @@ from hipsta_bids.group.design.model import Design, ModelRequest, build_design, c
 from hipsta_bids.group.design.settings import GroupSettings, load_group_settings
 from hipsta_bids.group.stats.arrays import Bool, Float, SideMaps
 from hipsta_bids.group.stats.glm import FittedMaps, PointTest, RowModel, fit_maps
-from hipsta_bids.group.stats.inference import Discoveries, MapKey, correct
+from hipsta_bids.group.stats.inference import Discoveries, MapKey, check_permutations, correct
 from hipsta_bids.types import PARTICIPANT, Mesh
 
 if TYPE_CHECKING:
@@ -233,18 +233,19 @@ def group(
         and any(values.ndim == _VERTICES for values in sides.values())
     ):
         raise ValueError("clusters of vertices need triangles, (faces, 3)")
-    table = with_factors(table, settings)
+    table = with_factors(table, settings.design, settings.model)
     _, spec, _, levels = choose_model(request, table, settings)
     design = build_design(table, spec, settings.design, levels)
-    model = RowModel(design)
+    model = RowModel(design, settings.glm)
+    check_permutations(settings.multiplicity, settings.glm)
     side_maps = {side: _side(values, measure, triangles) for side, values in sides.items()}
-    fitted = {side: fit_maps(side, one, model, settings) for side, one in side_maps.items()}
+    fitted = {side: fit_maps(side, one, model) for side, one in side_maps.items()}
     return GroupFit(
         measure=measure,
         unit=unit,
         design=design,
         fitted=fitted,
-        found=correct(fitted, model, table, settings),
+        found=correct(fitted, model, table, settings.multiplicity),
         axes=axes,
     )
 

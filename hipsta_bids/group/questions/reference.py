@@ -158,10 +158,10 @@ class Modeled:
         self.spec = parse_model(model_from_shortcut(formula, contrasts, "reference"))
         design = build_design(table, self.spec, settings.design, dict(request.references))
         self._table, self._settings = table, settings
-        self.model = RowModel(replace(design, contrasts=()))
+        self.model = RowModel(replace(design, contrasts=()), settings.glm)
         if self.time is not None:
-            slopes = settings.changed(longitudinal={"random": "slope"})
-            self.model = longitudinal_model(design, table, self.time, slopes)
+            slopes = settings.longitudinal.changed(random="slope")
+            self.model = longitudinal_model(design, table, self.time, settings.glm, slopes)
 
     @property
     def months(self) -> float:
@@ -185,14 +185,14 @@ class Modeled:
         """Fit the model, and describe mean, change and variances at each point."""
         points = None
         if isinstance(layer.source, SideMaps):
-            points = fit_maps(layer.hemi, layer.source, self.model, self._settings)
+            points = fit_maps(layer.hemi, layer.source, self.model)
             data, fit = points.values(layer.measure), points.fits[layer.measure]
             rows = layer.rows[points.used]
         else:
             rows, data = layer.rows, layer.data
             rows_known = np.flatnonzero(np.isfinite(data[:, 0]))
             contrasts = self.model.design.contrasts
-            fit = self.model.fit_measures(data[rows_known], rows_known, contrasts, self._settings)
+            fit = self.model.fit_measures(data[rows_known], rows_known, contrasts)
         return Described(
             layer=layer,
             tables={},

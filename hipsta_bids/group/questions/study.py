@@ -185,7 +185,9 @@ def read_inputs(options: GroupOptions, settings: GroupSettings) -> GroupInputs:
     read.check_summaries(measures, measured.sides)
     all_visits = Cohort(
         table=with_factors(
-            read_covariates(measured.visits, options.bids_dir, options.covariates), settings
+            read_covariates(measured.visits, options.bids_dir, options.covariates),
+            settings.design,
+            settings.model,
         ),
         sides=measured.sides,
         x=measured.x,
@@ -249,7 +251,12 @@ def _read_maps(
             " weights out"
         )
     measured = read.read_sheets(
-        found.records, found.grid, own, visits, rules=rules, error_window=error_window
+        found.records,
+        found.grid,
+        own,
+        visits,
+        max_gap=rules.registration.max_gap,
+        error_window=error_window,
     )
     return external.add_external(measured, files_of, visits)
 

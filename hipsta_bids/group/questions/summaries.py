@@ -11,7 +11,7 @@ from hipsta_bids.group.cohort.data import Cohort, hemispheres, participants_with
 from hipsta_bids.group.design.formula import Contrast, ModelSpec, check_names, typed
 from hipsta_bids.group.design.grammar import closed_formula
 from hipsta_bids.group.design.model import Design, Groups, build_design
-from hipsta_bids.group.design.settings import GroupSettings
+from hipsta_bids.group.design.settings import ClassificationSettings, DesignSettings
 from hipsta_bids.group.output.results import MeasureFit
 from hipsta_bids.group.stats.arrays import Float
 from hipsta_bids.group.stats.classify import PairComparison, compare_pairs, forget_models
@@ -24,12 +24,12 @@ def fit_summaries(
     cohort: Cohort,
     model: ModelSpec,
     design: Design,
-    settings: GroupSettings,
+    settings: DesignSettings,
     *,
     names: Sequence[str] | None,
     references: Mapping[str, str],
     icv: str | None,
-    rows_of: Callable[[Design], RowModel] = RowModel,
+    rows_of: Callable[[Design], RowModel],
 ) -> tuple[list[MeasureFit], list[str]]:
     """Fit the model of the maps to all summary measures; volumes also with intracranial volume."""
     fits: list[MeasureFit] = []
@@ -50,7 +50,7 @@ def fit_summaries(
                     hemi=hemi,
                     measures=tuple(values.columns),
                     formula=formula,
-                    fit=model.fit_measures(maps, present, model.design.contrasts, settings),
+                    fit=model.fit_measures(maps, present, model.design.contrasts),
                     participants=participants_with(np.isfinite(maps), participants),
                 )
             )
@@ -64,7 +64,7 @@ def fit_summaries(
         return fits, []
     try:
         adjusted = replace(model, formula=f"{model.formula} + {icv}")
-        larger = build_design(cohort.table, adjusted, settings.design, references)
+        larger = build_design(cohort.table, adjusted, settings, references)
         larger = replace(larger, contrasts=_same_names(larger, design))
     except ModelError as error:
         return fits, [f"volumes are not adjusted for {icv}: {error}"]
@@ -80,16 +80,16 @@ def _same_names(larger: Design, design: Design) -> tuple[Contrast, ...]:
 
 
 def classify_groups(
-    cohort: Cohort, groups: Groups, settings: GroupSettings
+    cohort: Cohort, groups: Groups, settings: ClassificationSettings
 ) -> tuple[list[tuple[str, str, PairComparison]], list[str]]:
     """Compare each pair of groups by base measures, and by each further measure on top."""
     names = cohort.table[groups.column].astype(object)
     labels = names.where(names.notna(), "").astype(str).to_numpy(dtype=np.str_)
     results: list[tuple[str, str, PairComparison]] = []
     notes: list[str] = []
-    if groups.column in settings.classification.base:
+    if groups.column in settings.base:
         raise UsageError(f"--base {groups.column}: that is what is told apart")
-    hemis, added = hemispheres(cohort), settings.classification.added
+    hemis, added = hemispheres(cohort), settings.added
     for part, hemi in enumerate(hemis):
         values = summary_values(cohort, hemi)
         if values.columns.empty:
@@ -98,14 +98,14 @@ def classify_groups(
         measured = values.columns[values.notna().any().to_numpy()]
         for number, measure in enumerate(added, start=part * len(added)):
             tell("classification", number, len(hemis) * len(added))
-            if measure not in measured or measure in settings.classification.base:
+            if measure not in measured or measure in settings.base:
                 continue
             try:
                 pairs = compare_pairs(
                     labels,
                     base,
                     values[[measure]].to_numpy(dtype=np.float64),
-                    settings.classification,
+                    settings,
                     order=groups.levels,
                 )
             except ModelError as error:
@@ -116,9 +116,9 @@ def classify_groups(
     return results, notes
 
 
-def _base(cohort: Cohort, values: pd.DataFrame, settings: GroupSettings) -> Float:
+def _base(cohort: Cohort, values: pd.DataFrame, settings: ClassificationSettings) -> Float:
     """Columns of the base model, from the summaries or the covariates."""
-    names = settings.classification.base
+    names = settings.base
     check_names(names, values.columns.union(cohort.table.columns, sort=False))
     columns = []
     for name in names:

@@ -60,7 +60,7 @@ def run_trial(
     """
     dataset.check_own_dataset(options.out_dir)
     if effect is not None:
-        trials.point_level(settings)  # refuses before anything is read
+        trials.point_level(settings.multiplicity, settings.power)  # refuses before anything is read
     visits = bool(effect and effect.visits)
     options = replace(options, comparison=Comparison(longitudinal=retest or visits))
     study, repeated = studies.Study.read(options, among, settings), None
@@ -107,7 +107,10 @@ def run_trial(
         "retest": repeated and {"participants": people, "sessions": repeated.sessions},
         "power": effect
         and asdict(effect)
-        | {"alpha_point": trials.point_level(settings), "most": trials.MOST_PARTICIPANTS},
+        | {
+            "alpha_point": trials.point_level(settings.multiplicity, settings.power),
+            "most": trials.MOST_PARTICIPANTS,
+        },
         "among": among,
     }
     name = ["retest"] if retest else []
@@ -136,8 +139,11 @@ def _sample_sizes(
         if not single:
             return {}
         moments = replace(moments, mean=np.full_like(moments.mean, np.nan))
-    alpha = settings.power.alpha if single else trials.point_level(settings)
-    return {"power": trials.sample_size(effect, moments, settings, alpha=alpha, limits=single)}
+    plan = settings.power
+    alpha = plan.alpha if single else trials.point_level(settings.multiplicity, plan)
+    confidence = settings.glm.confidence if single else None
+    size = trials.sample_size(effect, moments, plan, alpha=alpha, confidence=confidence)
+    return {"power": size}
 
 
 def _notes(

@@ -12,7 +12,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from hipsta_bids.group.design.formula import Contrast
-from hipsta_bids.group.design.settings import GroupSettings
+from hipsta_bids.group.design.settings import LongitudinalSettings
 from hipsta_bids.group.stats.arrays import Bool, Float, Int
 from hipsta_bids.group.stats.glm import chunks, products_of, sum_by
 from hipsta_bids.group.stats.mixed import fit_mixed
@@ -82,7 +82,7 @@ class SiteMoments:
 
 
 def fit_effects(
-    values: Float, visits: Visits, n_sites: int, settings: GroupSettings, *, pooled: bool
+    values: Float, visits: Visits, n_sites: int, settings: LongitudinalSettings, *, pooled: bool
 ) -> tuple[SiteEffects, SiteMoments]:
     """Estimate the effects of sites on values (visits, points), NaN where missing.
 
@@ -120,7 +120,7 @@ def fit_effects(
         any_contrast = Contrast("", np.eye(len(columns_used))[:1])
         names = visits.participant.astype(np.str_)
         values_here, matrix = values[:, varies], design[:, columns_used]
-        fit = fit_mixed(values_here, matrix, names, [any_contrast], settings.longitudinal)
+        fit = fit_mixed(values_here, matrix, names, [any_contrast], settings)
         coefficients[:, varies] = 0.0
         coefficients[np.ix_(columns_used, varies)] = fit.coefficients
         ratio[varies] = fit.variances["participant"] / fit.variances["residual"]

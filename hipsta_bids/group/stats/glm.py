@@ -12,7 +12,7 @@ from statsmodels.regression.linear_model import OLS
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.design.formula import Contrast
 from hipsta_bids.group.design.model import Design
-from hipsta_bids.group.design.settings import GlmSettings, GroupSettings
+from hipsta_bids.group.design.settings import GlmSettings
 from hipsta_bids.group.stats.arrays import Bool, Float, Int, SideMaps, parts_of_sheets, sheets_of
 from hipsta_bids.group.stats.exchangeability import Visits
 
@@ -422,23 +422,22 @@ class RowModel:
     """A linear model of independent rows of a design."""
 
     design: Design
+    settings: GlmSettings
 
     @property
     def visits(self) -> Visits | None:
         """Whose each row is, where participants have several."""
         return None
 
-    def fit(
-        self, values: Float, rows: Int, contrasts: tuple[Contrast, ...], settings: GroupSettings
-    ) -> PointwiseFit:
+    def fit(self, values: Float, rows: Int, contrasts: tuple[Contrast, ...]) -> PointwiseFit:
         """Fit some rows of the design at each point."""
-        return fit_points(values, self.design.matrix[rows], contrasts, settings.glm)
+        return fit_points(values, self.design.matrix[rows], contrasts, self.settings)
 
     def fit_measures(
-        self, values: Float, rows: Int, contrasts: tuple[Contrast, ...], settings: GroupSettings
+        self, values: Float, rows: Int, contrasts: tuple[Contrast, ...]
     ) -> PointwiseFit:
         """Fit some rows of the design to each summary measure."""
-        return fit_measures(values, self.design.matrix[rows], contrasts, settings.glm)
+        return fit_measures(values, self.design.matrix[rows], contrasts, self.settings)
 
 
 def with_mean(design: Design) -> tuple[Contrast, ...]:
@@ -483,7 +482,6 @@ def fit_maps(
     hemi: str,
     side: SideMaps,
     model: RowModel,
-    settings: GroupSettings,
     *,
     contrasts: tuple[Contrast, ...] | None = None,
 ) -> FittedMaps:
@@ -496,13 +494,13 @@ def fit_maps(
     try:
         for name in side.maps:
             # Maps of a large cohort are made here: without a name, one is gone before the next.
-            if settings.glm.weights == "none":
-                fits[name] = model.fit(_values(side.maps[name], positions), rows, tested, settings)
+            if model.settings.weights == "none":
+                fits[name] = model.fit(_values(side.maps[name], positions), rows, tested)
             else:
                 errors = _values(side.errors[name], positions)
                 matrix = model.design.matrix[rows]
                 fits[name] = fit_points(
-                    _values(side.maps[name], positions), matrix, tested, settings.glm, errors
+                    _values(side.maps[name], positions), matrix, tested, model.settings, errors
                 )
     except ModelError as error:
         raise ModelError(f"hemisphere {hemi}: {error}") from error

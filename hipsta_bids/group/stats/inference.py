@@ -13,7 +13,7 @@ from statsmodels.stats.multitest import multipletests
 
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.design.formula import Contrast, check_names, listed
-from hipsta_bids.group.design.settings import GlmSettings, GroupSettings, MultiplicitySettings
+from hipsta_bids.group.design.settings import GlmSettings, MultiplicitySettings
 from hipsta_bids.group.stats import exchangeability
 from hipsta_bids.group.stats.arrays import Bool, Float, Int
 from hipsta_bids.group.stats.clusters import edges_of, enhance
@@ -400,16 +400,17 @@ def correct_joint(
     contrasts: Mapping[str, Contrast],
     model: RowModel,
     table: pd.DataFrame,
-    settings: GroupSettings,
+    rules: MultiplicitySettings,
+    *,
+    combine: str,
 ) -> dict[MapKey, tuple[PermutationTest, Discoveries]]:
     """Test maps together that have the same points: fits and measures by title, by result."""
-    rules = settings.multiplicity
     if rules.method not in PERMUTATIONS:
         rules = rules.changed(method=_MAXIMUM)
 
     def part(key: MapKey) -> JointPart:
         parts = [_part(*one, model, rules) for one in groups[key].values()]
-        return JointPart(parts, settings.joint.combine)
+        return JointPart(parts, combine)
 
     tested = {key: contrasts[key.contrast] for key in groups}
     return _permuted(tested, part, row_blocks(model, table, rules), rules)
@@ -464,10 +465,12 @@ def _part(
 
 
 def correct(
-    fitted: Mapping[str, FittedMaps], model: RowModel, table: pd.DataFrame, settings: GroupSettings
+    fitted: Mapping[str, FittedMaps],
+    model: RowModel,
+    table: pd.DataFrame,
+    rules: MultiplicitySettings,
 ) -> dict[MapKey, Discoveries]:
     """Tell which points survive, in families."""
-    rules = settings.multiplicity
     tests = {
         MapKey(measure, test.contrast.name, hemi): test
         for hemi, one in fitted.items()
@@ -476,7 +479,6 @@ def correct(
     }
     if rules.method not in PERMUTATIONS:
         return discover({key: test.p for key, test in tests.items()}, rules)
-    check_permutations(settings)
     permuted = _permuted(
         {key: test.contrast for key, test in tests.items()},
         lambda key: _part(fitted[key.hemi], key.measure, model, rules),
@@ -487,11 +489,11 @@ def correct(
     return {key: permuted[key][1] for key in tests}
 
 
-def check_permutations(settings: GroupSettings) -> None:
+def check_permutations(
+    rules: MultiplicitySettings, settings: GlmSettings, *, joint: bool = False
+) -> None:
     """Refuse permutations where rows cannot be exchanged."""
-    if settings.multiplicity.method not in PERMUTATIONS and not settings.joint.measures:
-        return
-    if settings.glm.covariance != "ordinary":
+    if (rules.method in PERMUTATIONS or joint) and settings.covariance != "ordinary":
         raise ModelError("permutations assume equal variances; set glm.covariance to ordinary")
 
 

@@ -11,7 +11,7 @@ from scipy import special
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.design.formula import Contrast
 from hipsta_bids.group.design.model import Design
-from hipsta_bids.group.design.settings import GroupSettings, LongitudinalSettings
+from hipsta_bids.group.design.settings import GlmSettings, LongitudinalSettings
 from hipsta_bids.group.stats import glm, random_slope
 from hipsta_bids.group.stats.arrays import Bool, Float, Int
 from hipsta_bids.group.stats.exchangeability import Visits
@@ -384,6 +384,7 @@ class RepeatedRows(glm.RowModel):
     """(rows,) of each visit, if known."""
     slopes: bool
     """Whether participants have slopes over time, or intercepts only."""
+    longitudinal: LongitudinalSettings
 
     @property
     def visits(self) -> Visits | None:
@@ -391,31 +392,33 @@ class RepeatedRows(glm.RowModel):
         people = np.unique(self.participants, return_inverse=True)[1]
         return Visits(np.asarray(people, dtype=np.int64), self.times, self.slopes)
 
-    def fit(
-        self, values: Float, rows: Int, contrasts: tuple[Contrast, ...], settings: GroupSettings
-    ) -> glm.PointwiseFit:
+    def fit(self, values: Float, rows: Int, contrasts: tuple[Contrast, ...]) -> glm.PointwiseFit:
         """Fit some rows of the design at each point."""
         return fit_mixed(
             values,
             self.design.matrix[rows],
             self.participants[rows],
             contrasts,
-            settings.longitudinal,
+            self.longitudinal,
             times=self.times[rows] if self.times is not None and self.slopes else None,
         )
 
     def fit_measures(
-        self, values: Float, rows: Int, contrasts: tuple[Contrast, ...], settings: GroupSettings
+        self, values: Float, rows: Int, contrasts: tuple[Contrast, ...]
     ) -> glm.PointwiseFit:
         """Fit some rows of the design to each summary measure, as if it were a point."""
-        return self.fit(values, rows, contrasts, settings)
+        return self.fit(values, rows, contrasts)
 
 
 def longitudinal_model(
-    design: Design, table: pd.DataFrame, time: str | None, settings: GroupSettings
+    design: Design,
+    table: pd.DataFrame,
+    time: str | None,
+    settings: GlmSettings,
+    longitudinal: LongitudinalSettings,
 ) -> RepeatedRows:
     """Assign visits to participants, with their times if slopes are random."""
-    if settings.glm.covariance != "ordinary":
+    if settings.covariance != "ordinary":
         raise ModelError(
             "longitudinal model: it assumes equal variances; set glm.covariance to ordinary"
         )
@@ -423,17 +426,18 @@ def longitudinal_model(
     times = None if time is None else rows_table[time].to_numpy(dtype=np.float64)
     visits = rows_table[PARTICIPANT].value_counts()
     n_repeated = int((visits >= _SLOPE_SESSIONS).sum())
-    has_slopes = times is not None and n_repeated >= settings.longitudinal.slope_participants
-    random = settings.longitudinal.random
+    has_slopes = times is not None and n_repeated >= longitudinal.slope_participants
+    random = longitudinal.random
     slopes = random == "slope" or (random == "auto" and has_slopes)
     if slopes and times is None:
         raise ModelError(
             "longitudinal model: random slopes need the time of each session; give a column"
-            f" {settings.longitudinal.time_columns[0]} or acq_time in sessions.tsv"
+            f" {longitudinal.time_columns[0]} or acq_time in sessions.tsv"
         )
     if times is not None and not np.isfinite(times).all():
         if slopes:
             lacking = ", ".join(map(str, rows_table.index[~np.isfinite(times)][:8]))
             raise ModelError(f"longitudinal model: no {time} of {lacking}")
         times = None
-    return RepeatedRows(design, rows_table[PARTICIPANT].to_numpy(dtype=np.str_), times, slopes)
+    people = rows_table[PARTICIPANT].to_numpy(dtype=np.str_)
+    return RepeatedRows(design, settings, people, times, slopes, longitudinal)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy import special, stats
 
 from hipsta_bids.errors import ModelError, UsageError
-from hipsta_bids.group.design.settings import GroupSettings, MultiplicitySettings
+from hipsta_bids.group.design.settings import MultiplicitySettings, PowerSettings
 from hipsta_bids.group.stats.arrays import Bool, Float
 
 #: More participants per arm are not looked for.
@@ -73,10 +73,10 @@ class TrialEffect:
 def sample_size(
     effect: TrialEffect,
     reference: Reference,
-    settings: GroupSettings,
+    settings: PowerSettings,
     *,
     alpha: float,
-    limits: bool = False,
+    confidence: float | None = None,
 ) -> dict[str, Any]:
     """Return the columns of the table of sample sizes: participants per arm for the power asked.
 
@@ -85,12 +85,11 @@ def sample_size(
     is that of true slopes plus that within participants over the sum of squared times (Ard and
     Edland 2011). The test is Student's for two groups, so that power is that of the non-central t.
     """
-    target_power = settings.power.power
     sd = endpoint_sd(effect, reference)
     difference = _difference(effect, reference.mean, reference.slope)
-    per_arm = participants_needed(difference / sd, alpha, target_power, MOST_PARTICIPANTS)
+    per_arm = participants_needed(difference / sd, alpha, settings.power, MOST_PARTICIPANTS)
     ends = {}
-    if limits:
+    if confidence is not None:
         if effect.kind == SLOWING and reference.slope_limits is not None:
             low, high = reference.slope_limits
             # Where the slope may be zero, no number is enough.
@@ -98,13 +97,13 @@ def sample_size(
             largest = np.maximum(abs(low), abs(high))
             d = np.stack([largest, least]) * effect.share / sd
         else:
-            tail = (1 - settings.glm.confidence) / 2
+            tail = (1 - confidence) / 2
             chi = stats.chi2.ppf(np.array([[1 - tail], [tail]]), reference.freedom)
             d = difference / sd * np.sqrt(chi / reference.freedom)
-        low, high = participants_needed(d, alpha, target_power, MOST_PARTICIPANTS)
+        low, high = participants_needed(d, alpha, settings.power, MOST_PARTICIPANTS)
         ends = {"per_arm_low": low, "per_arm_high": high}
     per_year = _YEAR if effect.visits else 1.0
-    left = information_left(effect, reference, settings.power.dropout)
+    left = information_left(effect, reference, settings.dropout)
     return {
         "n": reference.n,
         "mean": reference.mean,
@@ -181,7 +180,7 @@ def participants_needed(d: Float, alpha: float, power: float, limit: int) -> Flo
     return np.where(is_enough, high, np.nan)
 
 
-def point_level(settings: GroupSettings) -> float:
+def point_level(rules: MultiplicitySettings, plan: PowerSettings) -> float:
     """Level of the test at a point that holds the false discovery rate, on average.
 
     If a share a of the points differs, and is found with the power P, while the rest are found
@@ -190,7 +189,6 @@ def point_level(settings: GroupSettings) -> float:
     two-stage procedure does it with q / (1 + q), and again with q / (1 + q) over the share of
     points not found in the first stage; its power in the first stage is that of the level there.
     """
-    rules, plan = settings.multiplicity, settings.power
     if rules.method not in {"fdr2", "bh"}:
         raise UsageError(
             f"--power: participants per point are known for false discovery rates, not for"
