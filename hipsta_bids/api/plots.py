@@ -11,6 +11,7 @@ from hipsta_bids.api.maps import Measurement, attributes, check_choice
 from hipsta_bids.geometry.catalog import MAPS
 from hipsta_bids.group.questions.models import GroupFit
 from hipsta_bids.io.gifti import sheet_triangles
+from hipsta_bids.reports.cells import display_name, unit_of
 from hipsta_bids.reports.display import (
     EFFECT_COLORS,
     MAP_KINDS,
@@ -23,7 +24,6 @@ from hipsta_bids.reports.display import (
     scale_of,
 )
 from hipsta_bids.reports.group_maps import EFFECT_NAMES
-from hipsta_bids.reports.group_tables import display_name, unit_of
 from hipsta_bids.reports.maps import draw_sheet
 from hipsta_bids.reports.results import SheetTable
 from hipsta_bids.types import Float

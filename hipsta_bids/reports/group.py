@@ -18,26 +18,10 @@ from hipsta_bids.errors import HipstaError
 from hipsta_bids.io import files
 from hipsta_bids.io.files import hide_home
 from hipsta_bids.protocols import EXPERIMENTAL
+from hipsta_bids.reports import cells, group_tables
 from hipsta_bids.reports.display import DESIGN_COLORS, colors_of
 from hipsta_bids.reports.group_maps import embedded, map_scenes
-from hipsta_bids.reports.group_tables import (
-    JOINT,
-    SIDES,
-    GroupResults,
-    classification,
-    display_name,
-    findings,
-    number_text,
-    p_text,
-    participants,
-    peaks,
-    read_group,
-    records,
-    scores,
-    summaries,
-    visit_of,
-    with_brackets,
-)
+from hipsta_bids.reports.group_tables import GroupResults, read_group, records
 from hipsta_bids.reports.group_trials import norms, power, retest
 from hipsta_bids.reports.page import Section, build_sections, render
 
@@ -45,6 +29,7 @@ _LOGGER = logging.getLogger(__name__)
 _PREFIX = "group"
 _ROW_HEIGHT, _LOWEST, _TALLEST = 6, 60, 360  # of the picture of a design matrix, CSS pixels
 _SHADES = 64
+_CHANCE = 0.5  # area under the curve of guesses
 
 
 def design(results: GroupResults) -> Mapping[str, Any] | None:
@@ -58,17 +43,14 @@ def design(results: GroupResults) -> Mapping[str, Any] | None:
     comparison = record.get("comparison") or {}
     return {
         "formula": record.get("formula"),
-        "measures": [display_name(m) for m in measures["measure"].unique() if m != JOINT]
+        "measures": [m for m in measures["measure"].unique() if m != cells.JOINT]
         if len(measures)
         else [],
         "what": _what(comparison),
-        "references": list((record.get("references") or {}).items()),
+        "references": record.get("references") or {},
         "columns": columns,
         "contrasts": [
-            {
-                "name": name,
-                "rows": [[number_text(w) for w in row] for row in np.atleast_2d(weights)],
-            }
+            (name, np.atleast_2d(weights).tolist())
             for name, weights in (record.get("contrasts") or {}).items()
         ],
         "picture": _matrix_picture(table, columns) if len(table) else None,
@@ -102,7 +84,7 @@ def _matrix_picture(table: pd.DataFrame, columns: list[str]) -> dict[str, Any]:
     buffer = io.BytesIO()
     image.save(buffer, format="png", optimize=True)
     ends = [
-        number_text(a) if a == b else f"{number_text(a)} to {number_text(b)}"
+        cells.number_text(a) if a == b else f"{cells.number_text(a)} to {cells.number_text(b)}"
         for a, b in zip(low, high, strict=True)
     ]
     return {
@@ -161,17 +143,19 @@ def group_page(folder: Path) -> str:
 
 def _classification(results: GroupResults) -> Mapping[str, Any] | None:
     """List how well groups are told apart, with the curves of the first added measures."""
-    rows = classification(results)
+    rows = records(results.table("classification"))
     if not rows:
         return None
-    first: dict[tuple[str, str], dict[str, Any]] = {}
+    first: dict[tuple[str, str], str] = {}
     for row in rows:
-        first.setdefault((row["pair"], row["side"]), row)
-    areas = "; ".join(
-        f"{row['pair']}, {row['side']}: {row['base']} {row['areas'][0]},"
-        f" with {row['added']} {row['areas'][1]}"
-        for row in first.values()
-    )
+        pair = f"{row['control']} against {row['case']}"
+        base, full = (cells.limits_text(row, f"auc_{model}", 2) for model in ("base", "full"))
+        first.setdefault(
+            (pair, cells.summary_side(row["hemi"], row["added"])),
+            f"{cells.measures_text(row['base'])} {base},"
+            f" with {cells.measures_text(row['added'])} {full}",
+        )
+    areas = "; ".join(f"{', '.join(key)}: {text}" for key, text in first.items())
     roc, calibration = "Receiver operating characteristics", "Calibration"
     alt = f"{roc}; areas under the curve: {areas}"
     pictures = embedded(results, "roc", roc, alt)
@@ -184,8 +168,8 @@ def _classification(results: GroupResults) -> Mapping[str, Any] | None:
         "pictures": pictures,
         "bases": list(dict.fromkeys(row["base"] for row in rows)),
         "least": settings.get("least_calibrated"),
-        "judged": any(row["slope"] for row in rows),
-        "chance": any(row["chance"] for row in rows),
+        "judged": any(np.isfinite(row["calibration_slope"]) for row in rows),
+        "chance": any(min(row["auc_base_cv"], row["auc_full_cv"]) < _CHANCE for row in rows),
     }
 
 
@@ -201,44 +185,10 @@ def _registered(results: GroupResults) -> dict[str, Any] | None:
     settings = (results.record.get("settings") or {}).get("registration") or {}
     return {
         "align": settings.get("align"),
-        "rows": [
-            {
-                "side": SIDES[row["hemi"]],
-                "n": row["n"],
-                "before": f"{row['explained_before']:.0%}",
-                "after": f"{row['explained_after']:.0%}",
-                "converged": bool(row["converged"]),
-                "difference": _moved(row),
-            }
-            for row in records(table)
-        ],
-        "alignment": [
-            {
-                "map": f"{display_name(row['measure'])}, {SIDES[row['hemi']]}: {row['contrast']}",
-                "with": row["n_significant"],
-                "without": row["n_unregistered"],
-                "both": row["n_both"],
-                "of": row["n_tests"],
-            }
-            for row in records(results.table("alignment"))
-        ],
-        "extreme": [
-            {
-                "who": visit_of(row),
-                "side": SIDES[row["hemi"]],
-                "displacement": f"{row['displacement']:.1f}",
-            }
-            for row in records(extreme)
-        ],
+        "rows": records(table),
+        "alignment": records(results.table("alignment")),
+        "extreme": records(extreme),
     }
-
-
-def _moved(row: Mapping[str, Any]) -> str:
-    """Say by how much groups are displaced differently, where that was tested."""
-    value = row.get("difference")
-    if value is None or not np.isfinite(value):
-        return ""
-    return f"{value:.2f} nodes (p {p_text(row['difference_p'])})"
 
 
 def _registration(results: GroupResults) -> Mapping[str, Any] | None:
@@ -256,43 +206,23 @@ def _harmonization(results: GroupResults) -> Mapping[str, Any] | None:
     if not record:
         return None
     alt = "Means and SDs of the residuals of sites over points, before and after harmonization"
-    others = (results.record.get("inputs") or {}).get("maps") or {}
+    names = (results.record.get("inputs") or {}).get("maps") or {}
     pictures = embedded(results, "sites", "Sites before and after harmonization", alt)
-    for name in others:
-        caption = f"Sites before and after harmonization, {display_name(name)}"
+    for name in names:
+        caption = f"Sites before and after harmonization, {cells.display_name(name)}"
         pictures += embedded(results, f"{name}_sites", caption, alt)
+    sites = results.everywhere("sites")
     settings = (results.record.get("settings") or {}).get("harmonization") or {}
     limit = float(settings.get("explained", 1.0))
     shares = (record.get("explained") or {}).items()
     return {
         **record,
-        "rows": _site_rows(results),
+        "rows": records(sites[sites["kind"] == "map"]),
         "pictures": pictures,
         "registered": bool(len(results.table("registration"))),
         "compared": bool(len(results.table("classification"))),
-        "doubtful": [(name, f"{share:.0%}") for name, share in shares if share > limit],
+        "doubtful": [(name, share) for name, share in shares if share > limit],
     }
-
-
-def _site_rows(results: GroupResults) -> list[dict[str, Any]]:
-    """List effects of sites on maps, and what is left of them."""
-    table = results.everywhere("sites")
-    return [
-        {
-            "measure": with_brackets(display_name(row["measure"]), row["unit"]),
-            "side": SIDES[row["hemi"]],
-            "site": row["site"],
-            "n": row["n"],
-            "shift": number_text(row["site_shift"]),
-            "scale": f"{row['site_scale']:.2f}",
-            "cells": [
-                f"{row[f'{what}_{when}']:.2f}"
-                for what in ("offset", "spread")
-                for when in ("before", "after")
-            ],
-        }
-        for row in records(table[table["kind"] == "map"])
-    ]
 
 
 def _sections_of_groups(results: GroupResults) -> Mapping[str, Any] | None:
@@ -337,13 +267,13 @@ SECTIONS: tuple[Section[GroupResults], ...] = (
     Section("power", "Sample size", "group/power.html", power),
     Section("retest", "Test-retest", "group/retest.html", retest),
     Section("norms", "Norms", "group/norms.html", norms),
-    Section("found", "What was found", "group/found.html", findings),
+    Section("found", "What was found", "group/found.html", group_tables.findings),
     Section("maps", "Maps", "group/maps.html", map_scenes),
-    Section("peaks", "Clusters and peaks", "group/peaks.html", peaks),
-    Section("summaries", "Summary measures", "group/summaries.html", summaries),
+    Section("peaks", "Clusters and peaks", "group/peaks.html", group_tables.peaks),
+    Section("summaries", "Summary measures", "group/summaries.html", group_tables.summaries),
     Section("classification", "Classification", "group/classification.html", _classification),
-    Section("scores", "w-scores", "group/scores.html", scores),
-    Section("people", "Participants", "group/people.html", participants),
+    Section("scores", "w-scores", "group/scores.html", group_tables.scores),
+    Section("people", "Participants", "group/people.html", group_tables.participants),
     Section("model", "Model", "group/model.html", design),
     Section("registration", "Registration", "group/registration.html", _registration),
     Section("harmonization", "Harmonization", "group/harmonization.html", _harmonization),

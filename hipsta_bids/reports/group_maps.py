@@ -7,18 +7,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from hipsta_bids.reports import cells
 from hipsta_bids.reports.display import known
-from hipsta_bids.reports.group_tables import (
-    JOINT,
-    SIDES,
-    GroupResults,
-    display_name,
-    map_unit,
-    measure_title,
-    number_text,
-    records,
-    unit_of,
-)
+from hipsta_bids.reports.group_tables import GroupResults, map_unit, records
 from hipsta_bids.reports.maps import Picture, picture_of_file
 from hipsta_bids.types import Float
 
@@ -49,30 +40,30 @@ def map_scenes(results: GroupResults) -> Mapping[str, Any] | None:
     if not len(maps):
         return None
     blocks, data = [], list[dict[str, Any]]()
-    measures = sorted(maps["measure"].unique().tolist(), key=lambda name: name != JOINT)
+    measures = sorted(maps["measure"].unique().tolist(), key=lambda name: name != cells.JOINT)
     for measure in measures[:_MOST_FIGURES]:
-        own = maps[maps["measure"] == measure]
+        rows = maps[maps["measure"] == measure]
         means = results.table("means")
         means = means[means["measure"] == measure] if len(means) else means
         scene: dict[str, Any] | None = None
-        if "node_x" in results.table(str(own["file"].iloc[0])):
-            unit = unit_of(map_unit(results, measure))
+        if "node_x" in results.table(str(rows["file"].iloc[0])):
+            unit = cells.unit_of(map_unit(results, measure))
             sides = [
-                _side(results, str(hemi), means, rows)
-                for hemi, rows in own.groupby("hemi", sort=False)
+                _side(results, str(hemi), means, tests)
+                for hemi, tests in rows.groupby("hemi", sort=False)
             ]
             scene = {"unit": unit, "sides": sides}
-        title = measure_title(measure)
+        title = cells.measure_title(measure)
         plates = [
             {"picture": picture, "spots": _spots(picture, scene, len(data)) if scene else []}
             for number in range(1, _MOST_FIGURES)
             for name in [f"{measure}_maps" if number == 1 else f"{measure}_maps_{number}"]
-            for picture in embedded(results, name, f"{title}, maps", _alternative(title, own))
+            for picture in embedded(results, name, f"{title}, maps", _alternative(title, rows))
         ]
         blocks.append({"title": title, "plates": plates})
         if scene and plates:
             data.append({**scene, "sides": list(map(_rounded, scene["sides"]))})
-    first = _OPEN + (JOINT in measures)
+    first = _OPEN + (cells.JOINT in measures)
     return {"blocks": blocks[:first], "more": blocks[first:], "data": data}
 
 
@@ -84,12 +75,12 @@ def embedded(results: GroupResults, name: str, caption: str, alt: str = "") -> l
 
 def _alternative(title: str, maps: pd.DataFrame) -> str:
     """Write what the maps of a measure show."""
-    found = "; ".join(
-        f"{row['contrast']}, {SIDES[row['hemi']]}: {row['n_significant']} of {row['n_tests']}"
+    counts = "; ".join(
+        f"{row['contrast']}, {cells.SIDES[row['hemi']]}: {row['n_significant']} of {row['n_tests']}"
         for row in records(maps)
     )
-    what = "evidence" if maps["measure"].iloc[0] == JOINT else "means, effects"
-    return f"{title}: {what} and significance. Points that survive: {found}"
+    content = "evidence" if maps["measure"].iloc[0] == cells.JOINT else "means, effects"
+    return f"{title}: {content} and significance. Points that survive: {counts}"
 
 
 def _spots(picture: Picture, scene: Mapping[str, Any], block: int) -> list[dict[str, Any]]:
@@ -134,10 +125,10 @@ def _alt(side: Mapping[str, Any], kind: str, index: int) -> str:
         group = side["means"][index]
         return f"Mean of {group['group']}, {side['title']}: {_span(group['values'])}"
     test = side["tests"][index]
-    said = f"{test['n_significant']} of {test['n_tests']} points survive"
+    text = f"{test['n_significant']} of {test['n_tests']} points survive"
     if kind == "effect":
-        said = f"{EFFECT_NAMES[test['kind']]} {_span(test['effect'])}"
-    return f"{kind.capitalize()} of {test['contrast']}, {side['title']}: {said}"
+        text = f"{EFFECT_NAMES[test['kind']]} {_span(test['effect'])}"
+    return f"{kind.capitalize()} of {test['contrast']}, {side['title']}: {text}"
 
 
 def _numbers(side: Mapping[str, Any], index: int) -> list[tuple[float, float]]:
@@ -158,11 +149,11 @@ def _side(
 ) -> dict[str, Any]:
     first = results.table(str(maps["file"].iloc[0]))
     names = [name for name in first["subfield"].dropna().unique().tolist() if name]
-    own = means[means["hemi"] == hemi] if len(means) else means
-    groups = own.groupby("group", sort=False) if len(own) else ()
+    group_means = means[means["hemi"] == hemi] if len(means) else means
+    groups = group_means.groupby("group", sort=False) if len(group_means) else ()
     return {
         "hemi": hemi,
-        "title": SIDES[hemi],
+        "title": cells.SIDES[hemi],
         "shape": [int(first["node_x"].max()), int(first["node_y"].max())],
         "x": first["x"].to_numpy(),
         "y": first["y"].to_numpy(),
@@ -178,7 +169,7 @@ def _side(
 
 def _test(results: GroupResults, row: Mapping[str, Any]) -> dict[str, Any]:
     rows = results.table(str(row["file"]))
-    joint = row["measure"] == JOINT
+    joint = row["measure"] == cells.JOINT
     kind = "z" if joint else "t" if rows["cohen_d"].notna().any() else "F"
     significant = rows["significant"].to_numpy() == True  # noqa: E712  (may hold missing values)
     numbers = {
@@ -187,8 +178,8 @@ def _test(results: GroupResults, row: Mapping[str, Any]) -> dict[str, Any]:
         if name in rows
     }
     peaks = results.everywhere("peaks")
-    same = (peaks["measure"] == row["measure"]) & (peaks["hemi"] == row["hemi"])
-    same &= (peaks["contrast"] == row["contrast"]) & (peaks["extent"] > 0)
+    selected = (peaks["measure"] == row["measure"]) & (peaks["hemi"] == row["hemi"])
+    selected &= (peaks["contrast"] == row["contrast"]) & (peaks["extent"] > 0)
     return {
         "contrast": row["contrast"],
         "kind": kind,
@@ -196,20 +187,24 @@ def _test(results: GroupResults, row: Mapping[str, Any]) -> dict[str, Any]:
         "n_significant": int(row["n_significant"]),
         "effect": rows[_EFFECT_COLUMNS[kind]].to_numpy(dtype=np.float64),
         "parts": [
-            [f"p of {display_name(str(name)[2:])}", rows[name].to_numpy(np.float64)]
+            [f"p of {cells.display_name(str(name)[2:])}", rows[name].to_numpy(np.float64)]
             for name in rows
             if joint and str(name).startswith("p_") and name != "p_corrected"
         ],
         "significant": significant.astype(int).tolist(),
         "values": numbers,
-        "peaks": peaks.loc[same, ["x", "y"]].round(6).to_numpy().tolist(),
+        "peaks": peaks.loc[selected, ["x", "y"]].round(6).to_numpy().tolist(),
     }
 
 
 def _span(values: Float) -> str:
     """Spell the smallest and the largest value."""
-    some = known([values])
-    return f"{number_text(some.min())} to {number_text(some.max())}" if len(some) else "n/a"
+    finite = known([values])
+    return (
+        f"{cells.number_text(finite.min())} to {cells.number_text(finite.max())}"
+        if len(finite)
+        else "n/a"
+    )
 
 
 def _rounded(side: Mapping[str, Any]) -> dict[str, Any]:

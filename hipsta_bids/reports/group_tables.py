@@ -12,29 +12,11 @@ import numpy as np
 import pandas as pd
 
 from hipsta_bids.io import files
-from hipsta_bids.protocols.protocol import Tissue
-from hipsta_bids.reports.display import subfield_title
+from hipsta_bids.reports import cells
 
-#: Names of the sides in tables of maps; in those of summary measures LR may be a mean.
-SIDES = {"L": "left", "R": "right", "LR": "left minus right", "both": "both sides"}
-BOTH, BOTH_SIDES = "LR", "both"
-
-#: Name of the map that tests several measures together, among those of measures.
-JOINT = "joint"
-
-MINUS = "\N{MINUS SIGN}"
-
-_THIRD = 1 / 3
 _ALPHA = 0.05  # of tests of summary measures and of models, for a word only
 _MOST_ROWS = 200  # of lists, so that pages stay small
-_IDS = ("participant_id", "session_id")
-_CHANCE = 0.5  # area under the curve of guesses
-_FAR = 2.0  # w-scores beyond are listed: about one in twenty of the reference
 
-#: Names of tissues inside names of measures; ``CA2_3`` before ``CA2``.
-_SUBFIELD = re.compile(
-    f"_({'|'.join(sorted((tissue.name for tissue in Tissue), key=len, reverse=True))})(?=_|$)"
-)
 
 #: Columns that are never numbers.
 _TEXT = (
@@ -83,8 +65,8 @@ class GroupResults:
 
     def everywhere(self, name: str) -> pd.DataFrame:
         """Join a table of the sheets and those of other programs' maps."""
-        others = [*((self.record.get("inputs") or {}).get("maps") or {}), JOINT]
-        parts = [self.table(name), *(self.table(f"{other}_{name}") for other in others)]
+        prefixes = [*((self.record.get("inputs") or {}).get("maps") or {}), cells.JOINT]
+        parts = [self.table(name), *(self.table(f"{other}_{name}") for other in prefixes)]
         return pd.concat([part for part in parts if len(part)] or parts[:1], ignore_index=True)
 
 
@@ -98,63 +80,10 @@ def records(table: pd.DataFrame) -> list[dict[str, Any]]:
     return [dict(zip(map(str, table.columns), row, strict=True)) for row in table.to_numpy(object)]
 
 
-def display_name(measure: str) -> str:
-    """Write a measure in words, with its subfield after a comma."""
-    words = _SUBFIELD.sub(lambda found: f", {subfield_title(found[1])}", measure)
-    return words.replace("_", " ")
-
-
-def measure_title(measure: object) -> str:
-    """Name a measure at the beginning of a line."""
-    name = display_name(str(measure))
-    return name[:1].upper() + name[1:]
-
-
-def unit_of(unit: str) -> str:
-    """Write a unit with superscripts; nothing for pure numbers."""
-    return "" if unit == "1" else unit.replace("^2", "²").replace("^3", "³")
-
-
-def with_brackets(title: str, unit: str) -> str:
-    """Append a unit to the title of a column or row."""
-    return f"{title} [{unit_of(unit)}]" if unit_of(unit) else title
-
-
-def with_unit(text: str, unit: str) -> str:
-    """Append a unit to a number."""
-    return f"{text} {unit_of(unit)}".rstrip()
-
-
-def statistic_text(row: Mapping[str, Any]) -> str:
-    """Write a statistic with its degrees of freedom; of F, those of the error."""
-    value = number_text(row["statistic"])
-    if row["test"] == "z":
-        return f"z {value}"
-    if row["test"] == "t":
-        return f"t({row['df']:.0f}) {value}" if np.isfinite(row["df"]) else f"z {value}"
-    return f"{row['test']} {value}, error df {row['df']:.0f}"
-
-
-def number_text(value: float) -> str:
-    """Write a number with three digits."""
-    if not np.isfinite(value):
-        return files.MISSING
-    text = f"{value:.3g}"
-    text = f"{value:.0f}" if "e+" in text else text
-    return text.replace("-", MINUS)
-
-
-def p_text(p: float) -> str:
-    """Write a p-value."""
-    if not np.isfinite(p):
-        return files.MISSING
-    return "< 0.001" if p < 0.001 else f"{p:.3f}"  # noqa: PLR2004  (as papers have it)
-
-
 def direction(results: GroupResults, contrast: str, hemi: str, sign: float) -> str:
     """Describe what a contrast above or below zero means."""
     comparison = results.record.get("comparison") or {}
-    if contrast == "mean" and hemi == BOTH:
+    if contrast == "mean" and hemi == cells.DIFFERENCE:
         return "larger on the left" if sign > 0 else "larger on the right"
     if contrast == "mean" and comparison.get("pair"):
         return "with an increase" if sign > 0 else "with a decrease"
@@ -179,7 +108,7 @@ def findings(results: GroupResults) -> Mapping[str, Any] | None:
             sides = [_side(results, row) for row in records(rows)]
             cards.append(
                 {
-                    "title": f"{measure_title(measure)}, {contrast}",
+                    "title": f"{cells.measure_title(measure)}, {contrast}",
                     "found": any(side["found"] for side in sides),
                     "sides": sides,
                 }
@@ -203,28 +132,28 @@ def _joint(settings: Mapping[str, Any]) -> dict[str, Any] | None:
     joint = settings.get("joint") or {}
     if not joint.get("measures"):
         return None
-    names = [display_name(str(name)) for name in joint["measures"]]
+    names = [cells.display_name(str(name)) for name in joint["measures"]]
     sides = ["on the left", "on the right"] if joint.get("sides") else []
-    what = " and ".join(names) + (f", {' and '.join(sides)}," if sides else "")
-    return {**joint, "what": what, "permutations": settings["multiplicity"]["permutations"]}
+    title = " and ".join(names) + (f", {' and '.join(sides)}," if sides else "")
+    return {**joint, "what": title, "permutations": settings["multiplicity"]["permutations"]}
 
 
 def _side(results: GroupResults, row: Mapping[str, Any]) -> dict[str, Any]:
     points = results.table(str(row["file"]))
     peaks = results.everywhere("peaks")
-    same = (peaks["measure"] == row["measure"]) & (peaks["contrast"] == row["contrast"])
-    own = peaks[same & (peaks["hemi"] == row["hemi"])]
+    selected = (peaks["measure"] == row["measure"]) & (peaks["contrast"] == row["contrast"])
+    candidates = peaks[selected & (peaks["hemi"] == row["hemi"])]
     n, total = int(row["n_significant"]), int(row["n_tests"])
-    title = SIDES[row["hemi"]].capitalize()
-    if not len(own):
+    title = cells.SIDES[row["hemi"]].capitalize()
+    if not len(candidates):
         return {"title": title, "found": False, "text": "nothing could be tested.", "peak": ""}
     if n:
-        where = _where(results, row, points)
-        text = f"{n} of {total} points survive ({_percent(n / total)} of the map): {where}."
-        first = records(own)[int(np.argmax(own["statistic"].abs()))]
+        counts = _where(results, row, points)
+        text = f"{n} of {total} points survive ({_percent(n / total)} of the map): {counts}."
+        first = records(candidates)[int(np.argmax(candidates["statistic"].abs()))]
     else:
         text = f"none of {total} points survives."
-        first = records(own)[0]
+        first = records(candidates)[0]
     return {
         "title": title,
         "found": n > 0,
@@ -239,16 +168,16 @@ def _percent(share: float) -> str:
 
 def _where(results: GroupResults, row: Mapping[str, Any], points: pd.DataFrame) -> str:
     """Count the points in each subfield, by direction."""
-    found = points[points["significant"] == True]  # noqa: E712  (may hold missing values)
+    significant = points[points["significant"] == True]  # noqa: E712  (may hold missing values)
     signed = "cohen_d" in points and points["cohen_d"].notna().any()
     parts = []
     for sign in (1, -1):
-        own = found[np.sign(found["statistic"]) == sign]
-        if not len(own):
+        rows = significant[np.sign(significant["statistic"]) == sign]
+        if not len(rows):
             continue
-        shares = own["subfield"].fillna("n/a").value_counts(normalize=True)
+        shares = rows["subfield"].fillna("n/a").value_counts(normalize=True)
         fields = [f"{name} {share:.0%}" for name, share in shares.items() if name != "n/a"]
-        words = [f"{len(own)} points"]
+        words = [f"{len(rows)} points"]
         if signed:
             words.append(direction(results, str(row["contrast"]), str(row["hemi"]), sign))
         parts.append(" ".join(words) + (f" ({', '.join(fields)})" if fields else ""))
@@ -256,15 +185,16 @@ def _where(results: GroupResults, row: Mapping[str, Any], points: pd.DataFrame) 
 
 
 def _peak(results: GroupResults, peak: Mapping[str, Any], points: pd.DataFrame) -> str:
-    if peak["measure"] == JOINT:
-        together = f"together corrected p {p_text(peak['p_corrected'])}"
-        return f"{position_text(peak)}: {peak['measures']}; {together}"
-    here = point_of(peak, points)
-    what = [f"{effect_name(peak['effect'])} {number_text(peak['effect_size'])}"]
-    if here is not None and np.isfinite(here["estimate"]):
+    """Describe the position of a peak, its size and its significance."""
+    corrected = f"corrected p {cells.p_text(peak['p_corrected'])}"
+    if peak["measure"] == cells.JOINT:
+        return f"{cells.position_text(peak)}: {peak['measures']}; together {corrected}"
+    point = point_of(peak, points)
+    effects = [f"{cells.effect_name(peak['effect'])} {cells.number_text(peak['effect_size'])}"]
+    if point is not None and np.isfinite(point["estimate"]):
         unit = map_unit(results, str(peak["measure"]))
-        what.insert(0, f"estimate {with_unit(number_text(here['estimate']), unit)}")
-    return f"{position_text(peak)}: {', '.join(what)}, corrected p {p_text(peak['p_corrected'])}"
+        effects.insert(0, f"estimate {cells.with_unit(cells.number_text(point['estimate']), unit)}")
+    return f"{cells.position_text(peak)}: {', '.join([*effects, corrected])}"
 
 
 def map_unit(results: GroupResults, measure: str) -> str:
@@ -273,35 +203,15 @@ def map_unit(results: GroupResults, measure: str) -> str:
     means = means if len(means) else results.table("forest")
     if not len(means):
         return "1"
-    own = means.loc[means["measure"] == measure, "unit"]
-    return str(own.iloc[0]) if len(own) else "1"
+    units = means.loc[means["measure"] == measure, "unit"]
+    return str(units.iloc[0]) if len(units) else "1"
 
 
 def point_of(peak: Mapping[str, Any], points: pd.DataFrame) -> pd.Series | None:
     """Find the point of a map that a peak is."""
     names = ("vertex",) if "vertex" in points else ("x", "y")
-    same = np.all([points[name] == peak[name] for name in names], axis=0)
-    return points[same].iloc[0] if same.any() else None
-
-
-def position_text(peak: Mapping[str, Any]) -> str:
-    """Describe the position of a peak."""
-    inside = f"{peak['subfield']}, " if isinstance(peak["subfield"], str) else ""
-    if np.isfinite(peak.get("x", np.nan)):
-        words = [
-            ends.split()[1 if abs(peak[axis]) < _THIRD else 0 if peak[axis] < 0 else 2]
-            for axis, ends in (("x", "medial middle lateral"), ("y", "posterior midway anterior"))
-        ]
-        if isinstance(part := peak.get("part"), str):
-            words[1:] = [part] if part != "body" else ["body", words[1]]
-        x, y = (f"{peak[axis]:.2f}".replace("-", MINUS) for axis in "xy")
-        return f"{inside}{', '.join(words)} (x {x}, y {y})"
-    return f"{inside}vertex {int(peak['vertex'])}"
-
-
-def effect_name(effect: str) -> str:
-    """Write the kind of an effect size."""
-    return {"cohen_d": "d", "partial_eta_squared": "partial η²"}.get(effect, effect)
+    matches = np.all([points[name] == peak[name] for name in names], axis=0)
+    return points[matches].iloc[0] if matches.any() else None
 
 
 def _summaries(results: GroupResults) -> Iterator[str]:
@@ -309,35 +219,27 @@ def _summaries(results: GroupResults) -> Iterator[str]:
     table = results.table("measures")
     if not len(table):
         return
-    several = len(table["model"].unique()) > 1
     by = ["contrast", "measure", "model"]
     for (contrast, measure, model), rows in table.groupby(by, sort=False):
-        own = rows[rows["p_fdr"] < _ALPHA]
-        if len(own):
-            said = f", model {model}" if several else ""
-            yield f"{display_name(str(measure))}, {contrast}{said}: " + "; ".join(
-                f"{summary_side(row['hemi'], str(measure))} {effect_name(row['effect'])}"
-                f" {number_text(row['effect_size'])}, p {p_text(row['p_fdr'])}"
-                for row in records(own)
-            )
-
-
-def summary_side(hemi: str, measure: str) -> str:
-    """Write the side of a summary measure."""
-    if hemi == "LR" and not measure.endswith("_asymmetry"):
-        return "mean of both sides"
-    return SIDES[hemi]
+        texts = [
+            f"{cells.summary_side(row['hemi'], str(measure))} {cells.effect_name(row['effect'])}"
+            f" {cells.number_text(row['effect_size'])}, p {cells.p_text(row['p_fdr'])}"
+            for row in records(rows[rows["p_fdr"] < _ALPHA])
+        ]
+        if texts:
+            suffix = f", model {model}" if len(table["model"].unique()) > 1 else ""
+            title = f"{cells.display_name(str(measure))}, {contrast}{suffix}"
+            yield f"{title}: {'; '.join(texts)}"
 
 
 def _classification(results: GroupResults) -> Iterator[str]:
     """List the pairs in which a measure adds to the base model."""
-    table = results.table("classification")
-    for row in records(table):
+    for row in records(results.table("classification")):
         if row["p"] < _ALPHA:
+            side, added = cells.summary_side(row["hemi"], row["added"]), row["added"]
             yield (
-                f"{row['control']} against {row['case']},"
-                f" {summary_side(row['hemi'], row['added'])}:"
-                f" {display_name(row['added'])} adds to {row['base']} (p {p_text(row['p'])});"
+                f"{row['control']} against {row['case']}, {side}: {cells.display_name(added)}"
+                f" adds to {row['base']} (p {cells.p_text(row['p'])});"
                 f" cross-validated area {row['auc_base_cv']:.2f} to {row['auc_full_cv']:.2f}"
             )
 
@@ -347,36 +249,14 @@ def peaks(results: GroupResults) -> Mapping[str, Any] | None:
     table = results.everywhere("peaks")
     if not len(table):
         return None
-    file_of = results.table("maps").set_index(["measure", "contrast", "hemi"])["file"]
-    numbers = table.groupby(["measure", "contrast", "hemi"]).cumcount() + 1
-    rows = []
-    for number, row in zip(numbers, records(table), strict=True):
+    maps = ["measure", "contrast", "hemi"]
+    file_of = results.table("maps").set_index(maps)["file"]
+    rows = records(table.assign(number=table.groupby(maps).cumcount() + 1).head(_MOST_ROWS))
+    for row in rows:
         points = results.table(file_of[row["measure"], row["contrast"], row["hemi"]])
-        joint = row["measure"] == JOINT
-        here = None if joint else point_of(row, points)
-        rows.append(
-            {
-                "number": int(number) if row["extent"] > 0 else "",
-                "measure": display_name(row["measure"]),
-                "contrast": row["contrast"],
-                "side": SIDES[row["hemi"]],
-                "position": position_text(row),
-                "extent": int(row["extent"]),
-                "shares": row["shares"] if isinstance(row["shares"], str) else "",
-                "estimate": number_text(np.nan if here is None else here["estimate"]),
-                "statistic": statistic_text(row),
-                "p": p_text(row["p"]),
-                "adjusted": p_text(row["p_corrected"]),
-                "effect": row["measures"] if joint else effect_text(row),
-            }
-        )
-    return {"rows": rows[:_MOST_ROWS], "more": max(0, len(rows) - _MOST_ROWS)}
-
-
-def effect_text(row: Any) -> str:  # noqa: ANN401  (a row of pandas)
-    """Write an effect size with its limits."""
-    limits = f"{number_text(row['effect_low'])} to {number_text(row['effect_high'])}"
-    return f"{effect_name(row['effect'])} {number_text(row['effect_size'])} ({limits})"
+        point = None if row["measure"] == cells.JOINT else point_of(row, points)
+        row["estimate"] = np.nan if point is None else point["estimate"]
+    return {"rows": rows, "more": len(table) - len(rows)}
 
 
 def participants(results: GroupResults) -> Mapping[str, Any]:
@@ -385,7 +265,7 @@ def participants(results: GroupResults) -> Mapping[str, Any]:
     groups = results.record.get("groups") or {}
     visits = len(people)
     if len(people):
-        people = people[~people[_IDS[0]].duplicated()]
+        people = people[~people[cells.IDS[0]].duplicated()]
     column = groups.get("column")
     levels = [level for level in results.levels if column in people]
     members = [people[people[column].astype(str) == level] for level in levels] or [people]
@@ -394,17 +274,15 @@ def participants(results: GroupResults) -> Mapping[str, Any]:
     return {
         "n": len(people),
         "visits": visits,
-        "hemispheres": [
-            (SIDES[hemi], n) for hemi, n in (results.record.get("hemispheres") or {}).items()
-        ],
+        "hemispheres": results.record.get("hemispheres") or {},
         "levels": levels or ["all"],
         "counts": [len(part) for part in members],
         "rows": [
-            {"title": name, "cells": [_described(part[name], people[name]) for part in members]}
+            (name, [_described(part[name], people[name]) for part in members])
             for name in _variables(results, people, column)
         ],
-        "ratings": list((results.record.get("ratings") or {}).items()),
-        "reasons": [(str(reason).replace("-", " "), n) for reason, n in reasons],
+        "ratings": results.record.get("ratings") or {},
+        "reasons": list(reasons),
         "excluded": records(excluded.fillna("").head(_MOST_ROWS)),
         "more": max(0, len(excluded) - _MOST_ROWS),
     }
@@ -414,14 +292,14 @@ def _variables(results: GroupResults, people: pd.DataFrame, column: str | None) 
     """Columns that the formula names, but for the groups."""
     formula = str(results.record.get("formula", ""))
     words = set(re.findall(r"[^\W\d]\w*", formula)) | set(re.findall("`([^`]+)`", formula))
-    own = [name for name in people.columns if name in words and name not in {*_IDS, column}]
-    return [str(name) for name in own]
+    names = [name for name in people.columns if name in words and name not in {*cells.IDS, column}]
+    return [str(name) for name in names]
 
 
-def _described(values: pd.Series, everyone: pd.Series) -> str:
+def _described(values: pd.Series, column: pd.Series) -> str:
     """Mean and standard deviation of numbers, counts of words."""
-    if pd.api.types.is_numeric_dtype(everyone) and not pd.api.types.is_bool_dtype(everyone):
-        return f"{number_text(values.mean())} ({number_text(values.std())})"
+    if pd.api.types.is_numeric_dtype(column) and not pd.api.types.is_bool_dtype(column):
+        return f"{cells.number_text(values.mean())} ({cells.number_text(values.std())})"
     counts = values.dropna().astype(str).value_counts().sort_index()
     return ", ".join(f"{level} {n}" for level, n in counts.items())
 
@@ -431,77 +309,17 @@ def summaries(results: GroupResults) -> Mapping[str, Any] | None:
     table = results.table("measures")
     if not len(table):
         return None
+    table = table[np.isfinite(table["statistic"])].sort_values("measure", kind="stable")
     means = results.table("descriptives")
-    groups = list(means["group"].unique()) if len(means) else []
-    by_group = {(r["measure"], r["hemi"], r["group"]): r for r in records(means)} if groups else {}
-    rows = []
-    for row in records(table.sort_values("measure", kind="stable")):
-        known = [by_group.get((row["measure"], row["hemi"], group)) for group in groups]
-        if not np.isfinite(row["statistic"]):
-            continue
-        rows.append(
-            {
-                "measure": with_brackets(display_name(row["measure"]), row["unit"]),
-                "side": summary_side(row["hemi"], row["measure"]),
-                "contrast": row["contrast"],
-                "model": row["model"],
-                "n": int(row["n"]),
-                "visits": int(row["visits"]),
-                "means": [
-                    f"{number_text(one['mean'])} ({number_text(one['sd'])})" if one else ""
-                    for one in known
-                ],
-                "estimate": number_text(row["estimate"]),
-                "statistic": statistic_text(row),
-                "p": p_text(row["p"]),
-                "adjusted": p_text(row["p_fdr"]),
-                "low": bool(row["p_fdr"] < _ALPHA),
-                "effect": effect_text(row),
-            }
-        )
-    letters = dict(zip(dict.fromkeys(row["model"] for row in rows), ascii_uppercase, strict=False))
-    for row in rows:
-        row["letter"] = letters[row["model"]]
-    models = [(letter, model) for model, letter in letters.items()]
+    models = table["model"].unique()
     return {
-        "groups": groups,
-        "rows": rows,
-        "models": models if len(models) > 1 else [],
-        "repeated": any(row["visits"] > row["n"] for row in rows),
+        "groups": list(means["group"].unique()) if len(means) else [],
+        "means": {(row["measure"], row["hemi"], row["group"]): row for row in records(means)},
+        "rows": records(table),
+        "alpha": _ALPHA,
+        "letters": dict(zip(models, ascii_uppercase, strict=False)) if len(models) > 1 else {},
+        "repeated": bool((table["visits"] > table["n"]).any()),
     }
-
-
-def classification(results: GroupResults) -> list[dict[str, Any]]:
-    """List pairs of groups with both models."""
-    table = results.table("classification")
-    return [
-        {
-            "pair": f"{row['control']} against {row['case']}",
-            "side": summary_side(row["hemi"], row["added"]),
-            "base": " + ".join(display_name(name) for name in row["base"].split(" + ")),
-            "added": display_name(row["added"]),
-            "n": f"{row['n'] - row['n_cases']} and {row['n_cases']}",
-            "areas": [
-                f"{row[f'auc_{m}']:.2f} ({row[f'auc_{m}_low']:.2f} to {row[f'auc_{m}_high']:.2f})"
-                for m in ("base", "full")
-            ],
-            "validated": [f"{row[f'auc_{model}_cv']:.2f}" for model in ("base", "full")],
-            "slope": number_text(row["calibration_slope"])
-            if np.isfinite(row["calibration_slope"])
-            else "",
-            "chance": bool(min(row["auc_base_cv"], row["auc_full_cv"]) < _CHANCE),
-            "brier": f"{row['brier']:.3f}",
-            "ratio": f"{row['likelihood_ratio']:.2f}",
-            "p": p_text(row["p"]),
-            "separated": bool(row["separated"]),
-        }
-        for row in records(table)
-    ]
-
-
-def visit_of(row: Mapping[str, Any]) -> str:
-    """Name a participant, and the session if there is one."""
-    return " ".join(row[name] for name in _IDS if isinstance(row[name], str))
 
 
 def scores(results: GroupResults) -> Mapping[str, Any] | None:
@@ -513,37 +331,23 @@ def scores(results: GroupResults) -> Mapping[str, Any] | None:
     whole = table[table["region"].isna() | (table["region"] == "all")]
     return {
         "reference": "=".join(str(part) for part in level),
-        "rows": list(score_rows(whole)),
-        "far": list(far_scores(whole)),
-        "limit": _FAR,
+        "rows": score_rows(whole),
+        "far": far_scores(whole),
+        "limit": cells.FAR,
     }
 
 
-def score_rows(table: pd.DataFrame) -> Iterator[dict[str, Any]]:
-    """Describe scores ``w`` of each measure, of the ``reference`` and of the others."""
-    for (measure, hemi), rows in table.groupby(["measure", "hemi"], sort=False):
-        reference = rows["reference"].astype(bool)
-        cells = []
-        for own in (reference, ~reference):
-            w = rows.loc[own, "w"].dropna()
-            beyond = f"{(w < -_FAR).sum()} low, {(w > _FAR).sum()} high"
-            spread = f"{number_text(w.mean())} ({number_text(w.std())})"
-            cells.append(f"{spread}; {beyond} of {len(w)}" if len(w) else "")
-        yield {
-            "measure": display_name(str(measure)),
-            "side": summary_side(str(hemi), str(measure)),
-            "cells": cells,
-        }
+def score_rows(table: pd.DataFrame) -> list[tuple[str, str, list[pd.Series]]]:
+    """List scores ``w`` by measure and side, of the ``reference`` and of the others."""
+    return [
+        (str(measure), str(hemi), [rows.loc[members, "w"].dropna() for members in (known, ~known)])
+        for (measure, hemi), rows in table.groupby(["measure", "hemi"], sort=False)
+        for known in [rows["reference"].astype(bool)]
+    ]
 
 
-def far_scores(table: pd.DataFrame) -> Iterator[dict[str, str]]:
+def far_scores(table: pd.DataFrame) -> list[dict[str, Any]]:
     """List scores ``w`` far from zero, the farthest first."""
-    far = table[table["w"].abs() > _FAR]
+    far = table[table["w"].abs() > cells.FAR]
     far = far.reindex(far["w"].abs().sort_values(ascending=False, kind="stable").index)
-    for row in records(far.head(_MOST_ROWS)):
-        yield {
-            "who": visit_of(row),
-            "measure": display_name(row["measure"]),
-            "side": summary_side(row["hemi"], row["measure"]),
-            "w": number_text(row["w"]),
-        }
+    return records(far.head(_MOST_ROWS))

@@ -10,25 +10,10 @@ from scipy import stats
 
 from hipsta_bids.derivatives.names import META, META_REPORT
 from hipsta_bids.io import files
+from hipsta_bids.reports import cells, group_tables
 from hipsta_bids.reports.group import heading, methods, origin
 from hipsta_bids.reports.group_maps import map_scenes
-from hipsta_bids.reports.group_tables import (
-    SIDES,
-    GroupResults,
-    display_name,
-    findings,
-    measure_title,
-    number_text,
-    p_text,
-    peaks,
-    position_text,
-    records,
-    summaries,
-    summary_side,
-    unit_of,
-    with_brackets,
-    with_unit,
-)
+from hipsta_bids.reports.group_tables import GroupResults, records
 from hipsta_bids.reports.page import Section, build_sections, render
 
 _PREFIX = "meta"
@@ -49,9 +34,13 @@ def _forests(results: GroupResults, *, maps: bool) -> Iterator[dict[str, Any]]:
     at = table["x"].notna() if "x" in table else pd.Series(data=False, index=table.index)
     for number, rows in table[at == maps].groupby("plot", sort=False):
         first = records(rows.head(1))[0]
-        side = SIDES[first["hemi"]] if maps else summary_side(first["hemi"], first["measure"])
-        position = f" at {position_text(first)}" if maps else ""
-        title = f"{measure_title(first['measure'])}, {side}, {first['contrast']}"
+        side = (
+            cells.SIDES[first["hemi"]]
+            if maps
+            else cells.summary_side(first["hemi"], first["measure"])
+        )
+        position = f" at {cells.position_text(first)}" if maps else ""
+        title = f"{cells.measure_title(first['measure'])}, {side}, {first['contrast']}"
         drawing = _drawing(records(rows), str(first["unit"]))
         yield {
             "number": int(str(number)),
@@ -64,8 +53,8 @@ def _forests(results: GroupResults, *, maps: bool) -> Iterator[dict[str, Any]]:
 
 def _drawing(rows: Sequence[Mapping[str, Any]], unit: str) -> dict[str, Any]:
     """Place the marks of a forest plot; rows from top to bottom."""
-    known = [row for row in rows if math.isfinite(row["estimate_low"])]
-    drawn = [row for row in known if row["kind"] != _PREDICTION]
+    estimated = [row for row in rows if math.isfinite(row["estimate_low"])]
+    drawn = [row for row in estimated if row["kind"] != _PREDICTION]
     ends = [row[name] for row in drawn for name in ("estimate_low", "estimate_high")]
     low, high = min(0.0, *ends), max(0.0, *ends)
     low, high = low - 0.04 * (high - low), high + 0.04 * (high - low)
@@ -75,12 +64,16 @@ def _drawing(rows: Sequence[Mapping[str, Any]], unit: str) -> dict[str, Any]:
         return float(round(_NAMES + (min(max(value, low), high) - low) * scale, 1))
 
     marks = []
-    for number, row in enumerate(known):
+    for number, row in enumerate(estimated):
         is_site = row["kind"] == _SITE
         estimate = row["estimate"]
-        limits = f"{number_text(row['estimate_low'])} to {number_text(row['estimate_high'])}"
-        said = (
-            f"[{limits}]" if row["kind"] == _PREDICTION else f"{number_text(estimate)} [{limits}]"
+        limits = (
+            f"{cells.number_text(row['estimate_low'])} to {cells.number_text(row['estimate_high'])}"
+        )
+        text = (
+            f"[{limits}]"
+            if row["kind"] == _PREDICTION
+            else f"{cells.number_text(estimate)} [{limits}]"
         )
         size = _LARGEST * math.sqrt(row["weight"]) if is_site else 0.0
         marks.append(
@@ -93,11 +86,12 @@ def _drawing(rows: Sequence[Mapping[str, Any]], unit: str) -> dict[str, Any]:
                 "high": across(row["estimate_high"]),
                 "at": across(estimate) if math.isfinite(estimate) else 0.0,
                 "size": round(max(3.0, size), 1),
-                "text": said,
+                "text": text,
             }
         )
     random = next(row for row in rows if row["kind"] == _RANDOM)
-    height = _TOP + _ROW * len(known) + 10
+    tau = cells.number_text(random["tau2"] ** 0.5)
+    height = _TOP + _ROW * len(estimated) + 10
     values = "; ".join(f"{mark['name']} {mark['text']}" for mark in marks)
     return {
         "marks": marks,
@@ -108,24 +102,16 @@ def _drawing(rows: Sequence[Mapping[str, Any]], unit: str) -> dict[str, Any]:
         "bottom": height,
         "zero": across(0.0),
         "rule": _TOP + _ROW * sum(mark["kind"] == _SITE for mark in marks) + 3,
-        "ticks": [(across(value), number_text(value)) for value in _ticks(low, high)],
-        "unit": unit_of(unit),
+        "ticks": [(across(value), cells.number_text(value)) for value in _ticks(low, high)],
+        "unit": cells.unit_of(unit),
         "text_at": _NAMES + _PLOT + _TEXTS,
         "middle": _NAMES + _PLOT / 2,
-        "alt": f"estimates with limits [{unit_of(unit)}]: {values}",
-        "between": f"I² {_percent(random['i2'])}, τ {with_unit(_root(random['tau2']), unit)},"
-        f" Q p {p_text(random['q_p'])}",
+        "alt": f"estimates with limits [{cells.unit_of(unit)}]: {values}",
+        "between": f"I² {cells.percent_text(random['i2'])}, τ {cells.with_unit(tau, unit)},"
+        f" Q p {cells.p_text(random['q_p'])}",
         "p": random["p"],
-        "p_text": p_text(random["p"]),
+        "p_text": cells.p_text(random["p"]),
     }
-
-
-def _root(variance: float) -> str:
-    return number_text(math.sqrt(variance))
-
-
-def _percent(share: float) -> str:
-    return f"{share:.0%}" if math.isfinite(share) else files.MISSING
 
 
 def _ticks(low: float, high: float) -> list[float]:
@@ -143,7 +129,7 @@ def _explained(results: GroupResults) -> Mapping[str, Any]:
         "joint": settings.get("model") == "joint",
         "reml": settings.get("random") == "reml",
         "sites": sites,
-        "needed": number_text(float(stats.t.isf(0.0005, max(1, sites - 1)))),
+        "needed": cells.number_text(float(stats.t.isf(0.0005, max(1, sites - 1)))),
         "confidence": f"{settings.get('confidence', 0.95):.0%}",
     }
 
@@ -172,53 +158,28 @@ def _summary_forests(results: GroupResults) -> Mapping[str, Any] | None:
 
 def _heterogeneity(results: GroupResults) -> Mapping[str, Any] | None:
     """Summarize I squared and Q of maps."""
-    maps = results.table("maps")
-    rows = []
-    for row in records(maps):
-        if f"({_RANDOM})" not in row["contrast"]:
-            continue
-        points = results.table(str(row["file"]))
-        own = points[points["i2"].notna()]
-        rows.append(
-            {
-                "measure": display_name(row["measure"]),
-                "contrast": row["contrast"].removesuffix(f" ({_RANDOM})"),
-                "side": SIDES[row["hemi"]],
-                "i2": _percent(own["i2"].median()) if len(own) else files.MISSING,
-                "most": _percent(float(own["i2"].quantile(0.95))) if len(own) else files.MISSING,
-                "share": _percent(float((own["q_p"] < 0.05).mean())),  # noqa: PLR2004 -- in words
-            }
-        )
+    suffix = f" ({_RANDOM})"
+    rows = [row for row in records(results.table("maps")) if suffix in row["contrast"]]
+    for row in rows:
+        points = results.table(str(row["file"])).dropna(subset="i2")
+        row["contrast"] = row["contrast"].removesuffix(suffix)
+        row["median"], row["most"] = points["i2"].quantile([0.5, 0.95])
+        row["share"] = (points["q_p"] < 0.05).mean()  # noqa: PLR2004  (in words)
     return {"rows": rows} if rows else None
 
 
-def _left_out(results: GroupResults) -> Mapping[str, Any] | None:
-    table = results.table("leave_one_out")
-    if not len(table):
-        return None
-    return {
-        "rows": [
-            {
-                "measure": display_name(row["measure"]),
-                "contrast": row["contrast"],
-                "side": SIDES[row["hemi"]],
-                "site": row["site"],
-                "found": row["n_significant"],
-                "kept": row["n_kept"],
-                "change": number_text(row["largest_change"]),
-            }
-            for row in records(table)
-        ]
-    }
+def _without(results: GroupResults) -> Mapping[str, Any] | None:
+    rows = records(results.table("leave_one_out"))
+    return {"rows": rows} if rows else None
 
 
 def _sites(results: GroupResults) -> Mapping[str, Any]:
     table = results.table("sites")
     columns = [name for name in table if name not in {"template", "version"}]
     return {
-        "columns": [with_brackets(str(name).replace("_", " "), "1") for name in columns],
+        "columns": [cells.with_brackets(str(name).replace("_", " "), "1") for name in columns],
         "rows": [
-            [value if isinstance(value, str) else number_text(float(value)) for value in row]
+            [value if isinstance(value, str) else cells.number_text(float(value)) for value in row]
             for row in table[columns].to_numpy(object).tolist()
         ],
         "template": table["template"].iloc[0],
@@ -228,16 +189,16 @@ def _sites(results: GroupResults) -> Mapping[str, Any]:
 
 #: Sections of the page, from top to bottom.
 SECTIONS: tuple[Section[GroupResults], ...] = (
-    Section("found", "What was found", "group/found.html", findings),
+    Section("found", "What was found", "group/found.html", group_tables.findings),
     Section("effects", "Fixed and random", "meta/effects.html", _explained),
     Section("sites", "Sites", "meta/sites.html", _sites),
     Section("forests", "Peaks by site", "meta/forests.html", _peak_forests),
     Section("measures", "Summary measures by site", "meta/forests.html", _summary_forests),
     Section("maps", "Maps", "group/maps.html", _maps),
     Section("between", "Heterogeneity", "meta/heterogeneity.html", _heterogeneity),
-    Section("without", "Without a site", "meta/without.html", _left_out),
-    Section("peaks", "Clusters and peaks", "group/peaks.html", peaks),
-    Section("summaries", "Summary measures", "group/summaries.html", summaries),
+    Section("without", "Without a site", "meta/without.html", _without),
+    Section("peaks", "Clusters and peaks", "group/peaks.html", group_tables.peaks),
+    Section("summaries", "Summary measures", "group/summaries.html", group_tables.summaries),
     Section("methods", "Methods paragraph", "group/methods.html", methods),
     Section("origin", "Origin", "group/origin.html", origin),
 )

@@ -13,6 +13,7 @@ from importlib.resources import files
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from hipsta_bids import __version__
+from hipsta_bids.reports.cells import FILTERS
 from hipsta_bids.reports.display import ORIENTATION
 from hipsta_bids.settings import Settings
 
@@ -88,6 +89,7 @@ def _environment() -> "Environment":
         source = files("hipsta_bids.reports") / "assets" / name
         return Markup(source.read_text(encoding="utf-8"))  # noqa: S704  (no user's text in it)
 
+    environment.filters |= FILTERS
     environment.globals |= {"asset": asset, "orientation": ORIENTATION}
     return environment
 

@@ -30,9 +30,9 @@ from hipsta_bids.cli.main import main
 from hipsta_bids.group.output import figures, write
 from hipsta_bids.io import files
 from hipsta_bids.reports import group as page_module
+from hipsta_bids.reports.cells import display_name
 from hipsta_bids.reports.display import ORIENTATION
 from hipsta_bids.reports.group import group_page, write_group_report
-from hipsta_bids.reports.group_tables import display_name
 from hipsta_bids.reports.maps import new_figure
 from hipsta_bids.reports.page import Section
 

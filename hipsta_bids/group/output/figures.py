@@ -25,8 +25,8 @@ from hipsta_bids.group.stats.arrays import Float, describe_known, mean_of_known
 from hipsta_bids.group.stats.classify import ClassifierResult, PairComparison
 from hipsta_bids.group.stats.glm import FittedMaps
 from hipsta_bids.io.files import MISSING, scratch_folder
+from hipsta_bids.reports.cells import SIDES, display_name, with_brackets
 from hipsta_bids.reports.display import COLORS, HEMISPHERE_COLORS, X_ENDS, kind_of, parts_of
-from hipsta_bids.reports.group_tables import SIDES, display_name, with_brackets
 from hipsta_bids.reports.maps import new_figure
 
 if TYPE_CHECKING:

@@ -14,7 +14,7 @@ from hipsta_bids.group.output.shapes import AverageShape
 from hipsta_bids.group.stats.clusters import edges_of
 from hipsta_bids.group.stats.glm import FittedMaps, PointTest
 from hipsta_bids.group.stats.inference import Discoveries, MapKey, PermutationTest
-from hipsta_bids.reports import display, group_tables
+from hipsta_bids.reports import cells, display
 from hipsta_bids.reports.group_maps import EFFECT_NAMES, signed_logarithm
 
 if TYPE_CHECKING:
@@ -80,14 +80,14 @@ def joint_peaks(joint: Sequence[JointMap], neighbors: int) -> pd.DataFrame:
         for cluster in find_clusters(joint_map.found.rejected, z, frame.subfield, edges):
             at = cluster.peak
             words = [
-                f"{title} {group_tables.effect_name(_EFFECTS[test.kind])}"
-                f" {group_tables.number_text(test.effect[at])},"
-                f" p {group_tables.p_text(test.p[at])}"
+                f"{title} {cells.effect_name(_EFFECTS[test.kind])}"
+                f" {cells.number_text(test.effect[at])},"
+                f" p {cells.p_text(test.p[at])}"
                 for title, test in tests.items()
             ]
             rows.append(
                 {
-                    "measure": group_tables.JOINT,
+                    "measure": cells.JOINT,
                     "contrast": joint_map.key.contrast,
                     "hemi": joint_map.key.hemi,
                     **frame.at(at),
@@ -119,10 +119,7 @@ def _rows(number: int, contrast: str, maps: Mapping[str, JointMap]) -> Iterator[
     z = {hemi: one.test.statistic for hemi, one in maps.items()}
     survive = {hemi: one.found.rejected for hemi, one in maps.items()}
     logs = {hemi: signed_logarithm(one.found.adjusted, z[hemi]) for hemi, one in maps.items()}
-    sides = {
-        hemi: "" if hemi == group_tables.BOTH_SIDES else f" {group_tables.SIDES[hemi]}"
-        for hemi in maps
-    }
+    sides = {hemi: "" if hemi == cells.BOTH_SIDES else f" {cells.SIDES[hemi]}" for hemi in maps}
     counts = ", ".join(f"{int(found.sum())}{sides[hemi]}" for hemi, found in survive.items())
     tested = "/".join(dict.fromkeys(str(int(np.isfinite(one).sum())) for one in z.values()))
     first = next(iter(maps.values()))

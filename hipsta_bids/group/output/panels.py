@@ -19,9 +19,9 @@ from hipsta_bids.group.stats.arrays import Bool, Float, describe_known
 from hipsta_bids.group.stats.glm import FittedMaps, PointTest
 from hipsta_bids.group.stats.inference import Discoveries, MapKey
 from hipsta_bids.reports import display
+from hipsta_bids.reports.cells import DIFFERENCE, SIDES, display_name, with_brackets
 from hipsta_bids.reports.display import X_ENDS, Y_ENDS, parts_of
 from hipsta_bids.reports.group_maps import EFFECT_NAMES, map_id, signed_logarithm
-from hipsta_bids.reports.group_tables import BOTH, SIDES, display_name, with_brackets
 from hipsta_bids.reports.maps import new_figure
 from hipsta_bids.types import Mesh
 
@@ -138,7 +138,7 @@ def _means(
             _, means.setdefault(group, {})[hemi], _ = describe_known(fitted.parts(measure, member))
             counts.setdefault(group, {})[hemi] = int(member.sum())
     pair = bool(analysis.comparison.pair)
-    kind = display.kind_of(measure, change=pair or set(sides) == {BOTH})
+    kind = display.kind_of(measure, change=pair or set(sides) == {DIFFERENCE})
     low, high = display.scale_of(
         kind, [fitted for member in means.values() for fitted in member.values()]
     )

@@ -31,7 +31,7 @@ from hipsta_bids.group.stats.glm import FittedMaps, PointTest
 from hipsta_bids.group.stats.inference import Discoveries, MapKey
 from hipsta_bids.io import files, gifti
 from hipsta_bids.progress import tell
-from hipsta_bids.reports.group_tables import JOINT
+from hipsta_bids.reports.cells import JOINT
 from hipsta_bids.types import PARTICIPANT, SESSION
 
 _LOGGER = logging.getLogger(__name__)

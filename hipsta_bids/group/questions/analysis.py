@@ -28,7 +28,7 @@ from hipsta_bids.group.stats.glm import FittedMaps, RowModel, fit_maps, with_mea
 from hipsta_bids.group.stats.mixed import longitudinal_model
 from hipsta_bids.group.stats.warps import Template, warp_labels, warp_values
 from hipsta_bids.progress import each, tell
-from hipsta_bids.reports import group_tables
+from hipsta_bids.reports import cells
 from hipsta_bids.reports.display import parts_of
 from hipsta_bids.types import PARTICIPANT
 
@@ -377,10 +377,8 @@ def check_joint(
     problem = None
     if unknown := [name for name in names if name not in available]:
         problem = f"no map is called {unknown[0]!r}; there are {', '.join(available)}"
-    elif names and group_tables.JOINT in available:
-        problem = (
-            f"a map is called {group_tables.JOINT}, as its results would be; give it another name"
-        )
+    elif names and cells.JOINT in available:
+        problem = f"a map is called {cells.JOINT}, as its results would be; give it another name"
     elif len(set(names)) < len(names):
         problem = "a measure is named twice; leave it out"
     elif len(names) < 1 + (not sides) and (names or sides):
@@ -413,7 +411,7 @@ def combine_maps(
         if not all((name, hemi) in fits for hemi, name in product(hemis, names)):
             continue
         parts = {
-            name if len(hemis) == 1 else f"{name} {group_tables.SIDES[hemi]}": (
+            name if len(hemis) == 1 else f"{name} {cells.SIDES[hemi]}": (
                 fits[name, hemi],
                 name,
             )
@@ -422,9 +420,9 @@ def combine_maps(
         _check_points(names, [one for one, _ in parts.values()])
         for test in fits[names[0], hemis[0]].fits[names[0]].tests:
             key = inference.MapKey(
-                group_tables.JOINT,
+                cells.JOINT,
                 test.contrast.name,
-                group_tables.BOTH_SIDES if len(hemis) > 1 else hemis[0],
+                cells.BOTH_SIDES if len(hemis) > 1 else hemis[0],
             )
             groups[key], contrasts[test.contrast.name] = parts, test.contrast
     if not groups:

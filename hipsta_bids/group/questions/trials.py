@@ -28,7 +28,7 @@ from hipsta_bids.group.stats import trials
 from hipsta_bids.group.stats.arrays import Float
 from hipsta_bids.io import files, gifti
 from hipsta_bids.progress import tell
-from hipsta_bids.reports.group_tables import display_name, with_brackets
+from hipsta_bids.reports.cells import display_name, with_brackets
 from hipsta_bids.types import PARTICIPANT
 
 #: Ticks of numbers of participants.

@@ -1,0 +1,179 @@
+"""The cells of pages: filters of templates that write a number, a measure or a position."""
+
+import re
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from hipsta_bids.io import files
+from hipsta_bids.protocols.protocol import Tissue
+from hipsta_bids.reports.display import subfield_title
+
+#: Names of the sides in tables of maps; in those of summary measures LR may be a mean.
+SIDES = {"L": "left", "R": "right", "LR": "left minus right", "both": "both sides"}
+DIFFERENCE, BOTH_SIDES = "LR", "both"
+#: Name of the map that tests several measures together, among those of measures.
+JOINT = "joint"
+MINUS = "\N{MINUS SIGN}"
+IDS = ("participant_id", "session_id")
+_THIRD = 1 / 3
+FAR = 2.0  # w-scores beyond are listed: about one in twenty of the reference
+#: Names of tissues inside names of measures; ``CA2_3`` before ``CA2``.
+_SUBFIELD = re.compile(
+    f"_({'|'.join(sorted((tissue.name for tissue in Tissue), key=len, reverse=True))})(?=_|$)"
+)
+
+
+def display_name(measure: str) -> str:
+    """Write a measure in words, with its subfield after a comma."""
+    words = _SUBFIELD.sub(lambda match: f", {subfield_title(match[1])}", measure)
+    return words.replace("_", " ")
+
+
+def measure_title(measure: object) -> str:
+    """Name a measure at the beginning of a line."""
+    name = display_name(str(measure))
+    return name[:1].upper() + name[1:]
+
+
+def unit_of(unit: str) -> str:
+    """Write a unit with superscripts; nothing for pure numbers."""
+    return "" if unit == "1" else unit.replace("^2", "²").replace("^3", "³")
+
+
+def with_brackets(title: str, unit: str) -> str:
+    """Append a unit to the title of a column or row."""
+    return f"{title} [{unit_of(unit)}]" if unit_of(unit) else title
+
+
+def with_unit(text: str, unit: str) -> str:
+    """Append a unit to a number."""
+    return f"{text} {unit_of(unit)}".rstrip()
+
+
+def statistic_text(row: Mapping[str, Any]) -> str:
+    """Write a statistic with its degrees of freedom; of F, those of the error."""
+    value = number_text(row["statistic"])
+    if row["test"] == "z":
+        return f"z {value}"
+    if row["test"] == "t":
+        return f"t({row['df']:.0f}) {value}" if np.isfinite(row["df"]) else f"z {value}"
+    return f"{row['test']} {value}, error df {row['df']:.0f}"
+
+
+def number_text(value: float, digits: int | None = None) -> str:
+    """Write a number with three digits, or with as many decimals."""
+    if not np.isfinite(value):
+        return files.MISSING
+    text = f"{value:.3g}" if digits is None else f"{value:.{digits}f}"
+    text = f"{value:.0f}" if "e+" in text else text
+    return text.replace("-", MINUS)
+
+
+def p_text(p: float) -> str:
+    """Write a p-value."""
+    if not np.isfinite(p):
+        return files.MISSING
+    return "< 0.001" if p < 0.001 else f"{p:.3f}"  # noqa: PLR2004  (as papers have it)
+
+
+def position_text(peak: Mapping[str, Any]) -> str:
+    """Describe the position of a peak."""
+    inside = f"{peak['subfield']}, " if isinstance(peak["subfield"], str) else ""
+    if np.isfinite(peak.get("x", np.nan)):
+        words = [
+            ends.split()[1 if abs(peak[axis]) < _THIRD else 0 if peak[axis] < 0 else 2]
+            for axis, ends in (("x", "medial middle lateral"), ("y", "posterior midway anterior"))
+        ]
+        if isinstance(part := peak.get("part"), str):
+            words[1:] = [part] if part != "body" else ["body", words[1]]
+        x, y = (f"{peak[axis]:.2f}".replace("-", MINUS) for axis in "xy")
+        return f"{inside}{', '.join(words)} (x {x}, y {y})"
+    return f"{inside}vertex {int(peak['vertex'])}"
+
+
+def effect_name(effect: str) -> str:
+    """Write the kind of an effect size."""
+    return {"cohen_d": "d", "partial_eta_squared": "partial η²"}.get(effect, effect)
+
+
+def summary_side(hemi: str, measure: str) -> str:
+    """Write the side of a summary measure."""
+    if hemi == "LR" and not measure.endswith("_asymmetry"):
+        return "mean of both sides"
+    return SIDES[hemi]
+
+
+def effect_text(row: Mapping[str, Any]) -> str:
+    """Write an effect size with its limits; of a joint test, the effect of each measure."""
+    if row["measure"] == JOINT:
+        return str(row["measures"])
+    limits = f"{number_text(row['effect_low'])} to {number_text(row['effect_high'])}"
+    return f"{effect_name(row['effect'])} {number_text(row['effect_size'])} ({limits})"
+
+
+def visit_of(row: Mapping[str, Any]) -> str:
+    """Name a participant, and the session if there is one."""
+    return " ".join(row[name] for name in IDS if isinstance(row[name], str))
+
+
+def measures_text(measures: str, unit: str = "1") -> str:
+    """Write a measure, or a sum of several, with its unit."""
+    return with_brackets(" + ".join(map(display_name, measures.split(" + "))), unit)
+
+
+def _side(hemi: str, measure: str | None = None) -> str:
+    """Write the side of a map, or of a summary measure."""
+    return SIDES[hemi] if measure is None else summary_side(hemi, measure)
+
+
+def limits_text(row: Mapping[str, Any], name: str, digits: int | None = None) -> str:
+    """Write a number with its limits."""
+    columns = (name, f"{name}_low", f"{name}_high")
+    value, low, high = (number_text(row[column], digits) for column in columns)
+    return f"{value} ({low} to {high})"
+
+
+def _quartiles(values: pd.Series) -> str:
+    """Write the median with the quartiles."""
+    if not values.notna().any():
+        return files.MISSING
+    low, middle, high = (number_text(value) for value in values.quantile([0.25, 0.5, 0.75]))
+    return f"{middle} ({low} to {high})"
+
+
+def _count(value: float) -> str:
+    """Write a number of participants, which may be beyond all that was tried."""
+    return f"{value:,.0f}" if np.isfinite(value) else "more"
+
+
+def percent_text(share: float) -> str:
+    """Write a share in percent."""
+    return f"{share:.0%}" if np.isfinite(share) else files.MISSING
+
+
+def _deviations(scores: pd.Series) -> str:
+    """Write the mean of scores with their SD, and how many are far from zero."""
+    beyond = f"{(scores < -FAR).sum()} low, {(scores > FAR).sum()} high of {len(scores)}"
+    spread = f"{number_text(scores.mean())} ({number_text(scores.std())})"
+    return f"{spread}; {beyond}" if len(scores) else ""
+
+
+#: By the names that templates use.
+FILTERS: dict[str, Callable[..., str]] = {
+    "number": number_text,
+    "p": p_text,
+    "percent": percent_text,
+    "count": _count,
+    "limits": limits_text,
+    "quartiles": _quartiles,
+    "deviations": _deviations,
+    "measure": measures_text,
+    "side": _side,
+    "effect": effect_text,
+    "statistic": statistic_text,
+    "position": position_text,
+    "visit": visit_of,
+}
