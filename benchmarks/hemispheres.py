@@ -83,7 +83,7 @@ def measure(volume: LabelVolume, hemi: str, settings: Settings, repeats: int) ->
 
     costs = []
     for _ in range(repeats):
-        for process in ("self", *helpers()):
+        for process in ("self", *(str(helper.pid) for helper in helpers())):
             reset_peak_memory(process)
         clock, start = CpuClock(), time.perf_counter()
         try:
@@ -95,7 +95,7 @@ def measure(volume: LabelVolume, hemi: str, settings: Settings, repeats: int) ->
                 stages=clock.stages,
                 wall=time.perf_counter() - start,
                 memory=peak_memory() / 1e6,
-                helper_memory=sum(map(peak_memory, helpers())) / 1e6,
+                helper_memory=sum(peak_memory(str(helper.pid)) for helper in helpers()) / 1e6,
                 tetrahedra=int(maps.qc["tetrahedra"]),
             )
         )

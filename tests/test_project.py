@@ -89,7 +89,6 @@ def test_imports_are_the_declared_dependencies():
     distributions = {
         "PIL": "pillow",
         "bids": "pybids",
-        "fontTools": "fonttools",
         "mpl_toolkits": "matplotlib",
         "skimage": "scikit-image",
         "sklearn": "scikit-learn",

@@ -17,6 +17,7 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+import psutil
 from checks import (
     COMMAND,
     break_one,
@@ -188,14 +189,12 @@ def first_result(main: "subprocess.Popen[str]") -> None:
 def measuring_process() -> int:
     """Find the process of a job that measures: it has TetGen as its child."""
     while True:
-        for path in Path("/proc").glob("[0-9]*/cmdline"):
-            try:
-                of_job = b"SLURM_JOB_ID=" in (path.parent / "environ").read_bytes()
-                if of_job and b"hipsta_bids.geometry.tetgen_worker" in path.read_bytes():
-                    stat = (path.parent / "stat").read_text(encoding="utf-8")
-                    return int(stat.rpartition(")")[2].split()[1])
-            except OSError:
-                continue
+        for process in psutil.process_iter(["cmdline", "environ", "ppid"]):
+            of_job = "SLURM_JOB_ID" in (process.info["environ"] or {})
+            if of_job and "hipsta_bids.geometry.tetgen_worker" in " ".join(
+                process.info["cmdline"] or []
+            ):
+                return int(process.info["ppid"])
         time.sleep(0.05)
 
 

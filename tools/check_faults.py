@@ -18,6 +18,7 @@ import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+import psutil
 from checks import (
     COMMAND,
     demand,
@@ -100,11 +101,10 @@ def check_kills(work: Path, data: Path, reference: dict[str, bytes], n_kills: in
 def worker_of(pid: int, generator: random.Random) -> int | None:
     """Choose a child of a process."""
     try:
-        lists = [path.read_text() for path in Path(f"/proc/{pid}/task").glob("*/children")]
-    except OSError:
+        children = psutil.Process(pid).children()
+    except psutil.Error:
         return None
-    children = " ".join(lists).split()
-    return int(generator.choice(children)) if children else None
+    return generator.choice(children).pid if children else None
 
 
 def check_full_disk(work: Path, data: Path, reference: dict[str, bytes]) -> None:

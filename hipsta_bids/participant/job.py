@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import psutil
 
 from hipsta_bids import __version__
 from hipsta_bids.derivatives import hemisphere
@@ -221,34 +222,32 @@ class CostClock:
 
 
 def cpu_seconds() -> float:
-    """Processor time of this process and its helpers, running or ended, in s."""
+    """Compute processor time of this process and its helpers, running (to 20 ms) or ended, in s."""
     ended = resource.getrusage(resource.RUSAGE_CHILDREN)
     total = time.process_time() + ended.ru_utime + ended.ru_stime
     for process in helpers():
-        # Of its main thread alone, but in ns; TetGen has no other.
-        with contextlib.suppress(OSError, ValueError, IndexError):
-            total += int(Path(f"/proc/{process}/schedstat").read_text().split()[0]) * 1e-9
+        with contextlib.suppress(psutil.Error):  # it may end now
+            spent = process.cpu_times()
+            total += spent.user + spent.system
     return total
 
 
-def helpers() -> list[str]:
-    """List the process numbers of running children, where the system tells."""
-    with contextlib.suppress(OSError):
-        lists = [path.read_text() for path in Path("/proc/self/task").glob("*/children")]
-        return " ".join(lists).split()
-    return []
+def helpers() -> list[psutil.Process]:
+    """Return running children."""
+    children: list[psutil.Process] = psutil.Process().children()
+    return children
 
 
 def reset_peak_memory(process: str = "self") -> None:
-    """Forget how much memory a process needed so far, where Linux allows it."""
+    """Forget how much memory a process needed so far, where Linux allows it; psutil cannot."""
     with contextlib.suppress(OSError):
         Path(f"/proc/{process}/clear_refs").write_text("5")
 
 
 def peak_memory(process: str = "self") -> float:
-    """Largest resident memory of a process since the last reset, in bytes.
+    """Return the largest resident memory of a process since the last reset, in bytes.
 
-    Where there is no ``/proc``: of this process since it began, whichever was asked for.
+    Where there is no ``/proc``: of this process since it began. psutil knows it on Windows alone.
     """
     with contextlib.suppress(OSError, StopIteration, ValueError):
         lines = Path(f"/proc/{process}/status").read_text().splitlines()

@@ -26,6 +26,8 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import psutil
+
 if TYPE_CHECKING:
     from types import FrameType
 
@@ -258,9 +260,8 @@ def _start(plan: WorkerPlan) -> _Slot:
 
 def _context() -> Any:  # noqa: ANN401  (the contexts have no common type that can start processes)
     """Choose fork, so that nothing is loaded twice, unless threads or the system make it unsafe."""
-    with contextlib.suppress(OSError):
-        if len(os.listdir("/proc/self/task")) == 1:  # noqa: PTH208  (a count, not paths)
-            return multiprocessing.get_context("fork")
+    if sys.platform == "linux" and psutil.Process().num_threads() == 1:
+        return multiprocessing.get_context("fork")
     resource_tracker.ensure_running()  # its start would let Ctrl-C through
     return multiprocessing.get_context("spawn")
 

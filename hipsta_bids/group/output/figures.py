@@ -3,15 +3,12 @@
 Those of maps are in ``panels``. Colors are those of the pages (``reports.display``).
 """
 
-import atexit
 import io
 import re
-import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from functools import cache, partial
+from functools import partial
 from itertools import cycle
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -24,7 +21,7 @@ from hipsta_bids.group.output.shapes import AverageShape
 from hipsta_bids.group.stats.arrays import Float, describe_known, mean_of_known
 from hipsta_bids.group.stats.classify import ClassifierResult, PairComparison
 from hipsta_bids.group.stats.glm import FittedMaps
-from hipsta_bids.io.files import MISSING, scratch_folder
+from hipsta_bids.io.files import MISSING
 from hipsta_bids.reports.cells import SIDES, display_name, with_brackets
 from hipsta_bids.reports.display import COLORS, HEMISPHERE_COLORS, X_ENDS, kind_of, parts_of
 from hipsta_bids.reports.maps import new_figure
@@ -33,16 +30,11 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-#: A font with few signs, and those: Latin, Greek, punctuation, superscripts, arrows, mathematics.
-_FONT = "FigureSans"
-_SIGNS = (*range(0x20, 0x250), *range(0x370, 0x400), *range(0x2000, 0x20A0), *range(0x2190, 0x2300))
-
 _STYLE: Any = {
     "font.family": "sans-serif",
-    # The first two are everywhere; the other fonts are for readers of drawings who lack them.
+    # The first is everywhere; the other fonts are for readers of drawings who lack them.
     # Chinese, Japanese and Korean characters come from the first of these that is installed.
     "font.sans-serif": [
-        _FONT,
         "DejaVu Sans",
         "Verdana",
         "Arial",
@@ -93,33 +85,9 @@ _LOW = -1.645
 Drawing = Callable[[], "list[Figure]"]
 
 
-@cache
-def _load_font() -> None:
-    """Let figures take a part of the usual font, as each PDF would read all 6,000 signs of it.
-
-    That takes a tenth of a second for each weight and file. Other signs come from the whole font.
-    """
-    from fontTools import subset  # noqa: PLC0415  (slow to load)
-    from matplotlib import font_manager, get_data_path  # noqa: PLC0415
-
-    folder = scratch_folder("letters")
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    options = subset.Options(layout_features=["kern"], drop_tables=["FFTM"], name_IDs=["*"])
-    for name in ("DejaVuSans.ttf", "DejaVuSans-Bold.ttf"):
-        with subset.load_font(Path(get_data_path()) / "fonts" / "ttf" / name, options) as font:
-            choice = subset.Subsetter(options)
-            choice.populate(unicodes=_SIGNS)
-            choice.subset(font)
-            for record in font["name"].names:
-                record.string = re.sub("DejaVu ?Sans", _FONT, str(record))
-            font.save(folder / name)
-        font_manager.fontManager.addfont(folder / name)
-
-
 def encode(name: str, draw: Drawing) -> list[tuple[str, bytes]]:
     """Draw figures and encode each as PDF, PNG and SVG; the same results give the same bytes."""
     new_figure((1.0, 1.0), None)  # loads the library with settings of its own
-    _load_font()
     from matplotlib import rc_context  # noqa: PLC0415
 
     encoded = []
