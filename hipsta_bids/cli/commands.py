@@ -337,19 +337,15 @@ def run_meta_analysis(arguments: Sequence[str]) -> ExitCode:
     """Combine summaries of sites."""
     options = meta_parser().parse_intermixed_args(arguments)
     from hipsta_bids.group.design.settings import load_group_settings  # noqa: PLC0415  (start-up time)
-    from hipsta_bids.group.questions.consortium import MetaOptions, run_meta  # noqa: PLC0415  (heavy)
+    from hipsta_bids.group.questions.consortium import run_meta  # noqa: PLC0415  (heavy)
 
     chosen = {
         "meta": {"random": options.random},
         "multiplicity": {"method": options.correction, "scope": options.fdr_scope},
     }
     settings = load_group_settings(options.settings).changed(**given_settings(chosen))
-    request = MetaOptions(
-        sites=tuple(_site(text) for text in options.sites),
-        out_dir=options.out,
-        command=("hipsta-bids", "meta", *arguments),
-    )
-    page, notes = run_meta(request, settings)
+    paths = [_site(text) for text in options.sites]
+    page, notes = run_meta(paths, options.out, settings, ("hipsta-bids", "meta", *arguments))
     for note in notes:
         echo(f"note: {note}")
     echo(f"results: {options.out / 'meta'}")

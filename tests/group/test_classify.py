@@ -41,14 +41,15 @@ def test_agrees_with_r(oracle, r_data, name):
     base, added, case = r_model(r_data, name)
     expected = oracle[name]
     found = compare_models(base, added, case, SETTINGS)
-    assert (found.n, found.n_cases, found.df) == (expected["n"], expected["cases"], 1)
-    assert not found.separated
+    counts = [found.columns[name] for name in ("n", "n_cases", "lr_df")]
+    assert counts == [expected["n"], expected["cases"], 1]
+    assert not found.columns["separated"]
 
     def check(value, key):
         np.testing.assert_allclose(value, expected[key], rtol=1e-6)
 
-    check(found.likelihood_ratio, "LR")
-    check(found.p, "p_LR")
+    check(found.columns["likelihood_ratio"], "LR")
+    check(found.columns["p"], "p_LR")
     for number, model in enumerate((found.base, found.full)):
         np.testing.assert_allclose(
             model.fit.coefficients, list(expected[f"coef{number}"].values()), rtol=1e-6
@@ -142,10 +143,10 @@ def test_separated_groups_get_finite_answers_and_are_told():
     base, added, _ = simulated(4, n=40)
     case = added[:, 0] > 0.1
     found = compare_models(base, added, case, SETTINGS)
-    assert found.separated
+    assert found.columns["separated"]
     assert found.full.fit.firth
     assert np.isfinite(found.full.fit.coefficients).all()
-    assert found.p < 1e-6
+    assert found.columns["p"] < 1e-6
     assert found.full.auc.area == 1.0
     with pytest.raises(ModelError, match="separated"):
         fit_logistic(np.hstack([base, added]), case, firth=False)
@@ -156,13 +157,14 @@ def test_likelihood_ratio_does_not_depend_on_units_and_keeps_its_size():
     quick = SETTINGS.changed(folds=2, repeats=1)
     for seed in range(60):
         base, added, case = simulated(seed, n=80, effect=0.0)
-        p.append(compare_models(base, added, case, quick).p)
+        p.append(compare_models(base, added, case, quick).columns["p"])
     assert stats.kstest(p, "uniform").pvalue > 0.01  # one in a hundred by chance; the seed is fixed
     for separate in (False, True):
         outcome = added[:, 0] > 0 if separate else case
         one = compare_models(base, added, outcome, quick)
         other = compare_models(base * [1, 1e4], added * 1e-3, outcome, quick)
-        assert one.likelihood_ratio == pytest.approx(other.likelihood_ratio, rel=1e-6, abs=1e-8)
+        ratio = other.columns["likelihood_ratio"]
+        assert one.columns["likelihood_ratio"] == pytest.approx(ratio, rel=1e-6, abs=1e-8)
 
 
 def test_area_counts_pairs():
@@ -301,23 +303,20 @@ def test_each_pair_is_the_comparison_of_its_subjects():
     volume[[0, 4]] = np.nan
     thickness[[0, 5]] = np.nan
     found = compare_pairs(groups, volume, thickness, PAIRS, order=ORDER)
-    assert [(pair.control, pair.case) for pair in found] == [
-        ("CU", "MCI"),
-        ("CU", "DAT"),
-        ("MCI", "DAT"),
-    ]
-    assert [pair.n_incomplete for pair in found] == [2, 2, 2]
+    assert list(found) == [("CU", "MCI"), ("CU", "DAT"), ("MCI", "DAT")]
+    assert [one.columns["n_incomplete"] for one in found.values()] == [2, 2, 2]
     used = np.isin(groups, ["CU", "DAT"]) & np.isfinite(volume + thickness)[:, 0]
     base = np.column_stack([np.ones(used.sum()), volume[used]])
     alone = compare_models(base, thickness[used], groups[used] == "DAT", PAIRS)
-    ratio = found[1].comparison.likelihood_ratio
-    assert ratio == pytest.approx(alone.likelihood_ratio, rel=1e-9)
-    assert found[1].comparison.n == used.sum()
-    assert found[1].comparison.n_cases == (groups[used] == "DAT").sum()
+    apart = found["CU", "DAT"]
+    ratio = alone.columns["likelihood_ratio"]
+    assert apart.columns["likelihood_ratio"] == pytest.approx(ratio, rel=1e-9)
+    assert apart.columns["n"] == used.sum()
+    assert apart.columns["n_cases"] == (groups[used] == "DAT").sum()
     # Groups two steps apart are easier to tell than neighbors.
-    areas = [pair.comparison.full.auc.area for pair in found]
+    areas = [one.full.auc.area for one in found.values()]
     assert areas[1] > max(areas[0], areas[2])
-    assert found[1].comparison.full.fit.coefficients[2] < 0  # cases are thinner
+    assert apart.full.fit.coefficients[2] < 0  # cases are thinner
 
 
 def test_names_the_pair_that_cannot_be_compared():
@@ -335,11 +334,11 @@ def test_separated_groups_are_compared_alike_by_years_of_any_era():
     year[15:] += 15
     added = np.random.default_rng(0).standard_normal((30, 1))
     early, late = (
-        compare_pairs(groups, year + start, added, PAIRS, order=["CU", "DAT"])[0].comparison
+        compare_pairs(groups, year + start, added, PAIRS, order=["CU", "DAT"])["CU", "DAT"].columns
         for start in (0, 2000)
     )
-    assert late.separated
-    assert late.likelihood_ratio == pytest.approx(early.likelihood_ratio, rel=1e-6)
+    assert late["separated"]
+    assert late["likelihood_ratio"] == pytest.approx(early["likelihood_ratio"], rel=1e-6)
 
 
 def test_firth_converges_where_groups_hardly_do_not_overlap():

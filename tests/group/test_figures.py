@@ -347,9 +347,8 @@ def test_legends_of_curves_are_beside_them_and_small_groups_have_no_calibration(
     small = SimpleNamespace(calibration=calibrate(score, score > 0, ClassificationSettings()))
     cases = []
     for hemi, full in (("L", one), ("R", one), ("LR", small)):
-        model = SimpleNamespace(base=one, full=full, separated=False)
-        pair = SimpleNamespace(control="CN", case="AD", comparison=model)
-        cases.append((hemi, "thickness_mean", pair))
+        model = SimpleNamespace(base=one, full=full, columns={"separated": False})
+        cases.append((hemi, "thickness_mean", ("CN", "AD"), model))
     fields = dict.fromkeys(Analysis.__dataclass_fields__)
     analysis = Analysis(**{**fields, "pairs": cases[:2]})
     for draw in (draw_roc, draw_calibration):

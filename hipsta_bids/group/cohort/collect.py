@@ -121,21 +121,21 @@ def collect_sheets(request: GroupRequest, *, may_lack: bool = False) -> Collecti
         if not folder.is_dir():
             raise InputError(f"{folder}: no such folder; check --segmentations")
     roots = [root for root in request.roots if root.is_dir() or not may_lack]
-    results = [place for root in roots for place in _wanted_results(root, request)]
-    places = [place for place in results if place.name.region == request.region]
+    results = [result for root in roots for result in _wanted_results(root, request)]
+    places = [result for result in results if result.name.region == request.region]
     notes = _other_regions(results, request)
     if may_lack and not places:
         return Collection(
             grid=SheetSettings(), settings_hash=settings_hash(Settings()), notes=notes
         )
     seg = _one_protocol(places, results, request)
-    places = [place for place in places if place.name.seg == seg]
+    places = [result for result in places if result.name.seg == seg]
     _refuse_twice(places)
     choices = read_choices(request.exclude_table, request.ratings)
     records: list[SheetRecord] = []
     left_out: list[Exclusion] = []
-    for place in sorted(places, key=_key):
-        entry = _judge(place, request, choices)
+    for result in sorted(places, key=_key):
+        entry = _judge(result, request, choices)
         if isinstance(entry, Exclusion):
             left_out.append(entry)
         else:
@@ -153,19 +153,19 @@ def collect_sheets(request: GroupRequest, *, may_lack: bool = False) -> Collecti
         grid=grid_of(records[0].place.root),
         settings_hash=digest,
         versions=tuple(sorted({record.version for record in records})),
-        ratings=choices.counts((place.name, _digest(place)) for place in places),
+        ratings=choices.counts((result.name, _digest(result)) for result in places),
         notes=(
             *notes,
-            *choices.excluded.notes((place.name, _digest(place)) for place in results),
-            *choices.rated.notes((place.name, _digest(place)) for place in results),
+            *choices.excluded.notes((result.name, _digest(result)) for result in results),
+            *choices.rated.notes((result.name, _digest(result)) for result in results),
         ),
         warnings=_several_versions(records),
     )
 
 
-def _digest(place: hemisphere.ResultPlace) -> str | None:
+def _digest(result: hemisphere.ResultPlace) -> str | None:
     """Hash of a hemisphere's input and settings, if its record has one."""
-    digest = hemisphere.read_record(place).get("input_hash")
+    digest = hemisphere.read_record(result).get("input_hash")
     return None if digest is None else str(digest)
 
 
@@ -200,9 +200,9 @@ def _wanted_results(root: Path, request: GroupRequest) -> list[hemisphere.Result
     if not root.is_dir():
         raise InputError(f"{root}: no such folder; run the participant level first")
     return [
-        place
-        for place in hemisphere.list_results(root)
-        if request.wants(place.name.subject, place.name.session)
+        result
+        for result in hemisphere.list_results(root)
+        if request.wants(result.name.subject, result.name.session)
     ]
 
 
@@ -211,7 +211,7 @@ def _other_regions(
 ) -> tuple[str, ...]:
     """Say which results are left out because another region was asked for."""
     counts = Counter(
-        place.name.region for place in results if request.seg in {None, place.name.seg}
+        result.name.region for result in results if request.seg in {None, result.name.seg}
     )
     return tuple(
         f"{count} hemispheres of region {region} are not in this analysis;"
@@ -221,8 +221,8 @@ def _other_regions(
     )
 
 
-def _key(place: hemisphere.ResultPlace) -> tuple[str, str, str]:
-    return place.name.subject, place.name.session or "", place.name.hemi
+def _key(result: hemisphere.ResultPlace) -> tuple[str, str, str]:
+    return result.name.subject, result.name.session or "", result.name.hemi
 
 
 def _one_protocol(
@@ -230,11 +230,11 @@ def _one_protocol(
     results: Sequence[hemisphere.ResultPlace],
     request: GroupRequest,
 ) -> str:
-    counts = Counter(place.name.seg for place in places)
+    counts = Counter(result.name.seg for result in places)
     if not counts or request.seg not in {None, *counts}:
         request_text = f" with --seg {request.seg}" if request.seg else " as asked for"
         request_text += f" --region {request.region}" if request.region != "body" else ""
-        kinds = sorted({(place.name.seg, place.name.region) for place in results})
+        kinds = sorted({(result.name.seg, result.name.region) for result in results})
         protocols = [
             seg if region == "body" else f"{seg} --region {region}" for seg, region in kinds
         ]
@@ -252,22 +252,22 @@ def _one_protocol(
 
 def _refuse_twice(places: Sequence[hemisphere.ResultPlace]) -> None:
     first: dict[tuple[str, str, str], Path] = {}
-    for place in places:
-        root = first.setdefault(_key(place), place.root)
-        if root != place.root:
+    for result in places:
+        root = first.setdefault(_key(result), result.root)
+        if root != result.root:
             raise InputError(
-                f"{place.name.stem} is in {root} and in {place.root}; participants of different"
+                f"{result.name.stem} is in {root} and in {result.root}; participants of different"
                 " sites need different labels"
             )
 
 
 def _judge(
-    place: hemisphere.ResultPlace, request: GroupRequest, choices: Choices
+    result: hemisphere.ResultPlace, request: GroupRequest, choices: Choices
 ) -> SheetRecord | Exclusion:
-    record = hemisphere.read_record(place)
+    record = hemisphere.read_record(result)
     status = record.get("status")
     reason, message = record.get("reason") or str(status), record.get("message") or ""
-    unwanted = choices.reason_to_leave_out(place.name, record.get("input_hash"))
+    unwanted = choices.reason_to_leave_out(result.name, record.get("input_hash"))
     if unwanted is not None:
         reason, message = unwanted
     elif status == Status.FAILED:
@@ -279,13 +279,13 @@ def _judge(
     else:
         inputs = record.get("inputs") or [{}]
         return SheetRecord(
-            place=place,
+            place=result,
             settings_hash=intern(str(record.get("settings_hash"))),
             version=intern(str(record.get("version"))),
             source=relocate(str(inputs[0].get("file", "")), request.segmentations),
             flagged=status == Status.FLAGGED,
         )
-    return Exclusion.of_sheet(place.name, reason, message)
+    return Exclusion.of_sheet(result.name, reason, message)
 
 
 def _metrics(record: Mapping[str, Any]) -> dict[str, Any]:

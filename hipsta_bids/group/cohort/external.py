@@ -235,17 +235,6 @@ def _surfaces_beside(path: Path, hemi: str) -> list[Path]:
     ]
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class ExternalCohorts:
-    """Maps of other programs."""
-
-    measured: Measured
-    """Sheets, with the maps that lie on their grid."""
-    cohorts: Mapping[str, Cohort]
-    """Maps with points of their own, by surface; the covariates are the visits only."""
-    notes: tuple[str, ...]
-
-
 def find_all(
     requests: Sequence[MapPattern],
     root: Path,
@@ -260,8 +249,10 @@ def find_all(
 
 def add_external(
     measured: Measured, sources: Iterable[ExternalFiles], visits: Sequence[VisitKey]
-) -> ExternalCohorts:
+) -> tuple[Measured, dict[str, Cohort], list[str]]:
     """Read other programs' maps, and add those on the grid of the sheets to the sheets.
+
+    Returns the sheets, cohorts by surface of maps with points of their own, and notes.
 
     Without sheets, maps on a grid replace them if there is a curvature to register them by.
     """
@@ -297,9 +288,7 @@ def add_external(
             )
     if cohorts:
         notes.append(f"maps {', '.join(cohorts)}: not registered, their points are to correspond")
-    return ExternalCohorts(
-        measured=replace(measured, sides=sides), cohorts=cohorts, notes=tuple(notes)
-    )
+    return replace(measured, sides=sides), cohorts, notes
 
 
 def _nodes(sides: Mapping[str, SideMaps]) -> tuple[int, int]:

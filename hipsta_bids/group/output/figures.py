@@ -19,7 +19,7 @@ from hipsta_bids.group.output import panels
 from hipsta_bids.group.output.results import Analysis, ScoredMaps, members_of, profiles_of
 from hipsta_bids.group.output.shapes import AverageShape
 from hipsta_bids.group.stats.arrays import Float, describe_known, mean_of_known
-from hipsta_bids.group.stats.classify import ClassifierResult, PairComparison
+from hipsta_bids.group.stats.classify import ClassifierResult, ModelComparison
 from hipsta_bids.group.stats.glm import FittedMaps
 from hipsta_bids.io.files import MISSING
 from hipsta_bids.reports.cells import SIDES, display_name, with_brackets
@@ -154,7 +154,7 @@ def draw_calibration(analysis: Analysis) -> "list[Figure]":
         axis.plot(calibration.predicted, calibration.observed, "o-", color=color, markersize=3)
         return f"{calibration.slope:.2f}, {calibration.brier:.2f}"
 
-    judged = [one for one in analysis.pairs if one[2].comparison.full.calibration.judged]
+    judged = [one for one in analysis.pairs if one[-1].full.calibration.judged]
     labels = "predicted chance, cross-validated", "share of cases"
     return _draw_pairs(replace(analysis, pairs=judged), labels, "slope, Brier score", line)
 
@@ -166,19 +166,22 @@ def _draw_pairs(
     line: "Callable[[Axes, ClassifierResult, str], str]",
 ) -> "list[Figure]":
     """Draw a row for each pair of groups, with its legend beside it: the first added measure."""
-    first: dict[tuple[str, str], dict[str, tuple[str, PairComparison]]] = {}
-    for hemi, measure, pair in analysis.pairs:
-        first.setdefault((pair.control, pair.case), {}).setdefault(hemi, (measure, pair))
+    first: dict[tuple[str, str], dict[str, tuple[str, ModelComparison]]] = {}
+    for hemi, measure, pair, comparison in analysis.pairs:
+        first.setdefault(pair, {}).setdefault(hemi, (measure, comparison))
     n = max(map(len, first.values()))
     width = panels.TWO_COLUMNS if n > 1 else panels.ONE_COLUMN
     side = (width - 6.0) / (n + 1)
     figure, axes = _panels(len(first), n + 1, (width, len(first) * max(side + 13, 18 + 14 * n)))
     for row, ((control, case), by_side) in zip(axes, first.items(), strict=True):
         texts: dict[str, list[str]] = {}
-        for axis, (hemi, (measure, pair)) in zip(row, by_side.items(), strict=False):
+        for axis, (hemi, (measure, comparison)) in zip(row, by_side.items(), strict=False):
             where = {"L": "left", "R": "right"}.get(hemi, "both sides")
             axis.plot([0, 1], [0, 1], color="0.6", linewidth=0.5)
-            for color, name, result in _models(measure, pair):
+            for color, name, result in (
+                (COLORS[0], "base model", comparison.base),
+                (COLORS[1], f"with {display_name(measure)}", comparison.full),
+            ):
                 text = line(axis, result, color)
                 texts.setdefault(name, []).append(f"{where}: {text}")
             axis.set_title(where)
@@ -188,7 +191,7 @@ def _draw_pairs(
         row[0].set_ylabel(labels[1])
         for axis in row[len(by_side) :]:
             axis.set_axis_off()
-        method = "\n(separated: Firth's method)" if pair.comparison.separated else ""
+        method = "\n(separated: Firth's method)" if comparison.columns["separated"] else ""
         from matplotlib.lines import Line2D  # noqa: PLC0415  (slow to load)
 
         blank = Line2D([], [], linestyle="none")
@@ -204,11 +207,6 @@ def _draw_pairs(
         )  # fmt: skip
     _name([axis for axis in axes.flat if axis.axison])
     return [figure]
-
-
-def _models(measure: str, pair: PairComparison) -> Iterator[tuple[str, str, ClassifierResult]]:
-    yield COLORS[0], "base model", pair.comparison.base
-    yield COLORS[1], f"with {display_name(measure)}", pair.comparison.full
 
 
 def draw_registration(cohort: Cohort, analysis: Analysis) -> "list[Figure]":
@@ -460,5 +458,5 @@ def draw_figures(
         yield "sections", partial(draw_sections, cohort, analysis, shapes)
     if analysis.pairs:
         yield "roc", partial(draw_roc, analysis)
-        if any(pair.comparison.full.calibration.judged for *_, pair in analysis.pairs):
+        if any(one.full.calibration.judged for *_, one in analysis.pairs):
             yield "calibration", partial(draw_calibration, analysis)

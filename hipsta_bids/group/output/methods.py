@@ -452,7 +452,7 @@ def _classification(
 ) -> str:
     rules = settings.classification
     delong, firth, snell = map(cite, ("delong", "firth", "snell"))
-    separated = sum(pair.comparison.separated for _, _, pair in analysis.pairs)
+    separated = sum(one.columns["separated"] for *_, one in analysis.pairs)
     by_firth = (
         f" {separated} comparisons were separated and fitted by Firth's method {firth}."
         if separated

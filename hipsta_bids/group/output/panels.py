@@ -445,10 +445,10 @@ def _draw_row(
     cohort: Cohort,
     columns: Sequence[_Column],
     row: Row,
-    place: tuple[int, int, str],
+    position: tuple[int, int, str],
 ) -> None:
     """Draw a row at a place from the top, of a height, with its letter."""
-    top, height, letter = place
+    top, height, letter = position
     paper.text(1.0 * MM, top - 3.2 * MM, letter, fontsize=LETTER, weight="bold", ha="left")
     room = int((paper.width / MM - _LEFT) / (_LETTER_WIDTH * TITLE * 25.4 / 72))
     long = len(row.title) > room

@@ -18,7 +18,7 @@ from hipsta_bids.group.output.saved import SavedEffects, templates_to_json
 from hipsta_bids.group.stats import arrays
 from hipsta_bids.group.stats import registration as alignment
 from hipsta_bids.group.stats.arrays import Bool, Float, Int
-from hipsta_bids.group.stats.classify import PairComparison
+from hipsta_bids.group.stats.classify import ModelComparison
 from hipsta_bids.group.stats.combat import ARRAYS, SiteEffects, SiteMoments, Visits
 from hipsta_bids.group.stats.glm import FittedMaps, PointTest, PointwiseFit, RowModel
 from hipsta_bids.group.stats.inference import Discoveries, MapKey
@@ -181,8 +181,8 @@ class Analysis:
     scores: Scores | None
     """Scores of participants against a reference group, if there is one."""
     measures: Sequence[MeasureFit]
-    pairs: Sequence[tuple[str, str, PairComparison]]
-    """Hemisphere, added measure, and result."""
+    pairs: Sequence[tuple[str, str, tuple[str, str], ModelComparison]]
+    """Hemisphere, added measure, control and case, and result."""
     skipped: Sequence[str]
     """What was left out, and why; one line each."""
 

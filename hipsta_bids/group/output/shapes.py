@@ -118,9 +118,9 @@ def _nearest_rotation(matrix: Float) -> Float:
 def _read_layers(places: Sequence[ResultPlace], shape: tuple[int, int]) -> tuple[list[int], Float]:
     """Read the surfaces (sheets, 3, x, y, 3) in mm of the sheets that have all of them."""
     read_rows, layers = [], []
-    for i, place in enumerate(places):
+    for i, result in enumerate(places):
         try:
-            surfaces = [gifti.read_mesh(place.path(key)).points for key in _KEYS]
+            surfaces = [gifti.read_mesh(result.path(key)).points for key in _KEYS]
         except InputError:  # maps and statistics do without it
             continue
         if all(surface.shape == (shape[0] * shape[1], 3) for surface in surfaces):
@@ -134,7 +134,7 @@ def average_shapes(
 ) -> dict[str, AverageShape]:
     """Average the surfaces of each hemisphere, of the first visit of each participant."""
     names = [(record.place.name, record.place) for record in records]
-    place_of = {(visit_name(one.subject, one.session), one.hemi): place for one, place in names}
+    result_of = {(visit_name(one.subject, one.session), one.hemi): result for one, result in names}
     shapes = {}
     for hemi, side in analysis.sides.items() if records else ():
         visits = cohort.table.iloc[side.registered.rows]
@@ -142,8 +142,8 @@ def average_shapes(
         count = min(len(first), settings.most)
         rows = first[np.linspace(0, len(first) - 1, count).round().astype(np.int64)]
         keys = [(str(name), hemi) for name in visits.index[rows]]
-        rows = rows[[key in place_of for key in keys]]
-        places = [place_of[key] for key in keys if key in place_of]
+        rows = rows[[key in result_of for key in keys]]
+        places = [result_of[key] for key in keys if key in result_of]
         read, layers = _read_layers(places, side.registered.shape)
         if not read:
             continue

@@ -52,7 +52,7 @@ def result_tables(
     if analysis.pairs:
         yield "classification", _classification(analysis, settings)
         yield "roc", _stacked(_curves(analysis, _roc))
-        if any(pair.comparison.full.calibration.judged for *_, pair in analysis.pairs):
+        if any(one.full.calibration.judged for *_, one in analysis.pairs):
             yield "calibration", _stacked(_curves(analysis, _calibration))
     yield from _statistics(cohort, analysis)
 
@@ -316,9 +316,9 @@ def _root_mean_square(values: Float) -> float:
 
 def _curves(analysis: results.Analysis, curve: CurveOf) -> Iterator[Columns]:
     """Curves of both models of each comparison."""
-    for hemi, measure, pair in analysis.pairs:
-        labels = {"hemi": hemi, "control": pair.control, "case": pair.case, "added": measure}
-        for classifier, result in (("base", pair.comparison.base), ("full", pair.comparison.full)):
+    for hemi, measure, (control, case), comparison in analysis.pairs:
+        labels = {"hemi": hemi, "control": control, "case": case, "added": measure}
+        for classifier, result in (("base", comparison.base), ("full", comparison.full)):
             yield {**labels, "classifier": classifier, **curve(result)}
 
 
@@ -332,38 +332,17 @@ def _calibration(result: ClassifierResult) -> Columns:
 
 
 def _classification(analysis: results.Analysis, settings: GroupSettings) -> pd.DataFrame:
-    rows: list[dict[str, object]] = []
-    for hemi, measure, pair in analysis.pairs:
-        comparison = pair.comparison
-        rows.append(
+    base = " + ".join(settings.classification.base)
+    return pd.DataFrame(
+        [
             {
                 "hemi": hemi,
-                "control": pair.control,
-                "case": pair.case,
-                "base": " + ".join(settings.classification.base),
+                "control": control,
+                "case": case,
+                "base": base,
                 "added": measure,
-                "n": comparison.n,
-                "n_cases": comparison.n_cases,
-                "n_incomplete": pair.n_incomplete,
-                **_areas("base", comparison.base),
-                **_areas("full", comparison.full),
-                "calibration_intercept": comparison.full.calibration.intercept,
-                "calibration_slope": comparison.full.calibration.slope,
-                "brier": comparison.full.calibration.brier,
-                "likelihood_ratio": comparison.likelihood_ratio,
-                "lr_df": comparison.df,
-                "p": comparison.p,
-                "separated": comparison.separated,
+                **comparison.columns,
             }
-        )
-    return pd.DataFrame(rows)
-
-
-def _areas(name: str, result: ClassifierResult) -> dict[str, float]:
-    return {
-        f"auc_{name}": result.auc.area,
-        f"auc_{name}_low": result.auc.low,
-        f"auc_{name}_high": result.auc.high,
-        f"auc_{name}_cv": result.cross_validation.auc,
-        f"auc_{name}_cv_sd": result.cross_validation.auc_sd,
-    }
+            for hemi, measure, (control, case), comparison in analysis.pairs
+        ]
+    )

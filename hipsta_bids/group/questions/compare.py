@@ -173,7 +173,7 @@ def _notes(
         notes.append(
             f"{flagged} flagged hemispheres are in it; look at them, or use --exclude-flagged"
         )
-    if separated := sum(pair.comparison.separated for _, _, pair in analysis.pairs):
+    if separated := sum(one.columns["separated"] for *_, one in analysis.pairs):
         notes.append(
             f"{separated} of {len(analysis.pairs)} comparisons of classifiers are separated, and"
             " fitted by Firth's method"

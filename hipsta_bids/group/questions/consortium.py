@@ -2,7 +2,6 @@
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -31,26 +30,24 @@ from hipsta_bids.protocols.toml import resolve
 from hipsta_bids.reports.meta import write_meta_report
 
 
-@dataclass(frozen=True, kw_only=True)
-class MetaOptions:
-    """What the user asked for."""
+def run_meta(
+    paths: Sequence[tuple[str | None, Path]],
+    out_dir: Path,
+    settings: GroupSettings,
+    command: Sequence[str] = (),
+) -> tuple[Path, list[str]]:
+    """Combine the summaries of sites, perhaps with other names than those in them.
 
-    sites: tuple[tuple[str | None, Path], ...]
-    """Summaries, perhaps with other names than those in them."""
-    out_dir: Path
-    command: tuple[str, ...] = ()
-
-
-def run_meta(options: MetaOptions, settings: GroupSettings) -> tuple[Path, list[str]]:
-    """Combine the summaries of sites; returns the page and what should be known."""
+    Returns the page and what should be known.
+    """
     if settings.multiplicity.method in PERMUTATIONS:
         raise UsageError(
             "meta: there is nobody to permute in summaries; use --correction fdr2 or bh"
         )
-    sites = _read(options.sites)
+    sites = _read(paths)
     notes = check_agreement(sites)
     meta = analyze_sites(sites, settings)
-    folder = options.out_dir / META
+    folder = out_dir / META
     if folder.exists() and not (folder / "meta.json").exists():
         raise OutputError(
             f"{folder}: is no earlier meta-analysis; choose another output folder",
@@ -62,9 +59,9 @@ def run_meta(options: MetaOptions, settings: GroupSettings) -> tuple[Path, list[
         _write_maps(scratch, meta)
         notes += write.write_figures(scratch, _figures(meta))
         files.write_text(scratch / "methods.md", _methods(meta))
-        files.write_json(scratch / "meta.json", _record(meta, options, notes))
-    write_meta_report(options.out_dir)
-    return options.out_dir / META_REPORT, notes
+        files.write_json(scratch / "meta.json", _record(meta, paths, command, notes))
+    write_meta_report(out_dir)
+    return out_dir / META_REPORT, notes
 
 
 def _read(paths: Sequence[tuple[str | None, Path]]) -> list[SiteSummary]:
@@ -160,14 +157,19 @@ def _place(meta: Meta, hemi: str, cohort: Cohort) -> FittedMaps:
     )
 
 
-def _record(meta: Meta, options: MetaOptions, notes: Sequence[str]) -> dict[str, Any]:
+def _record(
+    meta: Meta,
+    paths: Sequence[tuple[str | None, Path]],
+    command: Sequence[str],
+    notes: Sequence[str],
+) -> dict[str, Any]:
     """Record what was combined, and how."""
     first = meta.sites[0]
     return {
-        "command": list(options.command),
+        "command": list(command),
         "version": __version__,
         "inputs": {
-            "datasets": [str(path.resolve()) for _, path in options.sites],
+            "datasets": [str(path.resolve()) for _, path in paths],
             "settings_hash": first.settings_hash,
             "versions": sorted({version for site in meta.sites for version in site.versions}),
             "seg": first.seg,

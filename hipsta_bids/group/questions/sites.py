@@ -289,14 +289,14 @@ def _points(peaks: Sequence[pd.DataFrame], frame: columns.Frame) -> list[int]:
     rows = table[table["extent"] > 0] if (table["extent"] > 0).any() else table.tail(1)
     rows = rows.reindex(rows["statistic"].abs().sort_values(ascending=False, kind="stable").index)
     x, y = (frame.position[axis].tolist() for axis in "xy")
-    at = {place: point for point, place in enumerate(zip(x, y, strict=True))}
+    at = {position: point for point, position in enumerate(zip(x, y, strict=True))}
     nodes = np.stack([frame.number["node_x"], frame.number["node_y"]])
     nodes_kept: list[int] = []
-    for place in zip(rows["x"].tolist(), rows["y"].tolist(), strict=True):
-        distance = np.abs(nodes[:, nodes_kept] - nodes[:, [at[place]]]).max(axis=0)
+    for position in zip(rows["x"].tolist(), rows["y"].tolist(), strict=True):
+        distance = np.abs(nodes[:, nodes_kept] - nodes[:, [at[position]]]).max(axis=0)
         # Both models have the same cluster's peak there, or nearly.
         if (distance > _SAME_PEAK).all():
-            nodes_kept.append(at[place])
+            nodes_kept.append(at[position])
     return nodes_kept[:_MOST_PEAKS]
 
 

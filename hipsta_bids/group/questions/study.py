@@ -178,9 +178,9 @@ def read_inputs(options: GroupOptions, settings: GroupSettings) -> GroupInputs:
     requests = external.map_patterns(options.maps, options.surfaces, taken)
     wanted = designs.wanted_measures(options.model, options.measures)
     measures = read.choose_measures(wanted, found.records, [one.name for one in requests])
-    further = _read_maps(options, found, requests, measures, settings)
+    sheets, surfaces, map_notes = _read_maps(options, found, requests, measures, settings)
     measured, volume_notes = external.add_volumes(
-        further.measured, found.records, options.volumes, options.bids_dir
+        sheets, found.records, options.volumes, options.bids_dir
     )
     read.check_summaries(measures, measured.sides)
     all_visits = Cohort(
@@ -195,7 +195,7 @@ def read_inputs(options: GroupOptions, settings: GroupSettings) -> GroupInputs:
         units=measured.units,
     )
     # A visit may have lost both of its hemispheres.
-    cohorts = {SHEET: all_visits, **further.cohorts}
+    cohorts = {SHEET: all_visits, **surfaces}
     rows = np.concatenate([side.rows for one in cohorts.values() for side in one.sides.values()])
     has_maps = np.isin(np.arange(len(all_visits.table)), rows)
     cohort, reasons = choose_visits(all_visits.take(has_maps), options.comparison)
@@ -206,14 +206,14 @@ def read_inputs(options: GroupOptions, settings: GroupSettings) -> GroupInputs:
     if options.comparison.longitudinal:
         time = add_time(cohort.table, settings)
         cohort = replace(cohort, table=time.table)
-    sheet_maps = tuple(name for name in measures.maps if name not in further.cohorts)
+    sheet_maps = tuple(name for name in measures.maps if name not in surfaces)
     reason = "other-session" if options.comparison.pair else "later-session"
     return GroupInputs(
         found=found,
         cohorts={SHEET: cohort}
         | {
             surface: replace(one.take(keep), table=cohort.table)
-            for surface, one in further.cohorts.items()
+            for surface, one in surfaces.items()
         },
         measures=replace(measures, maps=sheet_maps),
         icv=icv,
@@ -225,7 +225,7 @@ def read_inputs(options: GroupOptions, settings: GroupSettings) -> GroupInputs:
                 measured.visits, {visit: (reason, message) for visit, message in reasons.items()}
             ),
         ),
-        notes=(*found.notes, *further.notes, *volume_notes, *_damaged(measured)),
+        notes=(*found.notes, *map_notes, *volume_notes, *_damaged(measured)),
     )
 
 
@@ -235,7 +235,7 @@ def _read_maps(
     requests: Sequence[external.MapPattern],
     measures: Measures,
     rules: GroupSettings,
-) -> external.ExternalCohorts:
+) -> tuple[read.Measured, dict[str, Cohort], list[str]]:
     """Read the maps that are asked for, of the sheets and of other programs."""
     error_window = 0 if rules.glm.weights == "none" else ERROR_WINDOW
     asked = [one for one in requests if one.name in measures.maps]

@@ -14,7 +14,7 @@ from hipsta_bids.group.design.model import Design, Groups, build_design
 from hipsta_bids.group.design.settings import ClassificationSettings, DesignSettings
 from hipsta_bids.group.output.results import MeasureFit
 from hipsta_bids.group.stats.arrays import Float
-from hipsta_bids.group.stats.classify import PairComparison, compare_pairs, forget_models
+from hipsta_bids.group.stats.classify import ModelComparison, compare_pairs, forget_models
 from hipsta_bids.group.stats.glm import MEAN, RowModel, with_mean
 from hipsta_bids.progress import tell
 from hipsta_bids.types import PARTICIPANT
@@ -81,11 +81,11 @@ def _same_names(larger: Design, design: Design) -> tuple[Contrast, ...]:
 
 def classify_groups(
     cohort: Cohort, groups: Groups, settings: ClassificationSettings
-) -> tuple[list[tuple[str, str, PairComparison]], list[str]]:
+) -> tuple[list[tuple[str, str, tuple[str, str], ModelComparison]], list[str]]:
     """Compare each pair of groups by base measures, and by each further measure on top."""
     names = cohort.table[groups.column].astype(object)
     labels = names.where(names.notna(), "").astype(str).to_numpy(dtype=np.str_)
-    results: list[tuple[str, str, PairComparison]] = []
+    results: list[tuple[str, str, tuple[str, str], ModelComparison]] = []
     notes: list[str] = []
     if groups.column in settings.base:
         raise UsageError(f"--base {groups.column}: that is what is told apart")
@@ -111,7 +111,7 @@ def classify_groups(
             except ModelError as error:
                 notes.append(f"classification by {measure}, hemisphere {hemi}: {error}")
                 continue
-            results += [(hemi, measure, pair) for pair in pairs]
+            results += [(hemi, measure, pair, one) for pair, one in pairs.items()]
     forget_models()
     return results, notes
 

@@ -1,9 +1,10 @@
 """How well measures tell two groups apart, beyond a base model: classifiers and their curves."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,8 @@ CALIBRATION_BINS = 10
 
 #: Points of a curve that are written and drawn.
 _MOST_POINTS = 1001
+#: Ends of the columns of areas.
+_AREAS = ("", "_low", "_high", "_cv", "_cv_sd")
 #: Members of training sets that are fitted at once; does not change a result.
 _CHUNK = 100_000
 #: Subjects in a group of the table of calibration, or there are fewer groups.
@@ -120,19 +123,20 @@ class ModelComparison:
 
     base: ClassifierResult
     full: ClassifierResult
-    separated: bool
-    """Whether either model separates the groups; then both are Firth's."""
-    likelihood_ratio: float
-    df: int
-    p: float
-    n: int
-    n_cases: int
+    columns: Mapping[str, Any]
+    """Of the table of classification; ``separated`` if either model separates the groups, where
+    both are Firth's."""
 
 
 def compare_models(
-    base: Float, added: Float, case: Bool, settings: ClassificationSettings
+    base: Float,
+    added: Float,
+    case: Bool,
+    settings: ClassificationSettings,
+    *,
+    n_incomplete: int = 0,
 ) -> ModelComparison:
-    """Test whether measures add to a base model, and tell how well both classify.
+    """Test whether measures add to a base model, and how well both classify complete subjects.
 
     The likelihood-ratio test is the only test between the two. If a model separates the groups,
     both are fitted by Firth's method, and the test is that of the penalized likelihood (Heinze
@@ -151,16 +155,28 @@ def compare_models(
         fits[0] = logistic.fit_logistic(full, case, firth=True, free=free)
     ratio = 2 * (fits[1].log_likelihood - fits[0].log_likelihood)
     df = int((~free).sum())
-    return ModelComparison(
-        base=models[0],
-        full=models[1],
-        separated=separated,
-        likelihood_ratio=ratio,
-        df=df,
-        p=float(stats.chi2.sf(ratio, df)),
-        n=len(case),
-        n_cases=int(case.sum()),
-    )
+    calibration = models[1].calibration
+    columns = {
+        "n": len(case),
+        "n_cases": int(case.sum()),
+        "n_incomplete": n_incomplete,
+        **_areas("base", models[0]),
+        **_areas("full", models[1]),
+        "calibration_intercept": calibration.intercept,
+        "calibration_slope": calibration.slope,
+        "brier": calibration.brier,
+        "likelihood_ratio": ratio,
+        "lr_df": df,
+        "p": float(stats.chi2.sf(ratio, df)),
+        "separated": separated,
+    }
+    return ModelComparison(base=models[0], full=models[1], columns=columns)
+
+
+def _areas(name: str, result: ClassifierResult) -> dict[str, float]:
+    area, validation = result.auc, result.cross_validation
+    values = area.area, area.low, area.high, validation.auc, validation.auc_sd
+    return dict(zip((f"auc_{name}{end}" for end in _AREAS), values, strict=True))
 
 
 @lru_cache(maxsize=32)
@@ -304,17 +320,6 @@ def _shift(score: Float, case: Bool) -> float:
     )
 
 
-@dataclass(frozen=True)
-class PairComparison:
-    """Two groups told apart by a base model, and by one with measures added."""
-
-    control: str
-    case: str
-    comparison: ModelComparison
-    n_incomplete: int
-    """Subjects of the two groups left out of both models, as they lack a value."""
-
-
 def compare_pairs(
     groups: NDArray[np.str_],
     base: Float,
@@ -322,15 +327,15 @@ def compare_pairs(
     settings: ClassificationSettings,
     *,
     order: Sequence[str],
-) -> list[PairComparison]:
-    """Compare the two models in each pair of groups, on the same complete subjects."""
+) -> dict[tuple[str, str], ModelComparison]:
+    """Compare the two models in each pair of control and case, on the same complete subjects."""
     if unknown := sorted(set(order) - set(groups.tolist())):
         raise ModelError(
             f"classification: no participant is in group {', '.join(unknown)}; known are"
             f" {', '.join(sorted(set(groups.tolist())))}"
         )
     complete = np.isfinite(base).all(axis=1) & np.isfinite(added).all(axis=1)
-    results = []
+    results = {}
     for control, case in combinations(order, 2):
         in_pair = (groups == control) | (groups == case)
         rows_used = in_pair & complete
@@ -338,15 +343,13 @@ def compare_pairs(
         centered = [values[rows_used] - values[rows_used].mean(axis=0) for values in (base, added)]
         matrix = np.column_stack([np.ones(rows_used.sum()), centered[0]])
         try:
-            comparison = compare_models(matrix, centered[1], groups[rows_used] == case, settings)
-        except ModelError as error:
-            raise ModelError(f"{control} against {case}: {error}") from error
-        results.append(
-            PairComparison(
-                control=control,
-                case=case,
-                comparison=comparison,
+            results[control, case] = compare_models(
+                matrix,
+                centered[1],
+                groups[rows_used] == case,
+                settings,
                 n_incomplete=int((in_pair & ~complete).sum()),
             )
-        )
+        except ModelError as error:
+            raise ModelError(f"{control} against {case}: {error}") from error
     return results
