@@ -29,8 +29,8 @@ else:
             return import_module("hipsta_bids.group")
         if name not in _MODULES:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        found = globals()[name] = getattr(import_module(_MODULES[name]), name)
-        return found
+        value = globals()[name] = getattr(import_module(_MODULES[name]), name)
+        return value
 
     def __dir__() -> list[str]:
         return sorted({*globals(), *_MODULES, "group"})

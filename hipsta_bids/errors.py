@@ -92,8 +92,8 @@ class ModelError(HipstaError):
     """A statistical model cannot be fitted to these data."""
 
 
-def did_you_mean(words: Iterable[str], known: Iterable[str]) -> str:
+def did_you_mean(words: Iterable[str], vocabulary: Iterable[str]) -> str:
     """Name the nearest known words as the end of a message; empty if none is near."""
-    names = list(known)
+    names = list(vocabulary)
     near = [match for word in words for match in difflib.get_close_matches(word, names, n=1)]
     return f"; did you mean {' '.join(near)}?" if near else ""

@@ -26,16 +26,16 @@ def listening(listener: Listener) -> Iterator[None]:
         _LISTENER.reset(token)
 
 
-def tell(stage: str, done: int = 0, total: int = 0) -> None:
+def tell(stage: str, count: int = 0, total: int = 0) -> None:
     """Say what is being done. A stage ends when another begins."""
     listener = _LISTENER.get()
     if listener is not None:
-        listener(stage, done, total)
+        listener(stage, count, total)
 
 
 def each(stage: str, items: Sequence[Item]) -> Iterator[Item]:
     """Yield items, and tell how many are done."""
     tell(stage, 0, len(items))
-    for done, item in enumerate(items, start=1):
+    for count, item in enumerate(items, start=1):
         yield item
-        tell(stage, done, len(items))
+        tell(stage, count, len(items))

@@ -241,14 +241,14 @@ class Finding:
     """Statistic of the check."""
     limit: float
     """A larger value is flagged."""
-    what: str
+    text: str
     """What was found, for people."""
     remedy: str
     """What to try, for people."""
     points: Float = field(default_factory=_nowhere)
     """(N, 3) where it was found, RAS mm; none if it concerns the sheet as a whole."""
     placed: bool = False
-    """Whether :attr:`what` says where."""
+    """Whether :attr:`text` says where."""
     share: float = float("nan")
     """Share of the columns that are concerned, where the points do not tell."""
     change: float = float("nan")

@@ -123,7 +123,7 @@ def make_input(folder, subject="01", *, hemi="L", act="ok", problem=None, sessio
         files=(path,),
         source="tests",
         source_path=folder,
-        why="it is the only one",
+        explanation="it is the only one",
         passed_over=((str(folder / "other.txt"), "coarser"),),
         problem=problem,
     )

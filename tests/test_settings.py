@@ -63,7 +63,7 @@ def test_file_overrides_defaults_and_keeps_the_rest(tmp_path):
 
 def test_values_are_converted_to_their_fields_types():
     values = {"steps": [1, 2, 3], "limit": 4, "inner": {"length": 1, "rule": "b", "exact": True}}
-    made = settings_from(values, Outer, where="f")
+    made = settings_from(values, Outer, origin="f")
     assert made.steps == (1.0, 2.0, 3.0)
     assert {type(value) for value in (made.limit, *made.steps, made.inner.length)} == {float}
     assert made.inner == Inner(length=1.0, rule="b", exact=True)
@@ -95,7 +95,7 @@ def test_values_are_converted_to_their_fields_types():
 )
 def test_wrong_values_are_named(values, message):
     with pytest.raises(SettingsError, match=message) as caught:
-        settings_from(values, Outer, where="f")
+        settings_from(values, Outer, origin="f")
     assert str(caught.value).startswith("f: ")
     assert "\n" not in str(caught.value)
     assert (caught.value.exit_code, caught.value.reason) == (64, "setting-out-of-range")
@@ -120,7 +120,7 @@ def test_changed_values_are_checked():
 )
 def test_values_that_no_stage_could_work_with_are_refused(values, message):
     with pytest.raises(SettingsError, match=message):
-        settings_from(values, Settings, where="f")
+        settings_from(values, Settings, origin="f")
 
 
 @pytest.mark.parametrize(
@@ -138,7 +138,7 @@ def test_unusable_files_are_named(tmp_path, content, message):
 @pytest.mark.parametrize("settings", [Settings(), GroupSettings(), Outer(limit=2.5)])
 def test_printed_and_pickled_settings_read_back(settings):
     values = tomllib.loads(settings_toml(settings))
-    assert settings_from(values, type(settings), where="f") == settings
+    assert settings_from(values, type(settings), origin="f") == settings
     assert pickle.loads(pickle.dumps(settings)) == settings  # noqa: S301 -- made here
 
 

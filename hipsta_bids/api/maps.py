@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 #: Surfaces of the sheet, by their position among its layers.
 _LEVELS = {"interior": 0.0, "midthickness": 0.5, "exterior": 1.0}
 #: What is no column of the sheet's table: definition and unit.
-_MORE = {
+_EXTRA_VARIABLES = {
     "position": ("position, scanner RAS", "mm"),
     "depth": ("distance from the interior wall along the column", "mm"),
 }
@@ -179,14 +179,14 @@ def attributes(name: str) -> dict[str, str]:
     for row in MAPS:
         if row.name == name:
             return {"units": row.unit, "long_name": row.definition, "source": row.source}
-    words, unit = (_MORE | STATE)[name]
+    words, unit = (_EXTRA_VARIABLES | STATE)[name]
     return {"long_name": words, **({"units": unit} if unit else {})}
 
 
 def node_axes(grid: SheetSettings, region: str) -> dict[str, Any]:
     """Coordinates of the nodes, by the settings of the sheet."""
-    both = zip("xy", node_coordinates(grid, region), strict=True)
-    return {axis: ([axis], values, _NODES[axis]) for axis, values in both}
+    axis_values = zip("xy", node_coordinates(grid, region), strict=True)
+    return {axis: ([axis], values, _NODES[axis]) for axis, values in axis_values}
 
 
 def check_choice(name: str, value: object, choices: Mapping[str, object]) -> None:
@@ -295,8 +295,8 @@ def _read_volume(
     affine: ArrayLike | None,
     region: str,
 ) -> LabelVolume:
-    own = getattr(labels, "affine", None)
-    if isinstance(labels, str | Path) or own is not None:
+    image_affine = getattr(labels, "affine", None)
+    if isinstance(labels, str | Path) or image_affine is not None:
         if affine is not None:
             raise ValueError("an image has an affine of its own; give affine with arrays only")
     elif affine is None:
@@ -307,10 +307,10 @@ def _read_volume(
         if not image.data.size:
             raise InputError(f"{path}: all labels are zero", reason="empty-labels")
         return label_volume(image, protocol, side, region, path=path)
-    data = np.asanyarray(labels if own is None else labels.dataobj)
+    data = np.asanyarray(labels if image_affine is None else labels.dataobj)
     if data.ndim != 3:  # noqa: PLR2004  (a volume)
         raise InputError(f"labels of shape {data.shape}; a volume has 3 axes", reason="not-3d")
-    matrix = np.asarray(affine if own is None else own, dtype=np.float64)
+    matrix = np.asarray(affine if image_affine is None else image_affine, dtype=np.float64)
     if matrix.shape != (4, 4) or not abs(np.linalg.det(matrix[:3, :3])) > 0:
         raise ValueError("affine has to be an invertible matrix (4, 4), voxel indices to RAS mm")
     image = LabelImage(data=data, start=(0, 0, 0), shape=data.shape, affine=matrix)
@@ -369,43 +369,49 @@ def load(out_dir: str | Path, *, protocol: str | None = None, region: str = "bod
         hb.plot_sheet(maps.sel(participant="sub-01", side="L").squeeze("session"))
     """
     root = Path(out_dir)
-    found = list(find_results(root))
-    seg = _one_protocol(root, found, protocol, region)
-    own = [one for one in found if (one.place.name.seg, one.place.name.region) == (seg, region)]
-    table = pd.DataFrame([_row(one) for one in own])
-    return Results(maps=_lazy_dataset(root, own, table), table=table)
+    hemispheres = list(find_results(root))
+    seg = _one_protocol(root, hemispheres, protocol, region)
+    selected = [
+        side
+        for side in hemispheres
+        if (side.place.name.seg, side.place.name.region) == (seg, region)
+    ]
+    table = pd.DataFrame([_row(side) for side in selected])
+    return Results(maps=_lazy_dataset(root, selected, table), table=table)
 
 
-def _one_protocol(root: Path, found: list[Hemisphere], wanted: str | None, region: str) -> str:
-    every = sorted({(one.place.name.seg, one.place.name.region) for one in found})
-    names = [seg for seg, own in every if own == region]
-    if not names or wanted not in {None, *names}:
-        there = ", ".join(f"{seg} (region {own})" for seg, own in every)
-        there = f"there is {there}" if there else "run the participant level first"
-        raise NothingToDoError(f"{root}: no such hemisphere; {there}")
-    if wanted is None and len(names) > 1:
+def _one_protocol(
+    root: Path, hemispheres: list[Hemisphere], protocol: str | None, region: str
+) -> str:
+    pairs = sorted({(side.place.name.seg, side.place.name.region) for side in hemispheres})
+    names = [seg for seg, pair_region in pairs if pair_region == region]
+    if not names or protocol not in {None, *names}:
+        available = ", ".join(f"{seg} (region {pair_region})" for seg, pair_region in pairs)
+        available = f"there is {available}" if available else "run the participant level first"
+        raise NothingToDoError(f"{root}: no such hemisphere; {available}")
+    if protocol is None and len(names) > 1:
         raise InputError(
             f"{root}: hemispheres of several protocols, {', '.join(names)}; choose one by protocol"
         )
-    return wanted or names[0]
+    return protocol or names[0]
 
 
-def _row(one: Hemisphere) -> dict[str, object]:
-    who = identity(one.place.name)
+def _row(side: Hemisphere) -> dict[str, object]:
+    entities = identity(side.place.name)
     return {
-        "participant_id": who["subject"],
-        "session_id": who["session"],
-        "hemi": who["hemi"],
-        "protocol": who["seg"],
-        "region": who["region"],
-        "status": one.status.value,
-        "reason": one.record.get("reason") or "",
-        "message": one.message,
-        **one.summary,
+        "participant_id": entities["subject"],
+        "session_id": entities["session"],
+        "hemi": entities["hemi"],
+        "protocol": entities["seg"],
+        "region": entities["region"],
+        "status": side.status.value,
+        "reason": side.record.get("reason") or "",
+        "message": side.message,
+        **side.summary,
     }
 
 
-def _lazy_dataset(root: Path, own: list[Hemisphere], table: pd.DataFrame) -> "xr.Dataset":
+def _lazy_dataset(root: Path, hemispheres: list[Hemisphere], table: pd.DataFrame) -> "xr.Dataset":
     from hipsta_bids.io.xarrays import make_dataset, read_later  # noqa: PLC0415  (optional)
 
     axes_of_nodes = node_axes(grid_of(root), table["region"].iloc[0])
@@ -421,12 +427,12 @@ def _lazy_dataset(root: Path, own: list[Hemisphere], table: pd.DataFrame) -> "xr
     status = np.full(outer, "", dtype="<U8")
     for at, word in zip(index, table["status"], strict=True):
         status[at] = word
-    measured = {at: one for at, one in zip(index, own, strict=True) if one.measured}
+    measured = {at: side for at, side in zip(index, hemispheres, strict=True) if side.measured}
 
-    more = _beside_sheets(list(measured.values()))
+    extras = _beside_sheets(list(measured.values()))
 
     def read(name: str, at: tuple[int, ...]) -> NDArray[Any] | None:
-        key, _ = more.get(name, (("sheet",), {}))
+        key, _ = extras.get(name, (("sheet",), {}))
         if at not in measured or not (path := measured[at].place.path(*key)).is_file():
             return None
         if name == "position":
@@ -442,10 +448,10 @@ def _lazy_dataset(root: Path, own: list[Hemisphere], table: pd.DataFrame) -> "xr
         last = ("ras",) if name == "position" else ()
         inner = (*shape, *(len(POSITION) for _ in last))
         values = read_later(outer, inner, kind.get(name, np.float64), partial(read, name))
-        about = more[name][1] if name in more else attributes(name)
+        about = extras[name][1] if name in extras else attributes(name)
         return (*axes, "x", "y", *last), values, about
 
-    names = (*(row.name for row in MAPS), *STATE, "position", *more)
+    names = (*(row.name for row in MAPS), *STATE, "position", *extras)
     variables: dict[str, Any] = {name: variable(name) for name in names}
     variables["status"] = (axes, status, {"long_name": "how the hemisphere ended; empty: none"})
     coordinates = {
@@ -460,12 +466,12 @@ def _lazy_dataset(root: Path, own: list[Hemisphere], table: pd.DataFrame) -> "xr
 def _beside_sheets(measured: list[Hemisphere]) -> dict[str, tuple[tuple[str, ...], dict[str, str]]]:
     """Columns of tables of SDs and of sampled maps: their table, and what they are."""
     maps = {entry["name"] for one in measured for entry in one.record.get("maps") or ()}
-    found = {}
+    variables = {}
     for key in (("uncertainty",), *(("map_table", name) for name in sorted(maps))):
         paths = (one.place.path(*key).with_suffix(".json") for one in measured)
         path = next((path for path in paths if path.is_file()), None)
         for name, about in files.read_json(path).items() if path else ():
             if name.endswith("_sd") if key == ("uncertainty",) else name.partition("_")[0] in maps:
                 unit = {"units": about["Units"]} if "Units" in about else {}
-                found[name] = key, {"long_name": about["Description"], **unit}
-    return found
+                variables[name] = key, {"long_name": about["Description"], **unit}
+    return variables

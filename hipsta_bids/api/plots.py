@@ -155,7 +155,7 @@ def plot_surface(
     triangles = sheet_triangles(*points.shape[:2])
     corners = points.reshape(-1, 3)[triangles]
     values = columns[measure].ravel()[triangles].mean(axis=1)
-    known = np.isfinite(corners).all(axis=(1, 2))
+    finite = np.isfinite(corners).all(axis=(1, 2))
     if ax is None:
         from matplotlib import pyplot as plt  # noqa: PLC0415  (as above)
 
@@ -169,9 +169,9 @@ def plot_surface(
     colors[~np.isfinite(values)] = (0.8, 0.8, 0.8, 1.0)
     colors[:, :3] *= _light(corners, elevation, azimuth)[:, None]
     faces = Poly3DCollection(
-        corners[known],
-        facecolors=colors[known],
-        edgecolors=colors[known],
+        corners[finite],
+        facecolors=colors[finite],
+        edgecolors=colors[finite],
         linewidths=0.3,
         clip_on=False,
     )
@@ -254,7 +254,7 @@ def plot_group(
         from matplotlib import pyplot as plt  # noqa: PLC0415  (as above)
 
         ax = plt.gca()
-    known = np.isfinite(effect)
+    finite = np.isfinite(effect)
     names = np.full(effect.shape, "") if subfield is None else np.asarray(subfield, dtype=np.str_)
     kind = MapKind(
         column="effect",
@@ -278,7 +278,7 @@ def plot_group(
     if significant.any() and not significant.all():
         x, y = (np.linspace(0, n, n) for n in effect.shape)
         ax.contour(x, y, significant.T.astype(float), levels=[0.5], colors="black", linewidths=1.8)
-    count = f"{int(significant.sum())} of {int(known.sum())} points survive"
+    count = f"{int(significant.sum())} of {int(finite.sum())} points survive"
     ax.set_title(f"{ax.get_title()}, {contrast}: {count}")
     ax.set_aspect("auto")
     ax.set_ylabel("  ←  nodes  →  ".join(Y_ENDS))
@@ -298,8 +298,8 @@ def _columns(data: Any, measure: str) -> tuple[dict[str, Float], str]:  # noqa: 
             f"{measure} has the axes {', '.join(map(str, data[measure].dims))}; select one"
             " participant, session and side"
         )
-    wanted = [name for name in (measure, "extent_x", "extent_y") if name in data]
-    columns = {name: data[name].transpose("x", "y").to_numpy() for name in wanted}
+    names = [name for name in (measure, "extent_x", "extent_y") if name in data]
+    columns = {name: data[name].transpose("x", "y").to_numpy() for name in names}
     side = data.coords["side"].item() if "side" in data.coords else data.attrs.get("side", "")
     return columns, str(side)
 
@@ -352,15 +352,15 @@ def _light(corners: Float, elevation: float, azimuth: float) -> Float:
 
 def _kind(measure: str) -> MapKind:
     """How a map is shown: as the pages do, or after its unit."""
-    own = {kind.column: kind for kind in MAP_KINDS}
-    if measure in own:
-        return own[measure]
-    known = measure in {row.name for row in MAPS}
+    kinds = {kind.column: kind for kind in MAP_KINDS}
+    if measure in kinds:
+        return kinds[measure]
+    is_map = measure in {row.name for row in MAPS}
     return replace(
         kind_of(measure),
         column=measure,
         title=display_name(measure).capitalize(),
-        unit=unit_of(attributes(measure)["units"]) if known else "",
+        unit=unit_of(attributes(measure)["units"]) if is_map else "",
         digits=3,
     )
 

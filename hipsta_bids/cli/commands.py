@@ -305,10 +305,10 @@ def write_phantoms(arguments: Sequence[str]) -> ExitCode:
 
 def run_surrogate(arguments: Sequence[str]) -> ExitCode:
     """Measure thickness in single slices."""
-    given = surrogate_parser().parse_args(arguments)
+    parsed = surrogate_parser().parse_args(arguments)
     # Options of the participant level that this command lacks have their defaults.
-    defaults = build_parser().parse_args([str(given.bids_dir), str(given.output_dir), LEVELS[0]])
-    options = argparse.Namespace(**vars(defaults) | vars(given))
+    defaults = build_parser().parse_args([str(parsed.bids_dir), str(parsed.output_dir), LEVELS[0]])
+    options = argparse.Namespace(**vars(defaults) | vars(parsed))
     check_folders(options)
     from hipsta_bids.settings import load_settings  # noqa: PLC0415  (start-up time)
 
@@ -322,15 +322,15 @@ def run_surrogate(arguments: Sequence[str]) -> ExitCode:
     from hipsta_bids.participant.surrogate import crosscheck  # noqa: PLC0415  (heavy)
 
     request = input_request(options)
-    found = find_inputs(request)
-    for note in (*dataset_notes(request, found.items), *found.notes):
+    findings = find_inputs(request)
+    for note in (*dataset_notes(request, findings.items), *findings.notes):
         echo(f"note: {note}")
     if options.dry_run:
-        echo_table(selection_table(found.items))
-        echo_table(ignored_table(found.ignored))
+        echo_table(selection_table(findings.items))
+        echo_table(ignored_table(findings.ignored))
         return ExitCode.OK
-    check_output_is_no_input(options.output_dir, found.items)
-    return crosscheck(found.items, options.output_dir, settings, echo, warn)
+    check_output_is_no_input(options.output_dir, findings.items)
+    return crosscheck(findings.items, options.output_dir, settings, echo, warn)
 
 
 def run_meta_analysis(arguments: Sequence[str]) -> ExitCode:
@@ -339,11 +339,11 @@ def run_meta_analysis(arguments: Sequence[str]) -> ExitCode:
     from hipsta_bids.group.design.settings import load_group_settings  # noqa: PLC0415  (start-up time)
     from hipsta_bids.group.questions.consortium import run_meta  # noqa: PLC0415  (heavy)
 
-    chosen = {
+    choices = {
         "meta": {"random": options.random},
         "multiplicity": {"method": options.correction, "scope": options.fdr_scope},
     }
-    settings = load_group_settings(options.settings).changed(**given_settings(chosen))
+    settings = load_group_settings(options.settings).changed(**given_settings(choices))
     paths = [_site(text) for text in options.sites]
     page, notes = run_meta(paths, options.out, settings, ("hipsta-bids", "meta", *arguments))
     for note in notes:

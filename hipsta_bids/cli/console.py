@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 #: How many warnings of a kind are printed.
-_SHOWN = 3
+_LISTED_ROWS = 3
 
 #: Escape codes by what they mark: statuses, and the beginnings of lines.
 _COLORS = {
@@ -83,12 +83,12 @@ def echo_start(level: str, bids_dir: Path) -> None:
 
 
 @contextmanager
-def quiet(wanted: bool) -> Iterator[None]:
+def quiet(enabled: bool) -> Iterator[None]:
     """Print nothing but what went wrong, if that is wanted."""
-    if not wanted:
+    if not enabled:
         yield
         return
-    with Path(os.devnull).open("w", encoding="utf-8") as nowhere, redirect_stdout(nowhere):
+    with Path(os.devnull).open("w", encoding="utf-8") as sink, redirect_stdout(sink):
         yield
 
 
@@ -107,17 +107,17 @@ class Progress:
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         self._listening.close()
-        self._close(said=kind is None)
+        self._close(announced=kind is None)
 
-    def show(self, stage: str, done: int = 0, total: int = 0) -> None:
+    def show(self, stage: str, count: int = 0, total: int = 0) -> None:
         """Show what is being done; a stage ends with a line that has its time."""
         if stage != self._stage:
-            self._close(said=True)
+            self._close(announced=True)
             self._stage, self._start = stage, time.monotonic()
             if self._verbosity >= 0 and sys.stderr.isatty():
                 self._bar = _bar(stage, total)
         if self._bar is not None:
-            self._bar.update(done - self._bar.n)
+            self._bar.update(count - self._bar.n)
 
     def report(self, outcome: "Outcome") -> None:
         """Show one outcome."""
@@ -132,12 +132,12 @@ class Progress:
         if self._bar is not None:
             self._bar.update()
 
-    def _close(self, *, said: bool) -> None:
+    def _close(self, *, announced: bool) -> None:
         if self._bar is not None:
             self._bar.close()
             self._bar = None
         # Hemispheres have a line each.
-        if said and self._stage not in {"", "hemispheres"}:
+        if announced and self._stage not in {"", "hemispheres"}:
             echo(f"  {self._stage:<18}{time.monotonic() - self._start:6.1f} s")
 
 
@@ -181,10 +181,10 @@ def echo_result(result: "RunResult", out_dir: Path) -> None:
     page = out_dir / "report.html"
     if page.exists():
         echo(f"report: {page}")
-    for copy in result.copies[:_SHOWN]:
+    for copy in result.copies[:_LISTED_ROWS]:
         warn(f"warning: {copy}")
-    if len(result.copies) > _SHOWN:
-        warn(f"warning: {len(result.copies) - _SHOWN} more such groups, see status.tsv")
+    if len(result.copies) > _LISTED_ROWS:
+        warn(f"warning: {len(result.copies) - _LISTED_ROWS} more such groups, see status.tsv")
     for problem in result.page_problems:
         warn(f"warning: report: {problem}")
     echo(f"log: {result.log}")
@@ -220,8 +220,11 @@ def _echo_records(rows: Sequence[Mapping[str, str]], columns: Sequence[str], roo
     for row in rows:
         head, *cells = (f"{c}: {row[c]}" for c in columns if row[c])
         for i, cell in enumerate((head, *cells)):
-            first, *more = _fitted(cell, max(room - len(indent), _NARROWEST))
-            for line in (f"{indent[:_GAP] if i else ''}{first}", *(indent + text for text in more)):
+            first, *continuation = _fitted(cell, max(room - len(indent), _NARROWEST))
+            for line in (
+                f"{indent[:_GAP] if i else ''}{first}",
+                *(indent + text for text in continuation),
+            ):
                 echo(line)
 
 

@@ -108,9 +108,9 @@ def _add_sheets(parser: Parser) -> None:
         choices=REGIONS,
         default=REGIONS[0],
     )
-    for what, prefix in (("participant", "sub-"), ("session", "ses-")):
+    for label, prefix in (("participant", "sub-"), ("session", "ses-")):
         add(
-            f"--{what}-label",
+            f"--{label}-label",
             "LABEL...",
             "only these, with or without prefix",
             type=bids_label(prefix),
@@ -385,7 +385,7 @@ def _settings(parsed: argparse.Namespace) -> "GroupSettings":
     from hipsta_bids.group.design.settings import load_group_settings  # noqa: PLC0415  (start-up time)
 
     align = parsed.align and parsed.align.replace("penalised", "penalized")
-    chosen = {
+    choices = {
         "registration": {"align": align},
         "multiplicity": {
             "method": parsed.correction,
@@ -408,11 +408,11 @@ def _settings(parsed: argparse.Namespace) -> "GroupSettings":
         "power": {"power": parsed.power_level, "dropout": parsed.dropout},
     }
     settings = load_group_settings(parsed.settings)
-    settings = settings.changed(**given_settings(chosen))
+    settings = settings.changed(**given_settings(choices))
     if parsed.harmonize:
         # The default model has what is harmonized instead of other names of the same.
-        same = {"site", "scanner", "center"}
-        names = [name for name in settings.model.covariates if name.casefold() not in same]
+        site_names = {"site", "scanner", "center"}
+        names = [name for name in settings.model.covariates if name.casefold() not in site_names]
         settings = settings.changed(model={"covariates": (*names, parsed.harmonize)})
     return settings
 

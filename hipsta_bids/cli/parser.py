@@ -66,8 +66,8 @@ class Parser(argparse.ArgumentParser):
             words = [text.partition("=")[0] for text in unknown.split() if text.startswith("-")]
             hint = did_you_mean(words, self._option_string_actions)
         elif choice := _CHOICE.search(message):
-            known = [name.strip("'\"") for name in choice["known"].split(", ")]
-            hint = did_you_mean([choice["word"]], known)
+            choices = [name.strip("'\"") for name in choice["known"].split(", ")]
+            hint = did_you_mean([choice["word"]], choices)
         raise UsageError(f"{message}{hint} (see {self.prog} --help)")
 
 
@@ -82,8 +82,8 @@ class _Ignored(argparse.Action):
         option_string: str | None = None,
     ) -> None:
         del parser, values
-        given = dict(getattr(namespace, self.dest) or {})
-        namespace.ignored = {**given, str(option_string): str(self.const)}
+        previous = dict(getattr(namespace, self.dest) or {})
+        namespace.ignored = {**previous, str(option_string): str(self.const)}
 
 
 def accept(parser: argparse.ArgumentParser, options: Mapping[str, str]) -> None:
@@ -91,14 +91,14 @@ def accept(parser: argparse.ArgumentParser, options: Mapping[str, str]) -> None:
 
     What was given is in ``ignored`` of the namespace, with the reason.
     """
-    for name, why in options.items():
+    for name, reason in options.items():
         flag, _, value = name.partition(" ")
         parser.add_argument(
             flag,
             action=_Ignored,
             nargs=1 if value else 0,
             dest="ignored",
-            const=why,
+            const=reason,
             default={},
             help=argparse.SUPPRESS,
         )
@@ -133,13 +133,13 @@ def adder(group: argparse._ActionsContainer) -> Callable[..., None]:
 def from_namespace(
     kind: "type[Request]",
     options: argparse.Namespace,
-    **more: Any,  # noqa: ANN401  (fields of any type)
+    **extras: Any,  # noqa: ANN401  (fields of any type)
 ) -> "Request":
     """Fill a dataclass with the options of the same names, lists as tuples, and further fields."""
-    names = {field.name for field in fields(kind)} - more.keys()
-    given = {name: value for name, value in vars(options).items() if name in names}
-    frozen = {name: tuple(v) if isinstance(v, list) else v for name, v in given.items()}
-    return kind(**frozen, **more)
+    names = {field.name for field in fields(kind)} - extras.keys()
+    values = {name: value for name, value in vars(options).items() if name in names}
+    frozen = {name: tuple(v) if isinstance(v, list) else v for name, v in values.items()}
+    return kind(**frozen, **extras)
 
 
 # Converters of values; `tools/descriptors.py` knows them by name.
@@ -193,11 +193,11 @@ def named_path(text: str) -> tuple[str, Path]:
     return folder.name, folder
 
 
-def given_settings(chosen: Mapping[str, Mapping[str, object]]) -> dict[str, dict[str, object]]:
+def given_settings(choices: Mapping[str, Mapping[str, object]]) -> dict[str, dict[str, object]]:
     """Keep the settings, by group, that an option has set."""
     return {
         group: {name: value for name, value in options.items() if value is not None}
-        for group, options in chosen.items()
+        for group, options in choices.items()
     }
 
 

@@ -333,8 +333,8 @@ def _run(options: "Namespace", arguments: Sequence[str]) -> ExitCode:
     pin_threads()
     from hipsta_bids.settings import load_settings  # noqa: PLC0415  (start-up time)
 
-    for name, why in options.ignored.items():
-        echo(f"note: {name} has no effect: {why}")
+    for name, reason in options.ignored.items():
+        echo(f"note: {name} has no effect: {reason}")
     check_folders(options)
     collects = options.analysis_level == COLLECT
     if collects and options.shard is not None:
@@ -355,23 +355,23 @@ def _run(options: "Namespace", arguments: Sequence[str]) -> ExitCode:
 
     limit_memory(options.mem)
     requests = map_requests(options.map, options.map_sampling, options.map_interpolation)
-    found = _find(request, options.shard, say=echo if options.dry_run else None)
-    if found is None:
+    findings = _find(request, options.shard, say=echo if options.dry_run else None)
+    if findings is None:
         echo(f"part {options.shard.name} of the dataset has nothing to process")
         return ExitCode.OK
-    items, end_notes = attach_ends(found.items, options.ends)
+    items, end_notes = attach_ends(findings.items, options.ends)
     items, map_notes = attach(items, requests, options.roi, options.bids_dir)
-    notes = (*dataset_notes(request, items), *found.notes, *end_notes, *map_notes)
+    notes = (*dataset_notes(request, items), *findings.notes, *end_notes, *map_notes)
     for note in notes:
         echo(f"note: {note}")
     if options.dry_run:
         echo_table(selection_table(items))
-        echo_table(ignored_table(found.ignored))
+        echo_table(ignored_table(findings.ignored))
         return ExitCode.OK
     check_output_is_no_input(options.output_dir, items)
     from hipsta_bids.participant.run import collect, run_participants  # noqa: PLC0415  (heavy)
 
-    notes += tuple(f"not used: {entry.path}: {entry.reason}" for entry in found.ignored)
+    notes += tuple(f"not used: {entry.path}: {entry.reason}" for entry in findings.ignored)
     out, run_options = options.output_dir, _run_options(options, arguments, notes)
     with Progress(-1 if options.quiet else options.verbose) as progress:
         if collects:

@@ -115,15 +115,16 @@ def run_comparison(
 
     _refuse(parsed, (*_POWER_ONLY, "among"), "without --retest or --power")
     _refuse(parsed, ("controls",), "without --norms")
-    how = settings.multiplicity
-    if not settings.joint.measures and not how.method.startswith("permutation"):
+    multiplicity = settings.multiplicity
+    if not settings.joint.measures and not multiplicity.method.startswith("permutation"):
         _refuse(
             parsed, ("permutations", "blocks"), "without permutations, by --correction or --joint"
         )
-    elif how.permutations * how.alpha < 1:
+    elif multiplicity.permutations * multiplicity.alpha < 1:
         raise UsageError(
-            f"{how.permutations} permutations cannot give p of {how.alpha:g}; at least"
-            f" {math.ceil(1 / how.alpha)} are needed, and thousands are better"
+            f"{multiplicity.permutations} permutations cannot give p of"
+            f" {multiplicity.alpha:g}; at least {math.ceil(1 / multiplicity.alpha)}"
+            " are needed, and thousands are better"
         )
     return run_group(options, settings)
 
@@ -132,19 +133,19 @@ def run_question(
     parsed: argparse.Namespace, options: "GroupOptions", settings: "GroupSettings"
 ) -> "GroupResult":
     """Measure the agreement of sessions, find sample sizes, fit norms or score by them."""
-    asked = [f"--{name.replace('_', '-')}" for name in (*_TRIALS, *_NORMS) if getattr(parsed, name)]
-    if len(asked) > 1 and asked != ["--retest", "--power"]:
-        raise UsageError(f"give one of {', '.join(asked)}")
-    _refuse(parsed, _COMPARISON_ONLY, f"with {' and '.join(asked)}")
+    flags = [f"--{name.replace('_', '-')}" for name in (*_TRIALS, *_NORMS) if getattr(parsed, name)]
+    if len(flags) > 1 and flags != ["--retest", "--power"]:
+        raise UsageError(f"give one of {', '.join(flags)}")
+    _refuse(parsed, _COMPARISON_ONLY, f"with {' and '.join(flags)}")
     if settings.harmonization.column:
         raise UsageError(
-            f"{' and '.join(asked)}: nothing is harmonized; leave harmonization.column out of the"
+            f"{' and '.join(flags)}: nothing is harmonized; leave harmonization.column out of the"
             " settings (norms have sites in their model; for --power, put the site into --formula)"
         )
     if parsed.power is None:
         _refuse(parsed, _POWER_ONLY, "without --power")
     if parsed.power is None or parsed.retest:
-        _refuse(parsed, ("formula", "age_model"), f"with {asked[0]}")
+        _refuse(parsed, ("formula", "age_model"), f"with {flags[0]}")
     if parsed.norms is None:
         _refuse(parsed, ("controls",), "without --norms")
     else:
@@ -164,8 +165,8 @@ def run_question(
     return run_trial(options, settings, retest=parsed.retest, effect=effect, among=parsed.among)
 
 
-def _refuse(parsed: argparse.Namespace, names: Sequence[str], when: str) -> None:
+def _refuse(parsed: argparse.Namespace, names: Sequence[str], context: str) -> None:
     """Refuse options that would have no effect."""
-    given = [f"--{name.replace('_', '-')}" for name in names if getattr(parsed, name)]
-    if given:
-        raise UsageError(f"{', '.join(given)}: has no meaning {when}; leave it out")
+    flags = [f"--{name.replace('_', '-')}" for name in names if getattr(parsed, name)]
+    if flags:
+        raise UsageError(f"{', '.join(flags)}: has no meaning {context}; leave it out")

@@ -14,7 +14,7 @@ from hipsta_bids.io import files
 #: Begins what the message of a row says of labels that another hemisphere has, too.
 _COPY = "the labels are the same, byte for byte, as those of "
 
-_SHOWN = 6  # names in a message
+_LISTED_NAMES = 6  # names in a message
 
 
 def same_labels(
@@ -48,8 +48,8 @@ def describe_copies(names: Sequence[HemisphereName]) -> str:
 
 def _list(names: Sequence[HemisphereName]) -> str:
     titles = [name.title for name in names]
-    more = len(titles) - _SHOWN
-    return ", ".join(titles[:_SHOWN]) + (f" and {more} more" if more > 0 else "")
+    hidden = len(titles) - _LISTED_NAMES
+    return ", ".join(titles[:_LISTED_NAMES]) + (f" and {hidden} more" if hidden > 0 else "")
 
 
 def mark_copies(root: Path) -> list[tuple[HemisphereName, ...]]:
@@ -70,14 +70,14 @@ def mark_copies(root: Path) -> list[tuple[HemisphereName, ...]]:
             if agrees(row, record):
                 rows[name], records[name] = row, record
     groups = same_labels(records.items())
-    others = {name: [n for n in group if n != name] for group in groups for name in group}
+    copies_of = {name: [n for n in group if n != name] for group in groups for name in group}
     marked = []
     for name, row in rows.items():
         before = row.get("message", files.MISSING)
         words = [text for text in (before.partition(_COPY)[0].removesuffix("; "),) if text]
-        if name in others:
+        if name in copies_of:
             words = [text for text in words if text != files.MISSING]
-            words.append(f"{_COPY}{_list(others[name])}; check that no file was copied")
+            words.append(f"{_COPY}{_list(copies_of[name])}; check that no file was copied")
         after = "; ".join(words) or files.MISSING
         if after != before:
             marked.append({**row, "message": after})

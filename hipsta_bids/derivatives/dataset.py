@@ -84,17 +84,17 @@ def settle_settings(root: Path, settings: Settings) -> str:
         if earlier.get("hash") == digest:
             return digest
         before = earlier.get("settings")
-        theirs = flatten(before if isinstance(before, dict) else {})
-        ours = flatten(resolved)
-        if theirs.keys() - ours.keys():
+        recorded = flatten(before if isinstance(before, dict) else {})
+        current = flatten(resolved)
+        if recorded.keys() - current.keys():
             raise SettingsError(
                 f"{root}: holds results of version {earlier.get('version', 'unknown')}, which had"
                 " other settings; use a new output folder, or delete this one to redo all of it"
             )
         changes = [
-            f"{key} was {theirs.get(key, 'not there')}, now {ours.get(key, 'not there')}"
-            for key in dict.fromkeys((*theirs, *ours))
-            if theirs.get(key) != ours.get(key)
+            f"{key} was {recorded.get(key, 'not there')}, now {current.get(key, 'not there')}"
+            for key in dict.fromkeys((*recorded, *current))
+            if recorded.get(key) != current.get(key)
         ]
         raise SettingsError(
             f"{root}: holds results with other settings ({'; '.join(changes) or 'hash differs'});"
@@ -110,10 +110,10 @@ def shared_settings(settings: Settings) -> tuple[str, dict[str, Any]]:
 
     The region is in the names of the files, so that one folder may hold several.
     """
-    anywhere = settings.changed(body={"region": BodySettings().region})
-    resolved = resolve(anywhere)
+    shared = settings.changed(body={"region": BodySettings().region})
+    resolved = resolve(shared)
     del resolved["body"]["region"]
-    return settings_hash(anywhere), resolved
+    return settings_hash(shared), resolved
 
 
 def write_description(root: Path, sources: Mapping[str, Path]) -> None:
@@ -125,16 +125,16 @@ def write_description(root: Path, sources: Mapping[str, Path]) -> None:
     earlier = files.read_json(path) if path.exists() else {}
     links = {name: link_to(folder, root) for name, folder in sources.items()}
     entries = [_source(folder, links[name]) for name, folder in sources.items()]
-    known = {str(folder.resolve()) for folder in sources.values()}
+    current_folders = {str(folder.resolve()) for folder in sources.values()}
     before = earlier.get("SourceDatasets")
     before = [e for e in before if isinstance(e, dict)] if isinstance(before, list) else []
-    kept = [e for e in before if not _is_at(e.get("URL"), root, known)]
+    retained = [e for e in before if not _is_at(e.get("URL"), root, current_folders)]
     description = {
         "Name": "Hippocampal thickness and curvature maps",
         "BIDSVersion": BIDS_VERSION,
         "DatasetType": "derivative",
         "GeneratedBy": [_maker()],
-        "SourceDatasets": sorted(kept + entries, key=lambda entry: str(entry.get("URL"))),
+        "SourceDatasets": sorted(retained + entries, key=lambda entry: str(entry.get("URL"))),
         "DatasetLinks": dict(sorted(((read_links(root) if earlier else {}) | links).items())),
     }
     files.write_json(path, description)
@@ -212,10 +212,10 @@ def link_to(folder: Path, root: Path) -> str:
     the user did, symbolic links included. :func:`linked_folder` is the inverse.
     """
     spelled = Path(os.path.abspath(folder)), Path(os.path.abspath(root))  # noqa: PTH100  (no links followed)
-    for here, there in (spelled, (folder.resolve(), root.resolve())):
-        if Path(os.path.commonpath([here, there])) == Path(here.anchor):
+    for source, target in (spelled, (folder.resolve(), root.resolve())):
+        if Path(os.path.commonpath([source, target])) == Path(source.anchor):
             continue
-        relative = os.path.relpath(here, there)
+        relative = os.path.relpath(source, target)
         if (root / relative).resolve() == folder.resolve():
             return quote(relative)
     return spelled[0].as_uri()
@@ -254,17 +254,17 @@ def _source(folder: Path, link: str) -> dict[str, str]:
     """Describe where a source dataset is, with its identifier and version if these are known."""
     entry = {"URL": link}
     description = read_description(folder) or {}  # most FreeSurfer and ASHS folders have none
-    for key, theirs in (("DOI", "DatasetDOI"), ("Version", "DatasetVersion")):
-        if isinstance(description.get(theirs), str):
-            entry[key] = description[theirs]
+    for key, field in (("DOI", "DatasetDOI"), ("Version", "DatasetVersion")):
+        if isinstance(description.get(field), str):
+            entry[key] = description[field]
     return entry
 
 
 def source_names(folders: Iterable[tuple[str, Path]]) -> dict[str, Path]:
     """Choose a unique name for each source dataset."""
     names: dict[str, Path] = {}
-    for wanted, folder in dict.fromkeys(folders):
-        base = "".join(c if c.isascii() and (c.isalnum() or c in "-_") else "-" for c in wanted)
+    for label, folder in dict.fromkeys(folders):
+        base = "".join(c if c.isascii() and (c.isalnum() or c in "-_") else "-" for c in label)
         name, number = base, 2
         while names.get(name, folder) != folder:
             name, number = f"{base}-{number}", number + 1
@@ -321,14 +321,14 @@ def references() -> dict[str, str]:
 def _layer_rule(settings: BodySettings, protocols: Sequence[Protocol]) -> str:
     """Say what became of the molecular layer, and in which protocols it was left out."""
     rule = _LAYER_RULES[settings.layer_rule]
-    apart = [
+    separate = [
         protocol.name
         for protocol in protocols
         if Tissue.MOLECULAR_LAYER in protocol.interior and not protocol.layer
     ]
-    if settings.join_every_layer or not apart:
+    if settings.join_every_layer or not separate:
         return rule
-    return f"{rule}, or left out ({', '.join(apart)})"
+    return f"{rule}, or left out ({', '.join(separate)})"
 
 
 def citation_text(settings: Settings, protocols: Sequence[Protocol]) -> str:
@@ -447,12 +447,12 @@ def read_status(root: Path) -> list[dict[str, str]]:
     Of several rows of the same hemisphere, the one that agrees with the quality record is taken.
     """
     shards = sorted((root / DATASET_FILES["logs"]).glob(_SHARD_TABLE))
-    found: dict[tuple[str, ...], list[dict[str, str]]] = {}
+    rows_of: dict[tuple[str, ...], list[dict[str, str]]] = {}
     for path in (root / DATASET_FILES["status"], *shards):
         for row in read_table(path):
-            found.setdefault(row_key(row), []).append(row)
+            rows_of.setdefault(row_key(row), []).append(row)
     return [
-        rows[0] if len(rows) == 1 else _current(root, rows) for _, rows in sorted(found.items())
+        rows[0] if len(rows) == 1 else _current(root, rows) for _, rows in sorted(rows_of.items())
     ]
 
 

@@ -108,10 +108,10 @@ def remove_results(place: ResultPlace) -> None:
 
 def sheet_labels(protocol: Protocol) -> dict[Tissue, Label]:
     """Choose one label per sheet tissue: that of the body, since the sheet is the body's."""
-    found: dict[Tissue, Label] = {}
+    first_labels: dict[Tissue, Label] = {}
     for label in sorted(protocol.labels, key=lambda label: label.part != Part.BODY):
-        found.setdefault(label.tissue, label)
-    return {tissue: found[tissue] for tissue in protocol.sheet if tissue in found}
+        first_labels.setdefault(label.tissue, label)
+    return {tissue: first_labels[tissue] for tissue in protocol.sheet if tissue in first_labels}
 
 
 def format_column(values: Float, digits: int) -> list[str]:
@@ -456,13 +456,13 @@ def list_results(
     folders = ["sub-*/anat", "sub-*/ses-*/anat"]
     if subject is not None:
         folders = [f"sub-{subject}/{f'ses-{session}/' if session else ''}anat"]
-    found = [
+    results = [
         ResultPlace(root=root, name=name)
         for folder in folders
         for path in root.glob(f"{folder}/{output_pattern('qc')}")
         if (name := name_of_record(path.name)) is not None
     ]
-    return sorted(found, key=_order)
+    return sorted(results, key=_order)
 
 
 def _order(place: ResultPlace) -> tuple[str, ...]:
@@ -531,11 +531,11 @@ def read_sheet(
         ) from error
     expected = np.divmod(np.arange(len(x)), max(ny, 1))
     if len(x) != nx * ny or (x != expected[0] + 1).any() or (y != expected[1] + 1).any():
-        said = ", as the settings say" if shape else ""
-        raise InputError(f"{path}: not a sheet of {nx} x {ny} nodes{said}; {_REDO}")
-    found = {name: table.column(name) for name in numbers}
-    found |= {name: table.column(name).fill_null("") for name in words}
-    return {name: column.to_numpy().reshape(nx, ny) for name, column in found.items()}
+        suffix = ", as the settings say" if shape else ""
+        raise InputError(f"{path}: not a sheet of {nx} x {ny} nodes{suffix}; {_REDO}")
+    cells = {name: table.column(name) for name in numbers}
+    cells |= {name: table.column(name).fill_null("") for name in words}
+    return {name: column.to_numpy().reshape(nx, ny) for name, column in cells.items()}
 
 
 def read_units(place: ResultPlace) -> dict[str, str]:

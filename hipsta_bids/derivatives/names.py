@@ -431,8 +431,8 @@ def _by_name(sidecar: Output, text_of: Callable[[Output], str]) -> str:
     for image in sidecar.images:
         entity = f"space-{image.space}" if image.space else f"desc-{image.desc}"
         names.setdefault(text_of(image), []).append(entity)
-    first, *others = names
-    return "; ".join([first, *(f"with {', '.join(names[text])}: {text}" for text in others)])
+    first, *further_texts = names
+    return "; ".join([first, *(f"with {', '.join(names[text])}: {text}" for text in further_texts)])
 
 
 def sources(record: Mapping[str, Any]) -> list[str]:

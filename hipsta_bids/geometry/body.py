@@ -352,7 +352,7 @@ def check_mask(
             reason="edited-mask-coarse",
             value=mask.voxel / voxel,
             limit=settings.max_mask_ratio,
-            what=f"the edited mask has voxels of {mask.voxel:.2f} mm, the labels of {voxel:.2f} mm",
+            text=f"the edited mask has voxels of {mask.voxel:.2f} mm, the labels of {voxel:.2f} mm",
             remedy="draw it on the grid of the labels",
             share=1.0,
         ),
@@ -360,7 +360,7 @@ def check_mask(
             reason="edited-mask-different",
             value=change.share,
             limit=settings.max_mask_change,
-            what=f"the edited mask adds {change.added} voxels to the body and removes "
+            text=f"the edited mask adds {change.added} voxels to the body and removes "
             f"{change.removed} of {change.before}",
             remedy="check that it is in the space of the labels",
             share=1.0,

@@ -107,7 +107,7 @@ def check_thickness(thickness: Float, expected: float, settings: CheckSettings) 
             reason="thickness-doubtful",
             value=ratio,
             limit=settings.flag_thickness_ratio,
-            what=text,
+            text=text,
             remedy="look at the map",
             share=1.0,
             change=mean - expected,
@@ -156,7 +156,7 @@ def check_image(body: Body) -> list[Finding]:
             reason="slices-along-axis",
             value=0.0 if cut_across(body) else float(edges.max() / edges.min()),
             limit=LONG_VOXEL_RATIO,
-            what=f"the longest voxel edge ({edges.max():.2f} mm) lies across the long axis",
+            text=f"the longest voxel edge ({edges.max():.2f} mm) lies across the long axis",
             remedy="check the header of the image; slices should lie across the hippocampus",
             share=1.0,
         ),
@@ -164,7 +164,7 @@ def check_image(body: Body) -> list[Finding]:
             reason="image-border",
             value=float(np.count_nonzero(outer)),
             limit=0,
-            what=f"{np.count_nonzero(outer)} voxels of the body lie at the border of the image",
+            text=f"{np.count_nonzero(outer)} voxels of the body lie at the border of the image",
             remedy="check that the image holds all of it",
             points=points[outer],
         ),
@@ -190,7 +190,7 @@ def check_end_labels(
         reason="end-labels-inside",
         value=len(inside) / max(len(body.inside_points()[0]), 1),
         limit=settings.end_label_share,
-        what=f"{len(inside)} head or tail voxels lie inside the body",
+        text=f"{len(inside)} head or tail voxels lie inside the body",
         remedy="correct these labels",
         points=inside,
     )
@@ -214,7 +214,7 @@ def _check_beyond(volume: types.LabelVolume, body: Body) -> list[Finding]:
                 reason="labels-end",
                 value=1 - float(beyond) / max(len(near), 1),
                 limit=1 - BEYOND_SHARE,
-                what=f"the labels end where the body does, at its {end} end",
+                text=f"the labels end where the body does, at its {end} end",
                 remedy="it may be cut short there; label the whole hippocampus",
                 points=near,
             )
@@ -242,7 +242,7 @@ def check_cavities(body: Body, settings: CheckSettings) -> list[Finding]:
             reason="wide-cavity",
             value=len(cavity) / size,
             limit=settings.flag_cavity,
-            what=f"a cavity of {len(cavity) * body.voxel_volume:.0f} mm3 without a label was "
+            text=f"a cavity of {len(cavity) * body.voxel_volume:.0f} mm3 without a label was "
             "divided between the sheet and its interior, mean thickness may be off by "
             f"{len(cavity) / size / 2:.0%}",
             remedy="label what it is",
@@ -298,7 +298,7 @@ def check_labels(body: Body, settings: CheckSettings) -> list[Finding]:
             reason=reason,
             value=value,
             limit=limit,
-            what=what,
+            text=what,
             remedy=remedy,
             points=digital.to_ras(voxels, body.affine),
         )
@@ -361,7 +361,7 @@ def check_cross_sections(
             reason=reason,
             value=outlier.share,
             limit=outlier.limit,
-            what=f"a cross-section {what}, {outlier.share:.0%} of its area",
+            text=f"a cross-section {what}, {outlier.share:.0%} of its area",
             remedy=remedy,
             points=field.grid.to_ras(outlier.nodes),
         )

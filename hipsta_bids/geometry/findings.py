@@ -48,7 +48,7 @@ def raise_flags(
             flags.append(
                 Flag(
                     reason=finding.reason,
-                    message=f"{finding.what}{location}: {finding.remedy}"
+                    message=f"{finding.text}{location}: {finding.remedy}"
                     + consequence_text(consequence),
                     value=float(finding.value),
                     limit=float(finding.limit),

@@ -108,7 +108,7 @@ def check_flipped(sheet: Sheet, hemi: str) -> Finding:
         reason="side-doubtful",
         value=float(is_flipped(sheet, hemi)),
         limit=0,
-        what="the labels of the dentate gyrus lie on the exterior side of the sheet",
+        text="the labels of the dentate gyrus lie on the exterior side of the sheet",
         remedy="look at the map",
         share=1.0,
         change=0.0,
@@ -294,7 +294,7 @@ def check_layers(folded: Bool, sheet: Sheet) -> Finding:
         reason="layers-fold",
         value=float(np.count_nonzero(folded)),
         limit=0,
-        what=f"layers fold in {folded.sum()} of {folded.size} columns"
+        text=f"layers fold in {folded.sum()} of {folded.size} columns"
         + "".join(f", the first at x {x}, y {y}" for x, y in first)
         + ", their layers are at equal distances instead",
         remedy="set sheet.depths to distance, or leave these points out",

@@ -47,7 +47,7 @@ def check_rows(sheet: Sheet, settings: CheckSettings) -> list[Finding]:
                 reason=reason,
                 value=float(change[row]),
                 limit=limit,
-                what=f"the sheet's width {description.format(f'{change[row]:.0%}')}",
+                text=f"the sheet's width {description.format(f'{change[row]:.0%}')}",
                 remedy="look for missing or added parts in the labels",
                 points=_known(middle[:, row]),
             )
@@ -87,7 +87,7 @@ def check_edges(whole: Sheet, settings: CheckSettings) -> list[Finding]:
                 reason="edge-notch",
                 value=size,
                 limit=limit,
-                what=f"the {name} edge of the sheet recedes by {size:.1f} mm",
+                text=f"the {name} edge of the sheet recedes by {size:.1f} mm",
                 remedy="look for a notch or a missing tip in the labels",
                 points=_known(outline[max(row - k // 2, 0) : row + k // 2 + 1]),
             )
@@ -120,7 +120,7 @@ def check_subfields(
             reason="subfield-gap",
             value=size,
             limit=settings.flag_subfield_gap,
-            what=f"{tissue.name} is missing over {size:.1f} mm, and is there before and behind",
+            text=f"{tissue.name} is missing over {size:.1f} mm, and is there before and behind",
             remedy="complete the labels there",
             points=_known(middle[edge, first:last]),
         )
@@ -152,7 +152,7 @@ def check_ridges(sheet: Sheet, thickness: Float, settings: CheckSettings) -> lis
                 reason=reason,
                 value=size,
                 limit=size / excess if excess else limits[0],
-                what=f"a band of the sheet is {size:.1f} mm {description} than the sheet before "
+                text=f"a band of the sheet is {size:.1f} mm {description} than the sheet before "
                 "and behind it",
                 remedy="look at the labels there",
                 points=_known(middle[max(column - half, 0) : column + half + 1, row]),

@@ -64,7 +64,7 @@ def _named(labels: Path, hemisphere: Hemisphere, folders: tuple[Path, ...]) -> I
     space = entities(labels.name).get("space", "")
     # HippUnfold's crops lie in the space of the whole image.
     whole = space.removeprefix("crop")
-    found = []
+    images = []
     for folder in dict.fromkeys(folders):
         for name in _names(folder):
             pairs = entities(name)
@@ -76,17 +76,19 @@ def _named(labels: Path, hemisphere: Hemisphere, folders: tuple[Path, ...]) -> I
                 and pairs.get("ses", hemisphere.session) == hemisphere.session
             ):
                 # An image whose name has no space is in its own.
-                own = pairs.get("space", pairs["suffix"])
-                found.append((folder / name, own, pairs["suffix"]))
-    same = Counter((path.parent, own) for path, own, _ in found)
+                image_space = pairs.get("space", pairs["suffix"])
+                images.append((folder / name, image_space, pairs["suffix"]))
+    counts = Counter((path.parent, image_space) for path, image_space, _ in images)
 
     def rank(entry: tuple[Path, str, str]) -> tuple[bool, bool, int]:
-        _, own, suffix = entry
-        return own != space, own != whole, _SUFFIXES.index(suffix)
+        _, image_space, suffix = entry
+        return image_space != space, image_space != whole, _SUFFIXES.index(suffix)
 
-    for path, own, _ in sorted(found, key=rank):
+    for path, image_space, _ in sorted(images, key=rank):
         # Of several runs, the name does not say in whose space the labels are.
-        proven = bool(space) and own in (space, whole) and same[path.parent, own] == 1
+        proven = (
+            bool(space) and image_space in (space, whole) and counts[path.parent, image_space] == 1
+        )
         yield Candidate(path=path, proven=proven)
 
 

@@ -111,9 +111,9 @@ class AtlasFinder:
             return fitting[0], "only this atlas has such labels"
         left = [protocol for protocol in shared if protocol in fitting]
         if left and len(left) < len(fitting):
-            only = "this one" if len(left) == 1 else _names(left)
-            others = f"those of {_others(count)} only {only}"
-            return left[0], f"its labels fit {_names(fitting)}, {others}{_or_another(left)}"
+            fitting_text = "this one" if len(left) == 1 else _names(left)
+            difference = f"those of {_others(count)} only {fitting_text}"
+            return left[0], f"its labels fit {_names(fitting)}, {difference}{_or_another(left)}"
         if _one_body(fitting):
             return fitting[0], f"its labels fit {_names(fitting)}{_or_another(fitting)}"
         values = ", ".join(map(str, sorted(self._read(image))))
@@ -170,8 +170,8 @@ class AtlasFinder:
             values = label_values(path)
             if bilateral:
                 (offset,) = {protocol.right_offset for protocol in _protocols()}
-                own = (v for v in values if (v > offset) == (hemi == "R"))
-                values = frozenset(v - offset if hemi == "R" else v for v in own)
+                side_values = (v for v in values if (v > offset) == (hemi == "R"))
+                values = frozenset(v - offset if hemi == "R" else v for v in side_values)
             self._values[image] = values
         return self._values[image]
 
@@ -185,8 +185,8 @@ def _others(count: int) -> str:
 
 
 def _names(protocols: list[Protocol]) -> str:
-    *most, last = (protocol.name for protocol in protocols)
-    return f"{', '.join(most)} and {last}" if most else last
+    *leading_names, last = (protocol.name for protocol in protocols)
+    return f"{', '.join(leading_names)} and {last}" if leading_names else last
 
 
 def _or_another(protocols: list[Protocol]) -> str:
@@ -209,17 +209,17 @@ def find_ashs(
     visit: VisitFolders, source: Source, selection: Selection, atlases: AtlasFinder
 ) -> Iterator[HemisphereInput]:
     """Find ASHS's segmentations of one visit."""
-    everything = _files(visit)
+    all_files = _files(visit)
     for hemi in selection.wanted_hemis():
-        files = [file for file in everything if file.hemi in (hemi, None)]
+        files = [file for file in all_files if file.hemi in (hemi, None)]
         if not files:
             continue
-        chosen = files[0]
-        bilateral = chosen.hemi is None
-        protocol, why, problem = atlases.identify((chosen.path, hemi, bilateral))
+        best = files[0]
+        bilateral = best.hemi is None
+        protocol, explanation, problem = atlases.identify((best.path, hemi, bilateral))
         if problem is None and bilateral and not protocol.offset:
             problem = InputError(
-                f"{chosen.path}: neither left nor right is in its name, and the protocol "
+                f"{best.path}: neither left nor right is in its name, and the protocol "
                 f"{protocol.name} does not say how the hemispheres differ; set right_offset in its "
                 "TOML file",
                 reason="unknown-hemisphere",
@@ -229,8 +229,8 @@ def find_ashs(
             visit,
             hemi,
             source,
-            found=(protocol, problem),
-            why=(_kind(chosen), f"; {why}"),
+            candidate=(protocol, problem),
+            explanation=(_kind(best), f"; {explanation}"),
             passed_over=_passed_over(files),
         )
 
@@ -271,13 +271,13 @@ def _kind(file: SidedFile) -> str:
 
 
 def _passed_over(files: list[SidedFile]) -> Iterator[tuple[str, str]]:
-    chosen = files[0]
+    best = files[0]
     for file in files[1:]:
-        if file.hemi is None and chosen.hemi is not None:
+        if file.hemi is None and best.hemi is not None:
             reason = "both hemispheres in one file; one file per hemisphere comes first"
-        elif _kind(file) != _kind(chosen):
-            reason = f"{_kind(chosen)} comes before {_kind(file)}"
-        elif file.rank == chosen.rank:
+        elif _kind(file) != _kind(best):
+            reason = f"{_kind(best)} comes before {_kind(file)}"
+        elif file.rank == best.rank:
             reason = "as good as the first one"
         else:
             reason = "files in final/ and with the subject's label come first"

@@ -75,25 +75,25 @@ def list_edits(
     request: InputRequest, selection: Selection, ignored: list[Ignored]
 ) -> list[EditedFile]:
     """List the edited files of ``--edited-dir`` and of the output dataset."""
-    found = []
+    edited_files = []
     if request.edited_dir is not None:
-        found += _edits_of_dataset(request.edited_dir, _EDITED, selection, ignored)
+        edited_files += _edits_of_dataset(request.edited_dir, _EDITED, selection, ignored)
     # Whether the output folder can be used is checked where results are written.
     with contextlib.suppress(InputError):
         if request.output_dir is not None:
-            found += _edits_of_dataset(request.output_dir, _OUTPUT, selection, ignored)
-    return each_once(found)
+            edited_files += _edits_of_dataset(request.output_dir, _OUTPUT, selection, ignored)
+    return each_once(edited_files)
 
 
 def _edits_of_dataset(
     root: Path, name: str, selection: Selection, ignored: list[Ignored]
 ) -> list[EditedFile]:
-    folders, others = sort_folders(root)
-    ignored += others
-    wanted = filter(selection.wants_folder, folders)
+    folders, other_entries = sort_folders(root)
+    ignored += other_entries
+    selected_folders = filter(selection.wants_folder, folders)
     return [
         file
-        for visit in filter(selection.wants_visit, list_visits(wanted, ignored))
+        for visit in filter(selection.wants_visit, list_visits(selected_folders, ignored))
         for file in edits_of_visit(visit, root, name, beside=False)
     ]
 
@@ -109,30 +109,30 @@ def attach_edits(
     items: Iterable[HemisphereInput], edited: Iterable[EditedFile], selection: Selection
 ) -> tuple[tuple[HemisphereInput, ...], tuple[str, ...]]:
     """Attach the files that correct each hemisphere, and note those that correct none."""
-    found = list(items)
+    corrected = list(items)
     corrections: dict[int, list[EditedFile]] = {}
     notes = []
     for file in edited:
         hemi = file.names.get("hemi")
         if hemi in HEMIS and hemi not in selection.wanted_hemis():
             continue
-        matching = [n for n, item in enumerate(found) if _corrects(file, item)]
+        matching = [n for n, item in enumerate(corrected) if _corrects(file, item)]
         for n in matching:
             corrections.setdefault(n, []).append(file)
         if not matching:
-            notes.append(f"{file.edit.path}: edited file not used: {_why_not(file, found)}")
+            notes.append(f"{file.edit.path}: edited file not used: {_why_not(file, corrected)}")
         elif len(matching) > 1:
-            names = " and ".join(found[n].protocol.name for n in matching)
+            names = " and ".join(corrected[n].protocol.name for n in matching)
             problem = InputError(
                 f"{file.edit.path}: corrects the labels of {names}; say in its name which ones, "
-                f"as in _seg-{found[matching[0]].protocol.name}_desc-edited_",
+                f"as in _seg-{corrected[matching[0]].protocol.name}_desc-edited_",
                 reason="edit-ambiguous",
             )
             for n in matching:
-                found[n] = replace(found[n], problem=found[n].problem or problem)
-    for n, own in corrections.items():
-        found[n] = _corrected(found[n], [file.edit for file in own])
-    return tuple(found), tuple(notes)
+                corrected[n] = replace(corrected[n], problem=corrected[n].problem or problem)
+    for n, corrected_by in corrections.items():
+        corrected[n] = _corrected(corrected[n], [file.edit for file in corrected_by])
+    return tuple(corrected), tuple(notes)
 
 
 def _corrects(file: EditedFile, item: HemisphereInput) -> bool:
@@ -150,8 +150,8 @@ def _misnamed(file: EditedFile) -> str | None:
     names = file.names
     if names.get("hemi") not in HEMIS:
         return "its name has no hemi-L or hemi-R"
-    for key, own in (("sub", file.subject), ("ses", file.session)):
-        if names.get(key, own) != own:
+    for key, folder_label in (("sub", file.subject), ("ses", file.session)):
+        if names.get(key, folder_label) != folder_label:
             return f"its name says {key}-{names[key]}, but its folder is another one's"
     return None
 
@@ -162,21 +162,22 @@ def _why_not(file: EditedFile, items: list[HemisphereInput]) -> str:
     if misnamed:
         return misnamed
     hemi = file.names["hemi"]
-    whose = f"sub-{file.subject}{f' ses-{file.session}' if file.session else ''} hemi-{hemi}"
+    hemisphere = f"sub-{file.subject}{f' ses-{file.session}' if file.session else ''} hemi-{hemi}"
     rivals = [
         item
         for item in items
         if (item.subject, item.session, item.hemi) == (file.subject, file.session, hemi)
     ]
     if not rivals:
-        return f"no labels of {whose} are processed"
+        return f"no labels of {hemisphere} are processed"
     protocols = {item.protocol.name for item in rivals}
     if file.names.get("seg", rivals[0].protocol.name) not in protocols:
         return (
-            f"its name says seg-{file.names['seg']}, but {whose} has seg-{', seg-'.join(protocols)}"
+            f"its name says seg-{file.names['seg']}, but {hemisphere} has"
+            f" seg-{', seg-'.join(protocols)}"
         )
     return (
-        f"it does not lie beside the labels of {whose} ({rivals[0].files[0].parent}); move it "
+        f"it does not lie beside the labels of {hemisphere} ({rivals[0].files[0].parent}); move it "
         "there, or name its folder with --edited-dir"
     )
 
@@ -209,8 +210,8 @@ def _described(item: HemisphereInput) -> HemisphereInput:
     except HipstaError as error:
         return replace(item, problem=item.problem or error)
     # The citation is that of the protocol; a table has none.
-    known = {"title": item.protocol.title, "citation": item.protocol.citation}
-    protocol = protocol.model_copy(update=known)
+    description = {"title": item.protocol.title, "citation": item.protocol.citation}
+    protocol = protocol.model_copy(update=description)
     return replace(
         item,
         protocol=protocol,
@@ -226,7 +227,7 @@ class EndRow(Visit):
     """A row of the table, and whose it is."""
 
     hemi: str
-    where: str
+    origin: str
     """The file and its line."""
     end: GivenEnd | HipstaError
     """The plane, or what is wrong with the row."""
@@ -241,12 +242,12 @@ class EndRow(Visit):
 def read_ends(path: Path) -> list[EndRow]:
     """Read the table; refuse one in which it is unclear whose end a row is."""
     rows = files.read_tsv(path)
-    known = {*_NAMES, "session", *_POINT, *_NORMAL}
+    known_columns = {*_NAMES, "session", *_POINT, *_NORMAL}
     columns = set(rows[0]) if rows else set()
     lacking = [name for name in (*_NAMES, *_POINT) if name not in columns]
     lacking += [name for name in _NORMAL if columns & set(_NORMAL) and name not in columns]
-    if lacking or columns - known:
-        fault = f"has unknown {', '.join(sorted(columns - known))}"
+    if lacking or columns - known_columns:
+        fault = f"has unknown {', '.join(sorted(columns - known_columns))}"
         if lacking:
             fault = f"lacks {', '.join(lacking)}" if rows else "has no rows"
         raise InputError(
@@ -256,24 +257,24 @@ def read_ends(path: Path) -> list[EndRow]:
     return [_row(f"{path}, line {number}", row) for number, row in enumerate(rows, 2)]
 
 
-def _row(where: str, row: dict[str, str]) -> EndRow:
+def _row(origin: str, row: dict[str, str]) -> EndRow:
     cells = {name: cell.strip() for name, cell in row.items()}
     subject = cells["participant_id"].removeprefix("sub-")
     session = cells.get("session", "").removeprefix("ses-")
     hemi = cells["hemi"].upper()
     if hemi not in HEMIS or not subject or subject == files.MISSING:
-        what = f"hemi {cells['hemi']!r} is not L or R" if subject else "it has no participant_id"
-        raise InputError(f"{where}: {what}; correct it", reason="unreadable-table")
+        fault = f"hemi {cells['hemi']!r} is not L or R" if subject else "it has no participant_id"
+        raise InputError(f"{origin}: {fault}; correct it", reason="unreadable-table")
     end: GivenEnd | HipstaError
     try:
         end = _given(cells)
     except ValueError as error:
-        end = InputError(f"{where}: {error}", reason="unreadable-table")
+        end = InputError(f"{origin}: {error}", reason="unreadable-table")
     return EndRow(
         subject=subject,
         session=session if session not in ("", files.MISSING) else None,
         hemi=hemi,
-        where=where,
+        origin=origin,
         end=end,
     )
 
@@ -318,17 +319,18 @@ def attach_ends(
     if path is None:
         return tuple(items), ()
     rows = read_ends(path)
-    found = tuple(_attached(item, [r for r in rows if r.is_of(item)], items) for item in items)
-    others = [row for row in rows if not any(row.is_of(item) for item in items)]
-    if not others:
-        return found, ()
-    first = others[0]
+    attached = tuple(_attached(item, [r for r in rows if r.is_of(item)], items) for item in items)
+    unused_rows = [row for row in rows if not any(row.is_of(item) for item in items)]
+    if not unused_rows:
+        return attached, ()
+    first = unused_rows[0]
     session = f" ses-{first.session}" if first.session else ""
     note = (
-        f"{first.where}: not used, no labels of sub-{first.subject}{session} hemi-{first.hemi} are "
-        f"processed ({len(others)} of {len(rows)} rows are of no hemisphere here)"
+        f"{first.origin}: not used, no labels of sub-{first.subject}{session} hemi-{first.hemi}"
+        " are "
+        f"processed ({len(unused_rows)} of {len(rows)} rows are of no hemisphere here)"
     )
-    return found, (note,)
+    return attached, (note,)
 
 
 def _attached(
@@ -342,13 +344,13 @@ def _attached(
             problem = problem or row.end
         elif row.session is None and len(sessions) > 1:
             problem = problem or InputError(
-                f"{row.where}: sub-{item.subject} has several sessions; name one in a column "
+                f"{row.origin}: sub-{item.subject} has several sessions; name one in a column "
                 "session",
                 reason="unreadable-table",
             )
         elif row.end.end in ends:
             problem = problem or InputError(
-                f"{row.where}: a second {row.end.end} end of this hemisphere; keep one",
+                f"{row.origin}: a second {row.end.end} end of this hemisphere; keep one",
                 reason="unreadable-table",
             )
         else:

@@ -69,12 +69,12 @@ class Analysis:
         scans = {0: 3, 1: 2 if self.scans == ("T1",) else 1}.get(len(self.scans), 0)
         return self.longitudinal, scans, -(self.version or 0)
 
-    def answers(self, wanted: "Analysis") -> bool:
+    def answers(self, request: "Analysis") -> bool:
         """Check whether this is the wanted analysis (of any version, if none is wanted)."""
         return (
-            self.scans == wanted.scans
-            and self.longitudinal == wanted.longitudinal
-            and wanted.version in (None, self.version)
+            self.scans == request.scans
+            and self.longitudinal == request.longitudinal
+            and request.version in (None, self.version)
         )
 
 
@@ -157,12 +157,12 @@ def find_freesurfer(
         runs = _runs(visit, hemi)
         if not runs:
             continue
-        wanted = parse_analysis(selection.fs_analysis) if selection.fs_analysis else None
-        matching = [run for run in runs if wanted is None or run.analysis.answers(wanted)]
+        request = parse_analysis(selection.fs_analysis) if selection.fs_analysis else None
+        matching = [run for run in runs if request is None or run.analysis.answers(request)]
         usable = [run for run in matching if run.way]
-        chosen = usable[0] if usable else None
-        problem = None if chosen else _problem(runs, matching, selection.fs_analysis)
-        run = chosen or runs[0]
+        best = usable[0] if usable else None
+        problem = None if best else _problem(runs, matching, selection.fs_analysis)
+        run = best or runs[0]
         subfields, parts, protocol = run.way or (next(iter(run.files)), None, "freesurfer")
         files = tuple(run.files[name] for name in (subfields, parts) if name)
         if run.old and run.way:
@@ -177,10 +177,10 @@ def find_freesurfer(
             parts_protocol=load_protocol("freesurferHBT") if parts else None,
             source=source.name,
             source_path=source.path,
-            why=_why(run, subfields, parts, selection.fs_analysis),
+            explanation=_why(run, subfields, parts, selection.fs_analysis),
             passed_over=tuple(_passed_over(runs, run, files)),
             problem=problem,
-            notes=(coarse,) if chosen and run.coarse else (),
+            notes=(coarse,) if best and run.coarse else (),
         )
 
 
@@ -205,29 +205,29 @@ def _each_once(folders: tuple[Folder, ...]) -> tuple[Folder, ...]:
     """Leave out longitudinal folders that are links to others here, as FastSurfer's tools make."""
     if not any(folder.longitudinal for folder in folders):
         return folders
-    own = {os.path.realpath(folder.path) for folder in folders if not folder.longitudinal}
-    return tuple(f for f in folders if not f.longitudinal or os.path.realpath(f.path) not in own)
+    paths = {os.path.realpath(folder.path) for folder in folders if not folder.longitudinal}
+    return tuple(f for f in folders if not f.longitudinal or os.path.realpath(f.path) not in paths)
 
 
-def _why(run: _Run, subfields: str, parts: str | None, asked: str | None) -> str:
-    what = "full hierarchy" if subfields == "full" else f"subfields from .{subfields}"
+def _why(run: _Run, subfields: str, parts: str | None, requested: str | None) -> str:
+    hierarchy = "full hierarchy" if subfields == "full" else f"subfields from .{subfields}"
     if run.old:
-        what = "subfields of FreeSurfer 6.0"
+        hierarchy = "subfields of FreeSurfer 6.0"
     combined = f", head/body/tail from .{parts}" if parts else ""
-    choice = " (--fs-analysis)" if asked else ""
-    return f"{what}{combined}, analysis {run.analysis.name}{choice}"
+    choice = " (--fs-analysis)" if requested else ""
+    return f"{hierarchy}{combined}, analysis {run.analysis.name}{choice}"
 
 
 def _passed_over(
-    runs: list[_Run], chosen: _Run, taken: tuple[Path, ...]
+    runs: list[_Run], best: _Run, used_paths: tuple[Path, ...]
 ) -> Iterator[tuple[str, str]]:
     for run in runs:
         for hierarchy, path in run.files.items():
-            if path in taken:
+            if path in used_paths:
                 continue
-            if run.coarse and not chosen.coarse:
+            if run.coarse and not best.coarse:
                 reason = "resampled to 1 mm; a finer file exists"
-            elif run is chosen:
+            elif run is best:
                 reason = f"{hierarchy} hierarchy: less detail than what was taken"
             else:
                 name = run.analysis.name
@@ -235,12 +235,12 @@ def _passed_over(
             yield path.name, reason
 
 
-def _problem(runs: list[_Run], matching: list[_Run], asked: str | None) -> HipstaError:
+def _problem(runs: list[_Run], matching: list[_Run], requested: str | None) -> HipstaError:
     folder = next(iter(runs[0].files.values())).parent
-    if asked and not matching:
+    if requested and not matching:
         names = ", ".join(dict.fromkeys(run.analysis.name for run in runs))
         return InputError(
-            f"{folder}: no analysis {asked} here (found {names}); change --fs-analysis",
+            f"{folder}: no analysis {requested} here (found {names}); change --fs-analysis",
             reason="analysis-missing",
         )
     return InputError(

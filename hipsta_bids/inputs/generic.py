@@ -36,12 +36,12 @@ _SNAP_NAME = "snaplabels.txt"
 
 def find_table(image: Path, root: Path) -> Path | None:
     """Find the label table that applies to an image, beside it or above it in the dataset."""
-    own = entities(image.name)
+    image_entities = entities(image.name)
     for folder in (image.parent, *image.parent.parents):
         specific = [
             (len(pairs), name)
             for name, pairs in _tables_in(folder)[0].items()
-            if all(own.get(key) == value for key, value in pairs.items())
+            if all(image_entities.get(key) == value for key, value in pairs.items())
         ]
         if specific:
             return folder / max(specific)[1]
@@ -203,30 +203,32 @@ def without_side(visit: VisitFolders) -> Iterator[Ignored]:
 
 
 def _choose(files: list[_File], visit: VisitFolders, hemi: str, source: Source) -> HemisphereInput:
-    chosen = files[0]
-    problem = chosen.problem
-    if problem is None and not _OWN_SPACE.fullmatch(chosen.space):
+    best = files[0]
+    problem = best.problem
+    if problem is None and not _OWN_SPACE.fullmatch(best.space):
         problem = InputError(
-            f"{chosen.path}: space {chosen.space} is a template's, which changes thickness; "
+            f"{best.path}: space {best.space} is a template's, which changes thickness; "
             "use labels in the subject's own space",
             reason="template-space",
         )
     order = "the subject's own space, the finest grid and the shortest name come first"
-    named, own = entities(chosen.path.name), {"sub": visit.subject, "ses": visit.session}
-    others = [f"{k}-{named[k]}" for k, v in own.items() if v and named.get(k, v) != v]
+    named, visit_entities = entities(best.path.name), {"sub": visit.subject, "ses": visit.session}
+    mismatches = [
+        f"{k}-{named[k]}" for k, v in visit_entities.items() if v and named.get(k, v) != v
+    ]
     return HemisphereInput(
         subject=visit.subject,
         session=visit.session,
         hemi=hemi,
-        protocol=chosen.protocol
-        or unknown_protocol("unknown", f"Labels of {chosen.path.name}, not described"),
-        files=(chosen.path,),
+        protocol=best.protocol
+        or unknown_protocol("unknown", f"Labels of {best.path.name}, not described"),
+        files=(best.path,),
         source=source.name,
         source_path=source.path,
-        why=f"labels named by {chosen.origin}" if chosen.protocol else "labels not described",
+        explanation=f"labels named by {best.origin}" if best.protocol else "labels not described",
         passed_over=tuple((file.path.name, order) for file in files[1:]),
         problem=problem,
-        notes=(f"the file's name says {'_'.join(others)}",) if others else (),
+        notes=(f"the file's name says {'_'.join(mismatches)}",) if mismatches else (),
     )
 
 

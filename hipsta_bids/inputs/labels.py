@@ -33,7 +33,7 @@ _HALF = 0.5 - 1e-6
 _ROUNDING = 1e-3
 
 #: How many values an error message lists.
-_SHOWN = 5
+_LISTED_VALUES = 5
 
 
 def read_label_volume(item: HemisphereInput, region: str = "body") -> LabelVolume:
@@ -79,14 +79,16 @@ def read_label_volume(item: HemisphereInput, region: str = "body") -> LabelVolum
     if item.bilateral:
         codes = _one_hemisphere(codes, item.protocol, item.hemi, path)
     tissue, part = _translate(codes, item.protocol, path)
-    for other in item.files[1:]:
-        more = _beside(other, path, image, edited=labels is not None)
-        _, parts = _translate(_integers(more, other), item.parts_protocol or item.protocol, other)
+    for added_path in item.files[1:]:
+        added_image = _beside(added_path, path, image, edited=labels is not None)
+        _, parts = _translate(
+            _integers(added_image, added_path), item.parts_protocol or item.protocol, added_path
+        )
         part = np.where(parts == Part.UNKNOWN, part, parts)
     volume = _cropped(tissue, part, image, item.protocol, region=region, path=path)
     if labels:
-        wanted = _wanted(volume.tissue, item.protocol, region)
-        _check_same_place(wanted, volume.affine, item, path)
+        needed = _wanted(volume.tissue, item.protocol, region)
+        _check_same_place(needed, volume.affine, item, path)
     if mask is None and not item.ends:
         return volume
     edited = None
@@ -133,10 +135,10 @@ def _cropped(
 ) -> LabelVolume:
     """Crop what was translated to the labels that are wanted, and a margin."""
     part = np.where(tissue == Tissue.BACKGROUND, np.uint8(Part.UNKNOWN), part)
-    wanted = _wanted(tissue, protocol, region)
-    if not wanted.any():
+    needed = _wanted(tissue, protocol, region)
+    if not needed.any():
         raise _empty(path)
-    hits = [np.asarray(wanted.any(axis=axes)) for axes in ((1, 2), (0, 2), (0, 1))]
+    hits = [np.asarray(needed.any(axis=axes)) for axes in ((1, 2), (0, 2), (0, 1))]
     inner = box_with_margin(hits, MARGIN, image.affine)
     first, second, third = (a + b.start for a, b in zip(image.start, inner, strict=True))
     return LabelVolume(
@@ -149,18 +151,18 @@ def _cropped(
     )
 
 
-def _beside(other: Path, path: Path, image: LabelImage, *, edited: bool) -> NDArray[Any]:
+def _beside(added_path: Path, path: Path, image: LabelImage, *, edited: bool) -> NDArray[Any]:
     """Read a second file where the first has labels, at nearest voxels if that one was edited."""
-    beside = read_labels(other, part=image.box)
+    beside = read_labels(added_path, part=image.box)
     if beside.shape == image.shape and np.allclose(
         beside.affine, image.affine, rtol=0, atol=_SAME_GRID
     ):
         return beside.data
     if edited:
-        more = read_labels(other, MARGIN)
-        to_own = np.linalg.inv(more.own_affine) @ image.own_affine
+        added_image = read_labels(added_path, MARGIN)
+        to_own = np.linalg.inv(added_image.own_affine) @ image.own_affine
         sampled: NDArray[Any] = ndimage.affine_transform(
-            _integers(more.data, other),
+            _integers(added_image.data, added_path),
             to_own[:3, :3],
             to_own[:3, 3],
             output_shape=image.data.shape,
@@ -168,7 +170,7 @@ def _beside(other: Path, path: Path, image: LabelImage, *, edited: bool) -> NDAr
         )
         return sampled
     raise InputError(
-        f"{other}: its grid differs from that of {path.name}, with which it is combined; "
+        f"{added_path}: its grid differs from that of {path.name}, with which it is combined; "
         "use files of the same run",
         reason="grid-mismatch",
     )
@@ -230,13 +232,13 @@ def _one_hemisphere(
 ) -> NDArray[np.integer[Any]]:
     """Keep one hemisphere's labels of a file that carries both, without the offset."""
     offset, shift = protocol.offset, protocol.shift(hemi)
-    own = codes > offset if shift else (codes > 0) & (codes < offset)
-    if not own.any():
+    of_side = codes > offset if shift else (codes > 0) & (codes < offset)
+    if not of_side.any():
         raise InputError(
             f"{path}: no labels of hemisphere {hemi} in this file of both hemispheres",
             reason="empty-labels",
         )
-    return np.where(own, codes - np.asarray(shift, codes.dtype), 0)
+    return np.where(of_side, codes - np.asarray(shift, codes.dtype), 0)
 
 
 def _translate(
@@ -257,11 +259,11 @@ def _sample_mask(mask: LabelImage, affine: Float, shape: tuple[int, ...], path: 
     values = np.unique(mask.data)
     if mask.data.shape != mask.shape:  # around it everything is zero
         values = np.unique(np.append(values, 0))
-    shown = ", ".join(f"{value:g}" for value in values[:_SHOWN].tolist())
-    shown += ", ..." if len(values) > _SHOWN else ""
+    value_text = ", ".join(f"{value:g}" for value in values[:_LISTED_VALUES].tolist())
+    value_text += ", ..." if len(values) > _LISTED_VALUES else ""
     if len(values) > 2 or not np.isfinite(values).all() or (len(values) == 2 and 0 not in values):  # noqa: PLR2004 (two)
         raise InputError(
-            f"{path}: a mask has the value 0 and one other, this has {shown}; save edited "
+            f"{path}: a mask has the value 0 and one other, this has {value_text}; save edited "
             "labels as desc-edited_dseg instead",
             reason="edited-mask-not-binary",
         )

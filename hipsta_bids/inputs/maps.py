@@ -57,8 +57,8 @@ def read_regions(path: Path, shape: tuple[int, int]) -> Regions:
         raise InputError(f"{path}: no point belongs to a region; draw one")
     nodes = _nodes(path, drawn, shape)
     names = [row["region"].strip() for row in drawn]
-    seen = Counter(zip(names, *nodes.T.tolist(), strict=True))
-    (name, x, y), times = seen.most_common(1)[0]
+    counts = Counter(zip(names, *nodes.T.tolist(), strict=True))
+    (name, x, y), times = counts.most_common(1)[0]
     if times > 1:
         raise InputError(
             f"{path}: point x={x + 1}, y={y + 1} occurs {times} times in region {name}; keep one"
@@ -81,9 +81,9 @@ def _nodes(
     ]
     if wrong or off:
         first, count = (wrong or off)[0], len(wrong or off)
-        what = "is no pair of whole numbers" if wrong else "lies off the sheet"
+        fault = "is no pair of whole numbers" if wrong else "lies off the sheet"
         raise InputError(
-            f"{path}: point x={first['x']}, y={first['y']} {what} ({count} in all); x runs from 1"
+            f"{path}: point x={first['x']}, y={first['y']} {fault} ({count} in all); x runs from 1"
             f" to {shape[0]}, y from 1 to {shape[1]}"
         )
     return np.array([[int(row["x"]) - 1, int(row["y"]) - 1] for row in rows], dtype=np.intp)
@@ -104,9 +104,9 @@ def check_pattern(option: str, name: str, pattern: str) -> None:
     except ValueError:
         unknown = {pattern}
     if unknown:
-        known = ", ".join(f"{{{field}}}" for field in PLACEHOLDERS)
+        placeholders = ", ".join(f"{{{field}}}" for field in PLACEHOLDERS)
         raise UsageError(
-            f"{option} {name}: {min(unknown)!r} is not understood; placeholders are {known}"
+            f"{option} {name}: {min(unknown)!r} is not understood; placeholders are {placeholders}"
         )
 
 
@@ -129,7 +129,7 @@ def find(name: str, root: Path) -> list[Path]:
 
 def scan(pattern: str, root: Path) -> list[Found]:
     """Find the files of all hemispheres, with sessions or without."""
-    found: dict[Path, Found] = {}
+    matches: dict[Path, Found] = {}
     for variant in dict.fromkeys((pattern, _SESSION.sub("", pattern))):
         expression = re.compile(_expression(variant))
         name = "".join(
@@ -140,20 +140,20 @@ def scan(pattern: str, root: Path) -> list[Found]:
             text = path if Path(variant).is_absolute() else path.relative_to(root)
             if (match := expression.fullmatch(text.as_posix())) and path.is_file():
                 labels = match.groupdict()
-                whose = Found(
+                entry = Found(
                     path=path,
                     subject=labels["subject"],
                     session=labels.get("session"),
                     hemi=labels.get("hemi") or _HEMIS.get(labels.get("side", "")),
                 )
-                found.setdefault(path, whose)
-    return sorted(found.values(), key=lambda one: str(one.path))
+                matches.setdefault(path, entry)
+    return sorted(matches.values(), key=lambda entry: str(entry.path))
 
 
 def _expression(pattern: str) -> str:
     """Regular expression with a group per placeholder; further ones of a kind must be equal."""
     expression = ""
-    seen: set[str] = set()
+    used_fields: set[str] = set()
     for literal, field, _, _ in string.Formatter().parse(pattern):
         for part in _WILDCARD.split(literal):
             is_set = part.startswith("[") and part.endswith("]")
@@ -161,8 +161,10 @@ def _expression(pattern: str) -> str:
                 part.replace("[!", "[^", 1) if is_set else re.escape(part)
             )
         if field is not None:
-            expression += f"(?P={field})" if field in seen else f"(?P<{field}>{_LABELS[field]})"
-            seen.add(field)
+            expression += (
+                f"(?P={field})" if field in used_fields else f"(?P<{field}>{_LABELS[field]})"
+            )
+            used_fields.add(field)
     return expression
 
 
@@ -173,26 +175,30 @@ def map_requests(
 ) -> tuple[MapSource, ...]:
     """Combine and check the options about maps; choices without a name are for all other maps."""
     names = [name for name, _ in patterns]
-    taken = {row.desc for row in (*OUTPUTS, *EXTRA_OUTPUTS)} | {"x", "y", *(m.name for m in MAPS)}
+    reserved = {row.desc for row in (*OUTPUTS, *EXTRA_OUTPUTS)} | {
+        "x",
+        "y",
+        *(m.name for m in MAPS),
+    }
     for name, pattern in patterns:
         if not name.isalnum() or not name.isascii():
             raise UsageError(f"--map: {name!r} is not a name of letters and digits")
-        if name in taken or names.count(name) > 1:
-            why = "belongs to other outputs" if name in taken else "occurs twice"
-            raise UsageError(f"--map: the name {name} {why}; choose another one")
+        if name in reserved or names.count(name) > 1:
+            fault = "belongs to other outputs" if name in reserved else "occurs twice"
+            raise UsageError(f"--map: the name {name} {fault}; choose another one")
         check_pattern("--map", name, pattern)
     for option, choices in (("sampling", samplings), ("interpolation", interpolations)):
-        lost = [name for name, _ in choices if name is not None and name not in names]
-        if lost:
-            raise UsageError(f"--map-{option}: there is no --map {lost[0]}=...")
-    where = {None: "depth", **dict(samplings)}
-    how = {None: "linear", **dict(interpolations)}
+        unknown_names = [name for name, _ in choices if name is not None and name not in names]
+        if unknown_names:
+            raise UsageError(f"--map-{option}: there is no --map {unknown_names[0]}=...")
+    sampling_of = {None: "depth", **dict(samplings)}
+    interpolation_of = {None: "linear", **dict(interpolations)}
     return tuple(
         MapSource(
             name=name,
             pattern=pattern,
-            sampling=where.get(name, where[None]),
-            interpolation=how.get(name, how[None]),
+            sampling=sampling_of.get(name, sampling_of[None]),
+            interpolation=interpolation_of.get(name, interpolation_of[None]),
         )
         for name, pattern in patterns
     )
@@ -205,7 +211,7 @@ def attach(
     bids_dir: Path,
 ) -> tuple[tuple[HemisphereInput, ...], tuple[str, ...]]:
     """Look for the volumes of each hemisphere, and count them in one note per map."""
-    found = tuple(
+    attached = tuple(
         replace(
             item,
             maps=tuple(_source(item, request, bids_dir) for request in requests),
@@ -215,8 +221,8 @@ def attach(
     )
     notes = []
     for number, request in enumerate(requests):
-        without = [item for item in found if item.maps[number].path is None]
-        line = f"map {request.name}: {len(found) - len(without)} of {len(found)} hemispheres"
+        without = [item for item in attached if item.maps[number].path is None]
+        line = f"map {request.name}: {len(attached) - len(without)} of {len(attached)} hemispheres"
         if without:
             first = without[0]
             line += (
@@ -224,7 +230,7 @@ def attach(
                 f" ({first.maps[number].missing})"
             ) + (f" and {len(without) - 1} more" if len(without) > 1 else "")
         notes.append(line)
-    return found, tuple(notes)
+    return attached, tuple(notes)
 
 
 def _source(item: HemisphereInput, request: MapSource, bids_dir: Path) -> MapSource:

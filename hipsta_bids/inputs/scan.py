@@ -106,7 +106,7 @@ class HemisphereInput(Hemisphere):
     source: str
     """Name of the dataset."""
     source_path: Path
-    why: str
+    explanation: str
     """Why this file, in one phrase."""
     passed_over: tuple[tuple[str, str], ...] = ()
     """Other files of this hemisphere and why they were not taken."""
@@ -323,13 +323,13 @@ def list_visits(
     folders: Iterable[SubjectFolder], ignored: list[Ignored] | None = None
 ) -> list[VisitFolders]:
     """List the candidate files of some subjects; what cannot be listed is added to ``ignored``."""
-    found: dict[tuple[str, str | None], list[Folder]] = {}
+    folders_of: dict[tuple[str, str | None], list[Folder]] = {}
     for folder in folders:
         for session, inner in _inner_folders(folder, [] if ignored is None else ignored):
-            found.setdefault((folder.subject, session), []).append(inner)
+            folders_of.setdefault((folder.subject, session), []).append(inner)
     return [
         VisitFolders(subject=subject, session=session, folders=tuple(inner))
-        for (subject, session), inner in found.items()
+        for (subject, session), inner in folders_of.items()
     ]
 
 
@@ -372,8 +372,10 @@ def _try_to_list(
         return list_folder(path)
     except InputError as error:
         reason = str(error).removeprefix(f"{path}: ")
-        whose = (folder.subject, folder.path) if folder else (None, None)
-        ignored.append(Ignored(path=path, reason=reason, subject=whose[0], inside=whose[1]))
+        subject_folder = (folder.subject, folder.path) if folder else (None, None)
+        ignored.append(
+            Ignored(path=path, reason=reason, subject=subject_folder[0], inside=subject_folder[1])
+        )
         return None
 
 
@@ -448,22 +450,22 @@ def _datasets(
     Searched are ``depth`` levels below the root, and the folders in each ``sourcedata`` on the way.
     What cannot be listed is left out: ``sourcedata`` is often closed to all but a few.
     """
-    found: list[Path] = []
+    datasets: list[Path] = []
     unused: list[Ignored] = []
-    seen: set[str] = set()
+    visited: set[str] = set()
     waiting = [(root, depth)]
     while waiting:
         path, below = waiting.pop()
         key = os.path.realpath(path)
-        listed = None if key in seen else _try_to_list(path, ignored)
-        seen.add(key)
+        listed = None if key in visited else _try_to_list(path, ignored)
+        visited.add(key)
         if listed is None:
             continue
         entries = {name: _read_name(path / name, any_name=any_name) for name in listed[0]}
         inner = [name for name, entry in entries.items() if entry is None]
-        known = any(isinstance(entry, SubjectFolder) for entry in entries.values())
-        if known or any(name.startswith("sub-") for name in entries):
-            found.append(path)
+        has_subjects = any(isinstance(entry, SubjectFolder) for entry in entries.values())
+        if has_subjects or any(name.startswith("sub-") for name in entries):
+            datasets.append(path)
             inner, below = [name for name in inner if name == "sourcedata"], 0
         else:
             unused += [entry for entry in entries.values() if isinstance(entry, Ignored)]
@@ -475,9 +477,9 @@ def _datasets(
                 waiting.append((path / name, below - 1))
     # A folder of datasets may hold one that is called mri.
     ignored += [
-        entry for entry in unused if not any(path.is_relative_to(entry.path) for path in found)
+        entry for entry in unused if not any(path.is_relative_to(entry.path) for path in datasets)
     ]
-    return found
+    return datasets
 
 
 def list_participants(request: InputRequest) -> frozenset[str]:

@@ -56,7 +56,7 @@ _LOOKED_FOR = (
 _NO_LABELS = "its mri folder holds no hippocampal subfields"
 
 #: How many names an error message lists.
-_SHOWN = 6
+_LISTED_NAMES = 6
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,23 +101,25 @@ def find_inputs(request: InputRequest) -> Findings:
     selection = make_selection(request)
     option = choose_atlas(request)
     forget_tables()
-    found = _Found()
-    sources = list_sources(request, found.others)
-    found.edited = list_edits(request, selection, found.ignored)
+    results = _Found()
+    sources = list_sources(request, results.strays)
+    results.edited = list_edits(request, selection, results.ignored)
     for source in sources:
-        _search(source, selection, option, found)
-    ignored = tuple(filter(selection.misses, found.unused()))
-    if not found.items:
-        nothing = _nothing(request, sources, ignored)
+        _search(source, selection, option, results)
+    ignored = tuple(filter(selection.misses, results.unused()))
+    if not results.items:
+        error = _nothing(request, sources, ignored)
         for entry in ignored:
-            nothing.add_note(f"not used: {entry.path}: {entry.reason}")
-        raise nothing
-    _check_analysis(found.items, request)
+            error.add_note(f"not used: {entry.path}: {entry.reason}")
+        raise error
+    _check_analysis(results.items, request)
     items, notes = attach_edits(
-        _without_clashes(found.items, sources), each_once(found.edited), selection
+        _without_clashes(results.items, sources), each_once(results.edited), selection
     )
     subjects = {item.subject for item in items}
-    renamed = [f"{f.path.name} as sub-{f.subject}" for f in found.renamed if f.subject in subjects]
+    renamed = [
+        f"{f.path.name} as sub-{f.subject}" for f in results.renamed if f.subject in subjects
+    ]
     if renamed:
         notes += (f"renamed: {_count(renamed, 'FreeSurfer folder')}",)
     if unused := _unused(ignored):
@@ -132,18 +134,18 @@ class _Found:
     items: list[HemisphereInput] = field(default_factory=list)
     edited: list[EditedFile] = field(default_factory=list)
     ignored: list[Ignored] = field(default_factory=list)
-    others: list[Ignored] = field(default_factory=list)
+    strays: list[Ignored] = field(default_factory=list)
     """Entries that are no subject's by their names, unless an option says otherwise."""
     renamed: list[SubjectFolder] = field(default_factory=list)
     """Folders of wanted subjects whose names are not their labels."""
 
     def unused(self) -> list[Ignored]:
         """List each entry that was not used once, sorted by path."""
-        taken = {_place(folder.path) for folder in self.renamed} if self.others else set()
-        once = {_place(entry.path): entry for entry in reversed(self.others)}
-        once = {place: entry for place, entry in once.items() if place not in taken}
-        once |= {_place(entry.path): entry for entry in reversed(self.ignored)}
-        return sorted(once.values(), key=lambda entry: entry.path)
+        renamed_paths = {_place(folder.path) for folder in self.renamed} if self.strays else set()
+        entry_of = {_place(entry.path): entry for entry in reversed(self.strays)}
+        entry_of = {place: entry for place, entry in entry_of.items() if place not in renamed_paths}
+        entry_of |= {_place(entry.path): entry for entry in reversed(self.ignored)}
+        return sorted(entry_of.values(), key=lambda entry: entry.path)
 
 
 def _renaming(folders: Iterable[SubjectFolder]) -> dict[tuple[str, str | None], str]:
@@ -192,7 +194,7 @@ def selection_table(items: Iterable[HemisphereInput]) -> list[dict[str, str]]:
             "hemisphere": item.hemi,
             "file": " + ".join(_relative(path, item.source_path) for path in item.files),
             "scheme": item.protocol.name,
-            "why": "; ".join((f"{item.source}: {item.why}", *item.notes))
+            "why": "; ".join((f"{item.source}: {item.explanation}", *item.notes))
             + (f"; NOT USABLE: {item.problem}" if item.problem else ""),
             "edited": " + ".join(_relative(edit.path, edit.source_path) for edit in item.edits)
             or "n/a",
@@ -210,37 +212,37 @@ def dataset_notes(request: InputRequest, items: Iterable[HemisphereInput]) -> tu
             f"{request.bids_dir} has no dataset_description.json, which BIDS requires; going on"
         )
     selection = make_selection(request)
-    known = selection.subjects or list_participants(request)
-    without = sorted(known - selection.excluded - {item.subject for item in items})
+    expected = selection.subjects or list_participants(request)
+    without = sorted(expected - selection.excluded - {item.subject for item in items})
     if without:
         notes.append(f"no segmentation found for {_count(without, 'participant')}")
     return tuple(notes)
 
 
-def _search(source: Source, selection: Selection, option: Protocol | None, found: _Found) -> None:
+def _search(source: Source, selection: Selection, option: Protocol | None, results: _Found) -> None:
     """Search one dataset for all kinds of segmentations, and add the edited files beside them."""
-    every, others = sort_folders(source.path, any_name=source.any_name)
-    refused = same_labels(every)
-    folders = list(filter(selection.wants_folder, every))
-    found.others += others
-    found.renamed += [folder for folder in folders if folder.renamed]
-    anew = _renaming(folders)
+    all_folders, strays = sort_folders(source.path, any_name=source.any_name)
+    refused = same_labels(all_folders)
+    folders = list(filter(selection.wants_folder, all_folders))
+    results.strays += strays
+    results.renamed += [folder for folder in folders if folder.renamed]
+    renaming = _renaming(folders)
     atlases = AtlasFinder(source.path, option)
-    for visit in filter(selection.wants_visit, list_visits(folders, found.ignored)):
-        found.edited += edits_of_visit(visit, source.path, source.name, beside=True)
+    for visit in filter(selection.wants_visit, list_visits(folders, results.ignored)):
+        results.edited += edits_of_visit(visit, source.path, source.name, beside=True)
         items = list(_search_visit(visit, source, selection, atlases))
-        found.ignored += without_side(visit) if "named" in source.layouts else ()
-        used = [file for item in items for file in item.files]
-        found.ignored += [
+        results.ignored += without_side(visit) if "named" in source.layouts else ()
+        used_files = [file for item in items for file in item.files]
+        results.ignored += [
             Ignored(path=path, reason=_NO_LABELS, subject=visit.subject)
             for path in (without_labels(visit) if "freesurfer" in source.layouts else ())
-            if not any(file.is_relative_to(path) for file in used)
+            if not any(file.is_relative_to(path) for file in used_files)
         ]
         for item in items:
             problem = item.problem or refused.get(item.subject)
-            note = anew.get((item.subject, item.session))
+            note = renaming.get((item.subject, item.session))
             notes = item.notes if note is None else (*item.notes, note)
-            found.items.append(replace(item, problem=problem, notes=notes))
+            results.items.append(replace(item, problem=problem, notes=notes))
 
 
 def _search_visit(
@@ -260,29 +262,33 @@ def _search_visit(
 
 
 def _without_clashes(
-    found: list[HemisphereInput], sources: tuple[Source, ...]
+    candidates: list[HemisphereInput], sources: tuple[Source, ...]
 ) -> tuple[HemisphereInput, ...]:
     """Keep one input per hemisphere and protocol."""
     order = {source.path: index for index, source in enumerate(sources)}
-    chosen: dict[tuple[str, str, str, str], HemisphereInput] = {}
-    for item in sorted(found, key=lambda item: (item.problem is not None, order[item.source_path])):
-        first = chosen.setdefault(item.key, item)
+    items: dict[tuple[str, str, str, str], HemisphereInput] = {}
+    for item in sorted(
+        candidates, key=lambda item: (item.problem is not None, order[item.source_path])
+    ):
+        first = items.setdefault(item.key, item)
         if first is not item:
             reason = f"same hemisphere and protocol as in {first.source}, which comes first"
             if item.problem is not None and first.problem is None:
                 reason = f"not usable ({item.problem.reason})"
-            other = (str(item.files[0]), reason)
-            chosen[item.key] = replace(first, passed_over=(*first.passed_over, other))
-    return tuple(chosen[key] for key in sorted(chosen))
+            rejected = (str(item.files[0]), reason)
+            items[item.key] = replace(first, passed_over=(*first.passed_over, rejected))
+    return tuple(items[key] for key in sorted(items))
 
 
-def _check_analysis(found: list[HemisphereInput], request: InputRequest) -> None:
+def _check_analysis(items: list[HemisphereInput], request: InputRequest) -> None:
     """Refuse an analysis that no hemisphere has: a typing error."""
-    asked = [item for item in found if item.protocol.tool == "freesurfer"]
+    analyses = [item for item in items if item.protocol.tool == "freesurfer"]
     missing = [
-        item.problem for item in asked if item.problem and item.problem.reason == "analysis-missing"
+        item.problem
+        for item in analyses
+        if item.problem and item.problem.reason == "analysis-missing"
     ]
-    if request.fs_analysis and missing and len(missing) == len(asked):
+    if request.fs_analysis and missing and len(missing) == len(analyses):
         raise UsageError(
             f"--fs-analysis {request.fs_analysis}: no hemisphere has it ({missing[0]})"
         )
@@ -294,9 +300,12 @@ def _nothing(
     """Describe what was looked for, and where, and what was not used."""
     searched = ", ".join(str(source.path) for source in sources)
     restricted = (
-        *(f"--participant-label {label}" for label in request.participant_labels[:_SHOWN]),
-        *(f"--exclude-participant-label {label}" for label in request.excluded_labels[:_SHOWN]),
-        *(f"--session-label {label}" for label in request.session_labels[:_SHOWN]),
+        *(f"--participant-label {label}" for label in request.participant_labels[:_LISTED_NAMES]),
+        *(
+            f"--exclude-participant-label {label}"
+            for label in request.excluded_labels[:_LISTED_NAMES]
+        ),
+        *(f"--session-label {label}" for label in request.session_labels[:_LISTED_NAMES]),
         *(f"--hemi {hemi}" for hemi in request.hemis if request.hemis != HEMIS),
         *([f"--bids-filter-file {request.bids_filter_file}"] if request.bids_filter_file else []),
     )
@@ -332,9 +341,9 @@ def _unused(ignored: Iterable[Ignored]) -> str:
 
 
 def _count(names: list[str], noun: str) -> str:
-    more = ", ..." if len(names) > _SHOWN else ""
+    ellipsis = ", ..." if len(names) > _LISTED_NAMES else ""
     plural = "" if len(names) == 1 else "s"
-    listed = f" ({', '.join(names[:_SHOWN])}{more})" if names else ""
+    listed = f" ({', '.join(names[:_LISTED_NAMES])}{ellipsis})" if names else ""
     return f"{len(names)} {noun}{plural}{listed}"
 
 

@@ -26,7 +26,7 @@ from hipsta_bids.protocols.protocol import Protocol
 #: The entry of the filter file that applies to segmentations.
 _QUERY = "dseg"
 
-_Wanted = Callable[[str | None], bool]
+_Rule = Callable[[str | None], bool]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,7 +38,7 @@ class Selection:
     excluded: frozenset[str] = frozenset()
     sessions: frozenset[str] = frozenset()
     hemis: tuple[str, ...] = HEMIS
-    rules: Mapping[str, _Wanted] = field(default_factory=dict)
+    rules: Mapping[str, _Rule] = field(default_factory=dict)
     """By entity, in pybids's long names; from the filter file."""
     fs_analysis: str | None = None
     """The FreeSurfer analysis to take."""
@@ -67,8 +67,8 @@ class Selection:
 
     def wants_visit(self, visit: VisitFolders) -> bool:
         """Check whether a session of a subject is wanted."""
-        asked = not self.sessions or visit.session in self.sessions
-        return asked and self._passes("session", visit.session)
+        is_selected = not self.sessions or visit.session in self.sessions
+        return is_selected and self._passes("session", visit.session)
 
     def wanted_hemis(self) -> tuple[str, ...]:
         """List the hemispheres that are wanted."""
@@ -80,9 +80,9 @@ class Selection:
             return True
         from bids.layout import parse_file_entities  # noqa: PLC0415 (takes seconds)
 
-        found = parse_file_entities(str(path), entities=list(_entities().values()))
-        given = {key: str(value) for key, value in found.items()}
-        return all(rule(given.get(key)) for key, rule in self.rules.items())
+        file_entities = parse_file_entities(str(path), entities=list(_entities().values()))
+        texts = {key: str(value) for key, value in file_entities.items()}
+        return all(rule(texts.get(key)) for key, rule in self.rules.items())
 
     def _passes(self, entity: str, value: str | None) -> bool:
         rule = self.rules.get(entity)
@@ -106,30 +106,30 @@ def choose_file(
     hemi: str,
     source: Source,
     *,
-    found: tuple[Protocol, HipstaError | None],
-    why: tuple[str, str],
+    candidate: tuple[Protocol, HipstaError | None],
+    explanation: tuple[str, str],
     passed_over: Iterable[tuple[str, str]],
 ) -> HemisphereInput:
     """Take the first file of a hemisphere, unless another one is as good."""
-    (protocol, problem), chosen = found, files[0]
-    rivals = [file.path.name for file in files if file.rank == chosen.rank]
+    (protocol, problem), best = candidate, files[0]
+    rivals = [file.path.name for file in files if file.rank == best.rank]
     if len(rivals) > 1:
         problem = InputError(
-            f"{chosen.path.parent}: {' and '.join(rivals)} are equally good; "
+            f"{best.path.parent}: {' and '.join(rivals)} are equally good; "
             "keep one of them in the subject's folder",
             reason="several-files",
         )
-    both = ", both hemispheres in one file" if chosen.hemi is None else ""
+    note = ", both hemispheres in one file" if best.hemi is None else ""
     return HemisphereInput(
         subject=visit.subject,
         session=visit.session,
         hemi=hemi,
         protocol=protocol,
-        files=(chosen.path,),
-        bilateral=chosen.hemi is None,
+        files=(best.path,),
+        bilateral=best.hemi is None,
         source=source.name,
         source_path=source.path,
-        why=both.join(why),
+        explanation=note.join(explanation),
         passed_over=tuple(passed_over),
         problem=problem,
     )
@@ -181,7 +181,7 @@ def _labels(labels: Iterable[str], prefix: str, option: str) -> frozenset[str]:
     return bare
 
 
-def _rules(path: Path) -> dict[str, _Wanted]:
+def _rules(path: Path) -> dict[str, _Rule]:
     """Read a filter file: ``{"dseg": {"session": "01", "space": ["T1w", "T2w"]}}``."""
     try:
         contents = json.loads(path.read_text("utf-8"))
@@ -196,27 +196,27 @@ def _rules(path: Path) -> dict[str, _Wanted]:
         raise UsageError(
             f'{path}: the filter file is not of the form {{"{_QUERY}": {{ENTITY: VALUE}}}}'
         )
-    known = _entities()
+    known_keys = _entities()
     for key in query:
-        if key not in known:
-            near = difflib.get_close_matches(key, known, n=1)
+        if key not in known_keys:
+            near = difflib.get_close_matches(key, known_keys, n=1)
             hint = f"; did you mean {near[0]!r}?" if near else ""
             raise UsageError(f"{path}: {key!r} in {_QUERY!r} is not a BIDS entity{hint}")
     return {key: _rule(value) for key, value in query.items()}
 
 
-def _rule(value: Any) -> _Wanted:  # noqa: ANN401 (JSON)
+def _rule(value: Any) -> _Rule:  # noqa: ANN401 (JSON)
     """Make one entity's test; null, ``*`` and ``Query.…`` mean what they mean in fMRIPrep."""
     if value is None or value == "Query.NONE":
-        return lambda found: found is None
+        return lambda text: text is None
     if value in ("*", "Query.ANY"):
-        return lambda found: found is not None
+        return lambda text: text is not None
     if value == "Query.OPTIONAL":
         return lambda _: True
     values = value if isinstance(value, list) else [value]
     rules = [_rule(entry) for entry in values] if isinstance(value, list) else []
     texts = {str(entry) for entry in values}
-    return lambda found: found in texts or any(rule(found) for rule in rules)
+    return lambda text: text in texts or any(rule(text) for rule in rules)
 
 
 # pybids takes seconds to import and is needed only where a filter is given.

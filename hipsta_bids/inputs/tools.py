@@ -73,22 +73,22 @@ def find_tools(
 ) -> Iterator[HemisphereInput]:
     """Find the segmentations of these tools in one visit."""
     for tool in _TOOLS:
-        found = [
+        candidates = [
             file for folder in visit.folders for file in _files(folder, tool, source, selection)
         ]
-        found.sort(key=lambda file: (file.rank, str(file.path)))
+        candidates.sort(key=lambda file: (file.rank, str(file.path)))
         for hemi in selection.wanted_hemis():
-            files = [file for file in found if file.hemi in (hemi, None)]
+            files = [file for file in candidates if file.hemi in (hemi, None)]
             if not files:
                 continue
-            protocol, why, problem = _protocol(files[0].path, tool, selection)
+            protocol, explanation, problem = _protocol(files[0].path, tool, selection)
             yield choose_file(
                 files,
                 visit,
                 hemi,
                 source,
-                found=(protocol, problem),
-                why=(tool.title, f", {why}"),
+                candidate=(protocol, problem),
+                explanation=(tool.title, f", {explanation}"),
                 passed_over=[(file.path.name, _ORDER[file.rank[0]]) for file in files[1:]],
             )
 
@@ -120,12 +120,12 @@ def _protocol(
     users = selection.protocol
     if users is not None and users.tool == tool.name:
         return users, f"protocol {users.name} from --scheme", None
-    known = [
+    fitting = [
         protocol for name in protocol_names() if (protocol := load_protocol(name)).tool == tool.name
     ]
-    if len(known) == 1:
-        return known[0], f"protocol {known[0].name}", None
-    names = " or ".join(f"--scheme {each.name} ({each.title})" for each in known)
+    if len(fitting) == 1:
+        return fitting[0], f"protocol {fitting[0].name}", None
+    names = " or ".join(f"--scheme {each.name} ({each.title})" for each in fitting)
     problem = ProtocolError(f"{path}: {tool.choice}; say which: {names}", reason="ambiguous-scheme")
     return unknown_protocol(tool.name, f"{tool.title}, mode not given"), "mode not given", problem
 
@@ -187,22 +187,22 @@ def find_hippunfold(
         files = sorted(_unfold_files(visit, hemi, source, selection), key=lambda file: file.rank)
         if not files:
             continue
-        chosen = files[0]
-        known = chosen.atlas in _ATLASES
-        users = selection.protocol if not known and selection.describes(_HIPPUNFOLD) else None
+        best = files[0]
+        is_known = best.atlas in _ATLASES
+        users = selection.protocol if not is_known and selection.describes(_HIPPUNFOLD) else None
         note = "labels on the image's own grid, which may be coarse; no space-crop* file exists"
         yield HemisphereInput(
             subject=visit.subject,
             session=visit.session,
             hemi=hemi,
             protocol=users or load_protocol("hippunfold"),
-            files=(chosen.path,),
+            files=(best.path,),
             source=source.name,
             source_path=source.path,
-            why=f"space {chosen.space or 'not named'}, atlas {chosen.atlas or 'not named'}",
-            passed_over=tuple((file.path.name, _unfold_reason(file, chosen)) for file in files[1:]),
-            problem=_unfold_problem(chosen, known=known or users is not None),
-            notes=() if chosen.cropped else (note,),
+            explanation=f"space {best.space or 'not named'}, atlas {best.atlas or 'not named'}",
+            passed_over=tuple((file.path.name, _unfold_reason(file, best)) for file in files[1:]),
+            problem=_unfold_problem(best, is_known=is_known or users is not None),
+            notes=() if best.cropped else (note,),
         )
 
 
@@ -219,24 +219,24 @@ def _unfold_files(
                 yield _UnfoldFile(path=path, space=pairs.get("space", ""), atlas=pairs.get("atlas"))
 
 
-def _unfold_reason(file: _UnfoldFile, chosen: _UnfoldFile) -> str:
+def _unfold_reason(file: _UnfoldFile, best: _UnfoldFile) -> str:
     if file.scaled:
         return f"space {file.space} may be scaled, which changes thickness"
-    if file.atlas != chosen.atlas:
-        return f"atlas {chosen.atlas} comes first; a --bids-filter-file selects another one"
-    if chosen.cropped and not file.cropped:
-        return f"coarser grid than space {chosen.space}"
+    if file.atlas != best.atlas:
+        return f"atlas {best.atlas} comes first; a --bids-filter-file selects another one"
+    if best.cropped and not file.cropped:
+        return f"coarser grid than space {best.space}"
     return "as good as the first one; a --bids-filter-file selects it"
 
 
-def _unfold_problem(file: _UnfoldFile, *, known: bool) -> HipstaError | None:
+def _unfold_problem(file: _UnfoldFile, *, is_known: bool) -> HipstaError | None:
     if file.scaled:
         return InputError(
             f"{file.path}: space {file.space} may be scaled, which changes thickness; "
             "run HippUnfold with its default output space",
             reason="template-space",
         )
-    if not known:
+    if not is_known:
         return ProtocolError(
             f"{file.path}: no bundled protocol for HippUnfold's atlas {file.atlas}; "
             "describe its labels in a TOML file and pass it with --scheme",

@@ -49,19 +49,19 @@ def is_disk_full(error: OSError) -> bool:
 
 def output_error(path: Path, error: OSError) -> OutputError:
     """Translate a system error on writing into one that a user can act on."""
-    said = error.strerror or error
+    detail = error.strerror or error
     if is_disk_full(error):
         reason = "disk-full"
-        problem = f"no space left ({said}); free some and run the same command again"
+        problem = f"no space left ({detail}); free some and run the same command again"
     elif error.errno in _FORBIDDEN:
         reason = "read-only"
         problem = (
-            f"not allowed to write there ({said}); choose another output folder or change its"
+            f"not allowed to write there ({detail}); choose another output folder or change its"
             " permissions"
         )
     else:
         reason = "not-writable"
-        problem = f"cannot be written ({said}); choose another output folder"
+        problem = f"cannot be written ({detail}); choose another output folder"
     return OutputError(f"{path}: {problem}", reason=reason)
 
 
@@ -139,14 +139,14 @@ def check_scratch(folder: Path | None = None) -> None:
 def write_bytes(path: Path, content: bytes) -> None:
     """Write a file atomically, making its folder if need be."""
     make_folder(path.parent)
-    aside = _aside(path)
+    temporary = _aside(path)
     try:
         try:
-            _write_through(aside, content)
-            aside.replace(path)
+            _write_through(temporary, content)
+            temporary.replace(path)
         except BaseException:
             with contextlib.suppress(OSError):
-                aside.unlink()
+                temporary.unlink()
             raise
     except OSError as error:
         raise output_error(path, error) from error
@@ -270,9 +270,9 @@ def read_tsv(path: Path) -> list[dict[str, str]]:
         raise InputError(
             f"{path}: rows and header differ in length; restore or delete it", reason="bad-table"
         )
-    if twice := sorted({name for name in header if header.count(name) > 1}):
+    if repeated := sorted({name for name in header if header.count(name) > 1}):
         raise InputError(
-            f"{path}: column {twice[0]!r} occurs more than once; keep one", reason="bad-table"
+            f"{path}: column {repeated[0]!r} occurs more than once; keep one", reason="bad-table"
         )
     return [dict(zip(header, row, strict=True)) for row in rows]
 
@@ -290,7 +290,7 @@ def sha256_of(path: Path) -> str:
 
 
 @contextlib.contextmanager
-def locked(root: Path, what: str) -> Iterator[bool]:
+def locked(root: Path, purpose: str) -> Iterator[bool]:
     """Let one process at a time work on something, on one machine or many; others wait.
 
     Yields whether the file system knows locks. A process may hold one lock at a time: with POSIX's
@@ -299,7 +299,7 @@ def locked(root: Path, what: str) -> Iterator[bool]:
     folder = root / LOGS
     make_folder(folder)
     path = folder / _LOCK_FILE
-    digest = hashlib.blake2b(what.encode(), digest_size=7).digest()
+    digest = hashlib.blake2b(purpose.encode(), digest_size=7).digest()
     try:
         handle = path.open("ab")
     except OSError as error:

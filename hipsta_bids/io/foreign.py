@@ -13,8 +13,8 @@ from hipsta_bids.io import files
 from hipsta_bids.protocols.toml import Table, first_mistake
 
 Number = Annotated[float, Field(allow_inf_nan=False)]
-Known = list[Number | None]
-"""Numbers in JSON; null where one is missing."""
+FileNumbers = list[Number | None]
+"""FileNumbers in JSON; null where one is missing."""
 Nested = dict[str, dict[str, dict[str, list[Any]]]]
 """Arrays by hemisphere, measure and name as lists, for JSON."""
 
@@ -22,16 +22,16 @@ Nested = dict[str, dict[str, dict[str, list[Any]]]]
 _LONGEST = 300
 
 
-def read_foreign(path: Path, kind: type[Table], *, most: float) -> Table:
+def read_foreign(path: Path, kind: type[Table], *, max_bytes: float) -> Table:
     """Read a JSON file of other people, which may hold anything; nothing in it is run.
 
     Raises
     ------
     ValueError
-        One line about what is wrong in it, or that it has more bytes than ``most``.
+        One line about what is wrong in it, or that it has more bytes than ``max_bytes``.
     """
-    if path.is_file() and path.stat().st_size > most:
-        raise ValueError(f"larger than {most / 1e6:g} MB")
+    if path.is_file() and path.stat().st_size > max_bytes:
+        raise ValueError(f"larger than {max_bytes / 1e6:g} MB")
     return checked_foreign(files.read_json(path), kind)
 
 
@@ -55,11 +55,11 @@ def rounded(value: Any) -> Any:  # noqa: ANN401  (nested lists of numbers)
     return float(f"{value:.9g}") if math.isfinite(value) else None
 
 
-def as_nested(found: Mapping[tuple[str, str], object], names: Sequence[str]) -> Nested:
+def as_nested(results: Mapping[tuple[str, str], object], names: Sequence[str]) -> Nested:
     """Write the named arrays of values by hemisphere and measure."""
     nested: Nested = {}
-    for (hemi, measure), one in found.items():
-        arrays = {name: rounded(getattr(one, name)) for name in names}
+    for (hemi, measure), result in results.items():
+        arrays = {name: rounded(getattr(result, name)) for name in names}
         nested.setdefault(hemi, {})[measure] = arrays
     return nested
 

@@ -174,18 +174,18 @@ def cifti_sides(path: Path) -> list[str]:
 
 def _surface_models(path: Path, image: Cifti2Image) -> dict[str, Cifti2BrainModel]:
     """Find where the data of each hemisphere are, and of which vertices."""
-    found: dict[str, Cifti2BrainModel] = {}
+    models: dict[str, Cifti2BrainModel] = {}
     # The axes that nibabel makes of it would hold a word per vertex.
     for model in image.header.get_index_map(image.ndim - 1).brain_models:
         hemi = _CIFTI_SIDES.get(model.brain_structure.rpartition("_")[2])
         if hemi is None or not model.surface_number_of_vertices:
             continue
-        if hemi in found:
+        if hemi in models:
             raise InputError(
                 f"{path}: has several surfaces of hemisphere {hemi}; give a file with one"
             )
-        found[hemi] = model
-    return found
+        models[hemi] = model
+    return models
 
 
 def _from_cifti(path: Path, hemi: str) -> PointMap:
@@ -234,11 +234,11 @@ def _finite(values: Any) -> Float:  # noqa: ANN401  ((as nibabel returns them))
 def _from_table(path: Path, name: str) -> PointMap:
     rows = files.read_tsv(path)
     columns = list(rows[0]) if rows else []
-    others = [column for column in columns if column not in _POSITIONS]
-    column = name if name in columns else others[0] if len(others) == 1 else None
+    value_columns = [column for column in columns if column not in _POSITIONS]
+    column = name if name in columns else value_columns[0] if len(value_columns) == 1 else None
     if column is None:
-        what = f"columns {', '.join(others)}" if others else "no column of values"
-        raise InputError(f"{path}: has {what}; name the map after one of them")
+        fault = f"columns {', '.join(value_columns)}" if value_columns else "no column of values"
+        raise InputError(f"{path}: has {fault}; name the map after one of them")
     try:
         values = [np.nan if row[column] == files.MISSING else float(row[column]) for row in rows]
         nodes = _nodes(rows) if {"x", "y"} <= set(columns) else None
@@ -262,13 +262,13 @@ def _nodes(rows: list[dict[str, str]]) -> tuple[int, int] | None:
 def read_mesh(path: Path) -> Mesh:
     """Read a surface."""
     image = _load(path, GiftiImage)
-    found = [
+    array_groups = [
         image.get_arrays_from_intent(f"NIFTI_INTENT_{intent}")
         for intent in ("POINTSET", "TRIANGLE")
     ]
-    if any(len(arrays) != 1 for arrays in found):
+    if any(len(arrays) != 1 for arrays in array_groups):
         raise InputError(f"{path}: is no surface (points and triangles); give a .surf.gii file")
-    points, triangles = (arrays[0].data for arrays in found)
+    points, triangles = (arrays[0].data for arrays in array_groups)
     mesh = Mesh(
         points=np.asarray(points, dtype=np.float64),
         triangles=np.asarray(triangles, dtype=np.int64),
@@ -288,20 +288,21 @@ def structure_side(path: Path) -> str | None:
     return sides.pop() if len(sides) == 1 else None
 
 
-def _unreadable(path: Path, what: str, error: Exception) -> InputError:
+def _unreadable(path: Path, format_name: str, error: Exception) -> InputError:
     first = str(error).partition("\n")[0]
-    return InputError(f"{path}: not readable as {what} ({first}); write it again")
+    return InputError(f"{path}: not readable as {format_name} ({first}); write it again")
 
 
 def _load(path: Path, kind: type[Image]) -> Image:
-    what = "GIFTI" if kind is GiftiImage else "CIFTI"
+    format_name = "GIFTI" if kind is GiftiImage else "CIFTI"
     try:
         image = nib.load(path)
     except _DAMAGE as error:
-        raise _unreadable(path, what, error) from error
+        raise _unreadable(path, format_name, error) from error
     if not isinstance(image, kind):
         raise InputError(
-            f"{path}: is no {what} file; maps are .shape.gii, .func.gii, .dscalar.nii or .tsv files"
+            f"{path}: is no {format_name} file; maps are .shape.gii, .func.gii, .dscalar.nii or"
+            " .tsv files"
         )
     return image
 

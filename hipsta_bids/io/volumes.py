@@ -81,7 +81,7 @@ def _check_fits(
     image: Any,  # noqa: ANN401 (untyped)
     path: Path,
     voxels: int,
-    what: str,
+    content: str,
     *,
     beside: int = _BESIDE,
     remedy: str = "crop it to the hippocampus",
@@ -90,7 +90,8 @@ def _check_fits(
     need, share = voxels * _voxel_bytes(image, beside), READ_SHARE * _memory.get()
     if need > share:
         raise InputError(
-            f"{path}: reading {what} ({voxels / 1e6:.1f} million voxels) takes {need / 1e6:.0f} MB,"
+            f"{path}: reading {content} ({voxels / 1e6:.1f} million voxels) takes"
+            f" {need / 1e6:.0f} MB,"
             f" but {READ_SHARE:.0%} of a process' part of --mem is {share / 1e6:.0f} MB;"
             f" raise --mem, lower --n-procs, or {remedy}",
             reason="image-too-large",
@@ -130,9 +131,9 @@ class LabelImage:
 
 def moved(affine: Float, start: tuple[int, int, int]) -> Float:
     """Affine of a part of an image that begins at a voxel."""
-    own = affine.copy()
-    own[:3, 3] += affine[:3, :3] @ start
-    return own
+    shifted = affine.copy()
+    shifted[:3, 3] += affine[:3, :3] @ start
+    return shifted
 
 
 def read_labels(path: Path, margin: float = 0.0, part: Box | None = None) -> LabelImage:
@@ -170,8 +171,8 @@ def label_codes(path: Path) -> list[float]:
     """List the distinct values of an image of labels other than zero, in order."""
     with _opened(path) as image:
         shape = _label_shape(image, path)
-        found = [np.unique(slab[slab != 0]) for _, slab in _slabs(image, shape)]
-    return np.unique(np.concatenate(found)).tolist() if found else []
+        codes = [np.unique(slab[slab != 0]) for _, slab in _slabs(image, shape)]
+    return np.unique(np.concatenate(codes)).tolist() if codes else []
 
 
 def _label_shape(image: Any, path: Path) -> tuple[int, int, int]:  # noqa: ANN401 (untyped)
@@ -202,13 +203,13 @@ def _axes(image: Any) -> list[int]:  # noqa: ANN401 (untyped)
     return shape
 
 
-def _three_axes(image: Any, path: Path, what: str) -> tuple[int, int, int]:  # noqa: ANN401 (untyped)
+def _three_axes(image: Any, path: Path, requirement: str) -> tuple[int, int, int]:  # noqa: ANN401 (untyped)
     """Shape of an image without further axes of length one; refuse what has more than three."""
     shape = _axes(image)
     if len(shape) != _SPACE:
         text = " x ".join(map(str, image.shape))
         raise InputError(
-            f"{path}: has shape {text}, but {what} one 3-D volume; extract the volume",
+            f"{path}: has shape {text}, but {requirement} one 3-D volume; extract the volume",
             reason="not-3d",
         )
     return shape[0], shape[1], shape[2]
@@ -222,8 +223,8 @@ def _voxels(image: Any, shape: tuple[int, int, int], box: tuple[slice, ...]) -> 
 
 def _slabs(image: Any, shape: tuple[int, int, int]) -> Iterator[tuple[int, NDArray[Any]]]:  # noqa: ANN401 (untyped)
     """Read slab by slab along the last axis; yields where each begins."""
-    most = min(_SLAB, READ_SHARE / 4 * _memory.get() / _voxel_bytes(image, _BESIDE))
-    step = max(int(most // max(shape[0] * shape[1], 1)), 1)
+    slab_voxels = min(_SLAB, READ_SHARE / 4 * _memory.get() / _voxel_bytes(image, _BESIDE))
+    step = max(int(slab_voxels // max(shape[0] * shape[1], 1)), 1)
     for start in range(0, shape[2], step):
         stop = min(start + step, shape[2])
         yield (
@@ -342,9 +343,9 @@ def _check_scalar(image: Any, path: Path) -> None:  # noqa: ANN401 (nibabel's cl
     """Refuse voxels that are not one real number each, or a row of them."""
     kind = image.get_data_dtype()
     if kind.kind not in "iufb":
-        what = "complex numbers" if kind.kind == "c" else "colors"
+        kind_text = "complex numbers" if kind.kind == "c" else "colors"
         raise InputError(
-            f"{path}: its voxels are {what}, a map needs one number each; "
+            f"{path}: its voxels are {kind_text}, a map needs one number each; "
             "extract the magnitude or one channel",
             reason="not-scalar",
         )

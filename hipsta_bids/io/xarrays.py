@@ -63,13 +63,13 @@ class _Later(BackendArray):
         )
 
     def _take(self, key: tuple[Any, ...]) -> NDArray[Any]:
-        wanted = [np.arange(n)[part] for n, part in zip(self.shape, key, strict=True)]
-        lists = [np.atleast_1d(part) for part in wanted]
+        indices = [np.arange(n)[part] for n, part in zip(self.shape, key, strict=True)]
+        lists = [np.atleast_1d(part) for part in indices]
         outer, inner = lists[: self.count], np.ix_(*lists[self.count :])
-        found = np.full([len(part) for part in lists], self.missing, dtype=self.dtype)
+        result = np.full([len(part) for part in lists], self.missing, dtype=self.dtype)
         for place in np.ndindex(*(len(part) for part in outer)):
             index = tuple(int(part[i]) for part, i in zip(outer, place, strict=True))
             values = self.read(index)
             if values is not None:
-                found[place] = values[inner]
-        return found.reshape([part.size for part in wanted if part.ndim])
+                result[place] = values[inner]
+        return result.reshape([part.size for part in indices if part.ndim])

@@ -85,9 +85,9 @@ def _connect(cluster: Cluster, plan: WorkerPlan, stack: contextlib.ExitStack) ->
     # The scheduler that writes the file may just have been started.
     while "/" in address.replace("://", "") and not path.is_file() and time.monotonic() < end:
         time.sleep(_PAUSE)
-    given = {"scheduler_file": address} if path.is_file() else {"address": address}
+    arguments = {"scheduler_file": address} if path.is_file() else {"address": address}
     try:
-        return stack.enter_context(connect(**given, timeout=_ANSWER_TIME))
+        return stack.enter_context(connect(**arguments, timeout=_ANSWER_TIME))
     except (OSError, ValueError) as error:
         raise UsageError(
             f"--dask-scheduler {address}: no answer ({error}); give its address as"
@@ -157,9 +157,9 @@ def _work_off(client: Any, plan: WorkerPlan, jobs: Iterable[Any]) -> Generator[t
 
 
 def _result(future: Any) -> Any:  # noqa: ANN401  (Dask is optional)
-    lost = import_module("distributed").KilledWorker
+    killed_error = import_module("distributed").KilledWorker
     error = None if future.cancelled() else future.exception()
-    if future.cancelled() or isinstance(error, lost):
+    if future.cancelled() or isinstance(error, killed_error):
         return WorkerLost(timed_out=False, exit_code=None, seconds=0.0)
     if error is None:
         return future.result()

@@ -98,13 +98,15 @@ def recorded(job: Job) -> Outcome | None:
         status = Status(record.get("status", ""))
     except (InputError, ValueError):
         return None
-    same = record.get("version") == __version__ and record.get("settings_hash") == job.settings_hash
+    is_current = (
+        record.get("version") == __version__ and record.get("settings_hash") == job.settings_hash
+    )
     whole = status == Status.FAILED or (
         all(path.exists() for path in job.place.paths(optional=job.write_meshes))
         and is_complete(job.place, record)
         and has_spread(job.place, record, job.copies)
     )
-    if not (same and whole):
+    if not (is_current and whole):
         return None
     return Outcome(
         job=job,
@@ -132,7 +134,7 @@ def base_record(job: Job) -> dict[str, Any]:
     """Begin the quality record with what is known before any input is read."""
     item = job.item
     sources = dict(job.sources)
-    given = [
+    given_ends = [
         {"end": end.end, "point_ras_mm": end.point}
         | ({"normal_ras": end.normal} if end.normal else {})
         for end in item.ends
@@ -148,13 +150,13 @@ def base_record(job: Job) -> dict[str, Any]:
         "scheme": item.protocol.name,
         "region": job.settings.body.region,
         "scheme_title": item.protocol.title,
-        "chosen_because": item.why,
+        "chosen_because": item.explanation,
         "passed_over": [
             {"file": source_address(Path(path), sources), "reason": why}
             for path, why in item.passed_over
         ],
         "notes": item.notes,
-        **({"given_ends": given} if given else {}),
+        **({"given_ends": given_ends} if given_ends else {}),
     }
 
 
@@ -345,19 +347,19 @@ def _write_more(
         files.write_bytes(place.path(name), content)
     if spread is not None and spread.known:
         measured = spread.copies - spread.failed
-        own = {name: np.isfinite(values) for name, values in maps.maps.items()}
-        sd = {name: np.where(own[name], sds, np.nan) for name, sds in spread.maps.items()}
+        finite = {name: np.isfinite(values) for name, values in maps.maps.items()}
+        sd = {name: np.where(finite[name], sds, np.nan) for name, sds in spread.maps.items()}
         hemisphere.write_spread(place, sd, spread.summary, measured)
 
 
 def has_spread(place: ResultPlace, record: Mapping[str, Any], copies: int) -> bool:
     """Return whether the files of a record's uncertainty exist, and are of as many copies."""
     metrics = record.get("metrics") or {}
-    made = metrics.get("uncertainty_copies", 0)
-    if not made or metrics.get("uncertainty_thickness_mm") is None:
-        return made == copies or not copies
+    measured_copies = metrics.get("uncertainty_copies", 0)
+    if not measured_copies or metrics.get("uncertainty_thickness_mm") is None:
+        return measured_copies == copies or not copies
     keys = ("uncertainty", "summaryuncertainty", "thickness_sd")
-    return copies in {0, made} and all(place.path(key).exists() for key in keys)
+    return copies in {0, measured_copies} and all(place.path(key).exists() for key in keys)
 
 
 def fail(
@@ -399,5 +401,5 @@ def _explain(error: Exception, root: Path) -> HipstaError:
         )
     if isinstance(error, OSError) and files.is_disk_full(error):
         return files.output_error(Path(error.filename) if error.filename else root, error)
-    what = " ".join(f"{type(error).__name__}: {error}".split())
-    return HipstaError(f"internal error ({what}); please report it with the log", reason=INTERNAL)
+    text = " ".join(f"{type(error).__name__}: {error}".split())
+    return HipstaError(f"internal error ({text}); please report it with the log", reason=INTERNAL)

@@ -75,7 +75,7 @@ def _cells(values: Float, digits: int = 7) -> list[str]:
     return [f"{v:.{digits}g}" if np.isfinite(v) else files.MISSING for v in values.tolist()]
 
 
-def _write_regions(place: ResultPlace, regions: Regions, found: RegionStatistics) -> None:
+def _write_regions(place: ResultPlace, regions: Regions, statistics: RegionStatistics) -> None:
     """Write one row per region, and the sidecar."""
     definitions: dict[str, dict[str, object]] = {
         "region": {"Description": "region, as the user named it"},
@@ -85,14 +85,14 @@ def _write_regions(place: ResultPlace, regions: Regions, found: RegionStatistics
     }
     columns: dict[str, list[str]] = {
         "region": list(regions.names),
-        "n_points": _cells(found.n_points),
-        "n_valid": _cells(found.n_valid),
-        "area": hemisphere.format_column(found.area, _REGION_DIGITS),
+        "n_points": _cells(statistics.n_points),
+        "n_valid": _cells(statistics.n_valid),
+        "area": hemisphere.format_column(statistics.area, _REGION_DIGITS),
     }
     parts = (
-        ("mean", "mean of {} over valid points", found.mean),
-        ("sd", "standard deviation of {} over valid points", found.sd),
-        ("mode", "most frequent value of {} at valid points", found.mode),
+        ("mean", "mean of {} over valid points", statistics.mean),
+        ("sd", "standard deviation of {} over valid points", statistics.sd),
+        ("mode", "most frequent value of {} at valid points", statistics.mode),
     )
     for suffix, text, values in parts:
         for name, column in values.items():
@@ -137,7 +137,7 @@ def add_signals(
     item: HemisphereInput, maps: HemisphereMaps, settings: MapSettings, sources: Mapping[str, Path]
 ) -> tuple[HemisphereMaps, Mapped]:
     """Sample a hemisphere's volumes on its sheet, and read the regions."""
-    done = []
+    sampled_maps = []
     flags = []
     entries: list[dict[str, Any]] = []
     for source in item.maps:
@@ -157,7 +157,7 @@ def add_signals(
             flags.append(Flag(reason="map-unusable", message=f"map {source.name}: {error}"))
             entry["problem"] = str(error)
             continue
-        done.append((source, sampled))
+        sampled_maps.append((source, sampled))
         entry |= {
             "volumes": sampled.values.shape[2],
             "outside": sampled.outside,
@@ -178,7 +178,7 @@ def add_signals(
         except InputError as error:
             flags.append(Flag(reason="roi-unusable", message=f"regions: {error}"))
     record = {"maps": entries, "regions": str(item.regions) if item.regions else None}
-    mapped = Mapped(maps=tuple(done), regions=regions, record=record)
+    mapped = Mapped(maps=tuple(sampled_maps), regions=regions, record=record)
     return replace(maps, flags=(*maps.flags, *flags)), mapped
 
 
@@ -195,8 +195,8 @@ def _sample(
         interpolation=source.interpolation,
     )
     # Rims and holes of a sheet with a head have positions, but no values.
-    known = np.isfinite(maps.thickness)[:, :, None]
-    return replace(sampled, values=np.where(known, sampled.values, np.nan))
+    measured = np.isfinite(maps.thickness)[:, :, None]
+    return replace(sampled, values=np.where(measured, sampled.values, np.nan))
 
 
 def write_signals(place: ResultPlace, maps: HemisphereMaps, mapped: Mapped) -> None:
@@ -211,15 +211,15 @@ def write_signals(place: ResultPlace, maps: HemisphereMaps, mapped: Mapped) -> N
         kind = numbers if source.interpolation == "linear" else labels
         kind |= {name: sampled.values[:, :, k] for k, name in enumerate(columns)}
     if mapped.regions is not None:
-        found = summarize_regions(mapped.regions, maps.sheet, numbers, labels)
-        _write_regions(place, mapped.regions, found)
+        statistics = summarize_regions(mapped.regions, maps.sheet, numbers, labels)
+        _write_regions(place, mapped.regions, statistics)
 
 
 def is_complete(place: ResultPlace, record: Mapping[str, Any]) -> bool:
     """Return whether the files of maps and regions that a record names exist."""
     maps = [entry for entry in record.get("maps") or () if "outside" in entry]
-    wanted = [place.path("map_table", entry["name"]) for entry in maps]
+    paths = [place.path("map_table", entry["name"]) for entry in maps]
     usable = not any(f.get("reason") == "roi-unusable" for f in record.get("flags") or ())
     if record.get("regions") and usable:
-        wanted.append(place.path("roi"))
-    return all(path.exists() for path in wanted)
+        paths.append(place.path("roi"))
+    return all(path.exists() for path in paths)

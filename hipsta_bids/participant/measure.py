@@ -211,7 +211,7 @@ def _of_repair(repair: Repair) -> Finding:
         reason="large-repair",
         value=repair.excess,
         limit=1.0,
-        what=str(repair),
+        text=str(repair),
         remedy="a large repair, look at the labels there",
         points=repair.points,
         placed=True,
@@ -220,13 +220,13 @@ def _of_repair(repair: Repair) -> Finding:
 
 def _whole(row: tuple[str, float, float, str, str, Float | float]) -> Finding:
     """Make a finding about the sheet as a whole, from the columns concerned or their share."""
-    reason, value, limit, what, remedy, where = row
+    reason, value, limit, text, remedy, location = row
     finding = Finding(
-        reason=reason, value=value, limit=limit, what=what, remedy=remedy, placed=True
+        reason=reason, value=value, limit=limit, text=text, remedy=remedy, placed=True
     )
-    if isinstance(where, float):
-        return replace(finding, share=where)
-    return replace(finding, points=where[np.isfinite(where).all(axis=-1)])
+    if isinstance(location, float):
+        return replace(finding, share=location)
+    return replace(finding, points=location[np.isfinite(location).all(axis=-1)])
 
 
 def quality_metrics(evidence: Evidence) -> dict[str, Any]:
@@ -379,10 +379,12 @@ def measure_hemisphere(
         )
     if region in EXPERIMENTAL:
         check_fine(volume)
-        only = settings.changed(body={"region": "body"})
-        body = unfold(volume, hemi, only, clock)
-        own = Own(body.body, body.mesh, body.coordinates, _flags(body, _find(volume, hemi, body)))
-        return measure_whole(volume, hemi, settings, clock, own)
+        body_settings = settings.changed(body={"region": "body"})
+        body = unfold(volume, hemi, body_settings, clock)
+        body_alone = Own(
+            body.body, body.mesh, body.coordinates, _flags(body, _find(volume, hemi, body))
+        )
+        return measure_whole(volume, hemi, settings, clock, body_alone)
     evidence = unfold(volume, hemi, settings, clock)
     sheet = evidence.sheet
     with clock("measures"):
@@ -402,7 +404,7 @@ def measure_hemisphere(
             summary=summarize(evidence, for_region(volume.protocol, region).sheet),
             qc={**quality_metrics(evidence), "flag_margins": flag_margins(findings)},
             repairs=(
-                *(f"{finding.what}{consequence_text(finding)}" for finding in repairs),
+                *(f"{finding.text}{consequence_text(finding)}" for finding in repairs),
                 *describe_uncus(evidence.body, settings.checks),
             ),
             flags=_flags(evidence, findings),

@@ -37,7 +37,7 @@ class Pages:
 
     problems: list[str] = field(default_factory=list)
     """A line per page that could not be made."""
-    wanted: bool = True
+    enabled: bool = True
     """False where nothing can be written."""
 
 
@@ -106,13 +106,13 @@ def write_reports(plan: PagePlan, visits: Iterable[VisitKey]) -> Iterator[Proble
         warm_up=warm_up,
     )
     if plan.cluster is None or not jobs:
-        found = run_jobs(workers, jobs)
+        answers = run_jobs(workers, jobs)
     else:
-        found = run_on_cluster(plan.cluster, workers, jobs)
+        answers = run_on_cluster(plan.cluster, workers, jobs)
     tell("pages", 0, len(jobs))
-    with contextlib.closing(found) as pages:
-        for done, (job, answer) in enumerate(pages, start=1):
-            tell("pages", done, len(jobs))
+    with contextlib.closing(answers) as pages:
+        for count, (job, answer) in enumerate(pages, start=1):
+            tell("pages", count, len(jobs))
             problem = answer
             if isinstance(answer, WorkerLost):
                 cause = "took too long" if answer.timed_out else f"process died: {answer.cause}"
@@ -133,7 +133,7 @@ def reports_after(plan: PagePlan, visits: Sequence[VisitKey]) -> Generator[Pages
     except Exception:
         _try_all(plan, visits, pages.problems)
         raise
-    if pages.wanted:
+    if pages.enabled:
         _try_all(plan, visits, pages.problems)
 
 
@@ -159,9 +159,9 @@ def _try_all(plan: PagePlan, visits: Sequence[VisitKey], problems: list[str]) ->
 def _is_newer(page: Path, root: Path, *patterns: str) -> bool:
     """Return whether a page is newer than all records of some patterns."""
     try:
-        made = page.stat().st_mtime_ns
+        page_time = page.stat().st_mtime_ns
         records = [path for pattern in patterns for path in root.glob(pattern)]
-        return all(made >= path.stat().st_mtime_ns for path in records)
+        return all(page_time >= path.stat().st_mtime_ns for path in records)
     except OSError:
         return False
 

@@ -249,13 +249,13 @@ def _start(plan: WorkerPlan) -> _Slot:
         # Once for all workers. An error shows again in them, and in the log.
         with contextlib.suppress(Exception):
             plan.warm_up()
-    ours, theirs = context.Pipe()
+    parent_end, child_end = context.Pipe()
     # Not daemonic: stages may start helper processes of their own.
-    process = context.Process(target=_serve, args=(theirs, plan, os.getpid()), daemon=False)
+    process = context.Process(target=_serve, args=(child_end, plan, os.getpid()), daemon=False)
     with _inherited(plan):
         process.start()
-    theirs.close()
-    return _Slot(process=process, connection=ours)
+    child_end.close()
+    return _Slot(process=process, connection=parent_end)
 
 
 def _context() -> Any:  # noqa: ANN401  (the contexts have no common type that can start processes)
@@ -273,14 +273,14 @@ def _inherited(plan: WorkerPlan) -> Iterator[None]:
     The terminal sends Ctrl-C to every process; it is this one that stops the workers. Here it is
     only put off until the process is started.
     """
-    wanted = dict.fromkeys(THREAD_VARIABLES, "1") | dict(plan.environment)
-    before = {name: os.environ.get(name) for name in wanted}
+    variables = dict.fromkeys(THREAD_VARIABLES, "1") | dict(plan.environment)
+    before = {name: os.environ.get(name) for name in variables}
     caught: list[tuple[int, FrameType | None]] = []
     in_main = threading.current_thread() is threading.main_thread()
     # An exception would get lost within a fork; the mask is what the new process inherits.
     handler = signal.signal(signal.SIGINT, lambda *event: caught.append(event)) if in_main else None
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    os.environ.update(wanted)
+    os.environ.update(variables)
     try:
         yield
     finally:

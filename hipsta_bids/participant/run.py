@@ -67,11 +67,11 @@ class StatusTable:
 
     def __init__(self, root: Path, shard: str | None = None) -> None:
         self._root, self._shard = root, shard
-        own = {row_key(row): row for row in read_table(root / table_path(shard))}
+        shard_rows = {row_key(row): row for row in read_table(root / table_path(shard))}
         # The table of the whole dataset takes up those of its parts.
-        rows = own.values() if shard else read_status(root)
+        rows = shard_rows.values() if shard else read_status(root)
         self._known = {row_key(row): row for row in rows}
-        self._pending = {key: row for key, row in self._known.items() if row != own.get(key)}
+        self._pending = {key: row for key, row in self._known.items() if row != shard_rows.get(key)}
         self._next_write = 0.0
 
     def expect(self, jobs: Sequence[Job]) -> None:
@@ -83,8 +83,10 @@ class StatusTable:
     def add(self, outcome: Outcome) -> None:
         """Take in one outcome."""
         row = status_row(outcome)
-        known = self._known.get(row_key(row), {})
-        if outcome.seconds is None and all(known.get(cell) == row[cell] for cell in RECORDED):
+        recorded_row = self._known.get(row_key(row), {})
+        if outcome.seconds is None and all(
+            recorded_row.get(cell) == row[cell] for cell in RECORDED
+        ):
             return
         self._pending[row_key(row)] = row
         try:
@@ -337,19 +339,19 @@ def _run(
         with (
             _pages_after(jobs, out_dir, options, log) as pages,
             contextlib.closing(table),
-            contextlib.closing(outcomes_of(jobs, table, options, log)) as found,
+            contextlib.closing(outcomes_of(jobs, table, options, log)) as results,
         ):
-            for outcome in found:
+            for outcome in results:
                 _log(outcome)
                 table.add(outcome)
                 outcomes.append(outcome)
                 report(outcome)
                 if isinstance(outcome.error, OutputError):
-                    pages.wanted = False
+                    pages.enabled = False
                     break  # the next one would fail just so
                 if options.stop_on_first_crash and outcome.status == Status.FAILED:
                     break
-            if pages.wanted and shard is None:
+            if pages.enabled and shard is None:
                 table.close()
                 copies += _find_copies(jobs, out_dir)
         result = RunResult(
@@ -365,9 +367,9 @@ def _run(
 
 def _find_copies(jobs: Sequence[Job], out_dir: Path) -> Iterator[str]:
     """Mark hemispheres with the same labels in the table, and describe those of this run."""
-    own = {job.place.name for job in jobs}
+    names_of_jobs = {job.place.name for job in jobs}
     for names in mark_copies(out_dir):
-        if own.intersection(names):
+        if names_of_jobs.intersection(names):
             line = describe_copies(names)
             _LOGGER.warning("%s", line)
             yield line
@@ -381,12 +383,14 @@ def _prepare(
     origins += [(edit.source, edit.source_path) for item in items for edit in item.edits]
     origins += [("bids", m.source_path) for item in items for m in item.maps if m.source_path]
     sources = dataset.source_names(origins)
-    both = [p for item in items for p in (item.protocol, item.parts_protocol) if p is not None]
-    protocols = {protocol.name: protocol for protocol in both}
+    used_protocols = [
+        p for item in items for p in (item.protocol, item.parts_protocol) if p is not None
+    ]
+    protocols = {protocol.name: protocol for protocol in used_protocols}
     dataset.check_own_dataset(out_dir)
     files.check_writable(out_dir)
-    with locked(out_dir, DATASET) as alone:
-        if alone:
+    with locked(out_dir, DATASET) as is_only_run:
+        if is_only_run:
             files.remove_leftovers(out_dir, "*")
         digest = dataset.settle_settings(out_dir, settings)
         dataset.write_description(out_dir, sources)

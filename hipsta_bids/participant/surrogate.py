@@ -122,10 +122,10 @@ def _rows(profile: SurrogateProfile, mesh: Float) -> Iterator[list[str]]:
 
 def _line(profile: SurrogateProfile, mesh: Float) -> str:
     line = f"slice at {profile.position:.0%}: mean thickness {profile.thickness.mean():.3f} mm"
-    found = agreement(profile.thickness, mesh)
-    if not found.count:
+    comparison = agreement(profile.thickness, mesh)
+    if not comparison.count:
         return f"{line} (no sheet to compare with)"
     return (
-        f"{line}, {found.difference:+.3f} mm to the sheet, r {found.correlation:.2f},"
-        f" slope {found.slope:.2f} at {found.count} points"
+        f"{line}, {comparison.difference:+.3f} mm to the sheet, r {comparison.correlation:.2f},"
+        f" slope {comparison.slope:.2f} at {comparison.count} points"
     )

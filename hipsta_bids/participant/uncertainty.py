@@ -90,19 +90,19 @@ def estimate_uncertainty(
     The same labels always give the same copies, and the first ones do not depend on how many there
     are.
     """
-    found: list[tuple[Mapping[str, Float], Mapping[str, float]]] = []
+    measured: list[tuple[Mapping[str, Float], Mapping[str, float]]] = []
     for number in range(copies):
         try:
             copy = perturb(volume, settings.uncertainty, number)
-            found.append(_measure(copy, hemi, settings))
+            measured.append(_measure(copy, hemi, settings))
         except GeometryError:
             continue
-    enough = found if len(found) >= max(LEAST, copies / 2) else []
+    sufficient = measured if len(measured) >= max(LEAST, copies / 2) else []
     return Uncertainty(
         copies=copies,
-        failed=copies - len(found),
-        maps=_spread([maps for maps, _ in enough]),
-        summary={k: float(v) for k, v in _spread([one for _, one in enough]).items()},
+        failed=copies - len(measured),
+        maps=_spread([maps for maps, _ in sufficient]),
+        summary={k: float(v) for k, v in _spread([summary for _, summary in sufficient]).items()},
     )
 
 
@@ -151,16 +151,16 @@ def perturb(volume: LabelVolume, settings: UncertaintySettings, number: int) -> 
     for axis in range(3):
         noise = _smooth_noise(shape, settings.correlation, generator)
         places[axis] += spread * noise[near]
-    found = np.zeros(np.prod(shape), dtype=np.int64)
-    found[near] = _likeliest(codes, places)
-    found = found.reshape(shape)
+    sampled = np.zeros(np.prod(shape), dtype=np.int64)
+    sampled[near] = _likeliest(codes, places)
+    sampled = sampled.reshape(shape)
     mask = volume.edited_mask
     return LabelVolume(
-        tissue=(found % _PART).astype(np.uint8),
-        part=(found % _MASK // _PART).astype(np.uint8),
+        tissue=(sampled % _PART).astype(np.uint8),
+        part=(sampled % _MASK // _PART).astype(np.uint8),
         affine=affine,
         protocol=volume.protocol,
-        edited_mask=None if mask is None else EditedMask(inside=found >= _MASK, voxel=mask.voxel),
+        edited_mask=None if mask is None else EditedMask(inside=sampled >= _MASK, voxel=mask.voxel),
         given_ends=volume.given_ends,
     )
 
@@ -170,9 +170,9 @@ def _cropped(volume: LabelVolume) -> LabelVolume:
     labeled = _encode(volume) > 0
     if not labeled.any():
         return volume
-    where = np.argwhere(labeled)
-    low = np.maximum(where.min(axis=0) - 2, 0)
-    around = box(low, where.max(axis=0) + 3)
+    indices = np.argwhere(labeled)
+    low = np.maximum(indices.min(axis=0) - 2, 0)
+    around = box(low, indices.max(axis=0) + 3)
     mask = volume.edited_mask
     return replace(
         volume,
@@ -259,7 +259,7 @@ def _likeliest(codes: _Codes, places: Float) -> _Codes:
     last = np.array(padded.shape)[:, None] - 2
     places = np.clip(places + 2, 0, last - 1e-6)
     nearest = tuple(np.rint(places).astype(np.int64))
-    found: _Codes = padded[nearest]
+    likeliest: _Codes = padded[nearest]
     # Most voxels lie among voxels of one label only.
     low, high = (f(padded, 3, mode="nearest") for f in (minimum_filter, maximum_filter))
     mixed = np.flatnonzero((low != high)[nearest])
@@ -271,5 +271,5 @@ def _likeliest(codes: _Codes, places: Float) -> _Codes:
         [np.where(offset[:, None] == 1, share, 1 - share).prod(axis=0) for offset in offsets]
     )
     votes = np.array([(weights * (kinds == kind)).sum(axis=0) for kind in kinds])
-    found[mixed] = kinds[votes.argmax(axis=0), np.arange(len(mixed))]
-    return found
+    likeliest[mixed] = kinds[votes.argmax(axis=0), np.arange(len(mixed))]
+    return likeliest

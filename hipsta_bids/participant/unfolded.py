@@ -66,8 +66,8 @@ class Correspondence:
 
     def to_vertices(self, values: Float) -> Float:
         """Interpolate a map (Nx, Ny) at the vertices (V,); NaN beside NaN and beyond the nodes."""
-        known = np.isfinite(self.nodes).all(axis=-1)
-        sample = LinearNDInterpolator(self.nodes[known], values[known])
+        finite = np.isfinite(self.nodes).all(axis=-1)
+        sample = LinearNDInterpolator(self.nodes[finite], values[finite])
         return np.asarray(sample(self.places), dtype=np.float64)
 
     def to_nodes(self, values: Float) -> Float:
@@ -97,21 +97,22 @@ def resample(
         raise UsageError(f"{out}: results end with {ends} or {TABLE}")
     if out.resolve() in {path.resolve() for path in (*paths, *surfaces)}:
         raise UsageError(f"{out}: is an input; choose another name")
-    known = {_hemi(path): _unfolded(path) for path in surfaces}
-    across = {one.hemi: one.values for path in sheets for one in _read(path, column)}
+    surface_of = {_hemi(path): _unfolded(path) for path in surfaces}
+    positions_of = {side.hemi: side.values for path in sheets for side in _read(path, column)}
     x, y, _ = sheet_levels(settings, "whole")
     nodes = len(x), len(y)
     moved: dict[str, SheetMap] = {}
     vertices = False
-    for one in (one for path in paths for one in _read(path, column)):
-        if one.hemi in moved:
-            raise _several(f"{moved[one.hemi].path} and {one.path}: both are of side {one.hemi}")
-        flat = known.get(one.hemi, known.get(None))
+    for side in (side for path in paths for side in _read(path, column)):
+        if side.hemi in moved:
+            raise _several(f"{moved[side.hemi].path} and {side.path}: both are of side {side.hemi}")
+        flat = surface_of.get(side.hemi, surface_of.get(None))
         if flat is None:
             raise InputError(
-                f"{one.path}: there is no unfolded surface of side {one.hemi}; add it to --surface"
+                f"{side.path}: there is no unfolded surface of side {side.hemi}; add it to"
+                " --surface"
             )
-        places = across.get(one.hemi)
+        places = positions_of.get(side.hemi)
         if places is not None and (
             places.size != nodes[0] * nodes[1] or np.nanmax(np.abs(places)) > _LARGEST
         ):
@@ -120,36 +121,36 @@ def resample(
                 " sheet's desc-proximodistal map, or the --settings of the results"
             )
         between = Correspondence(flat, settings, None if places is None else places.reshape(nodes))
-        ours = len(one.values) == nodes[0] * nodes[1] and one.nodes in (None, nodes)
-        if not ours and len(one.values) != len(flat.points):
+        on_nodes = len(side.values) == nodes[0] * nodes[1] and side.nodes in (None, nodes)
+        if not on_nodes and len(side.values) != len(flat.points):
             raise InputError(
-                f"{one.path}: has {len(one.values)} points, the whole sheet {nodes[0]} x"
+                f"{side.path}: has {len(side.values)} points, the whole sheet {nodes[0]} x"
                 f" {nodes[1]}, and the surface {len(flat.points)}; give the surface of its density,"
                 " or the --settings of the results"
             )
-        if moved and ours != vertices:
-            raise _several(f"{one.path}: is not on the same points as {paths[0]}")
-        vertices = ours
-        if ours:
-            values = between.to_vertices(one.values.reshape(nodes))
+        if moved and on_nodes != vertices:
+            raise _several(f"{side.path}: is not on the same points as {paths[0]}")
+        vertices = on_nodes
+        if on_nodes:
+            values = between.to_vertices(side.values.reshape(nodes))
         else:
-            values = between.to_nodes(one.values)
-        moved[one.hemi] = replace(one, values=values)
+            values = between.to_nodes(side.values)
+        moved[side.hemi] = replace(side, values=values)
     _write(out, moved, to_nodes=not vertices)
-    missing = np.mean(np.isnan(np.concatenate([one.values.ravel() for one in moved.values()])))
-    where = "vertices of HippUnfold" if vertices else "nodes of the whole sheet"
-    points_each = ", ".join(f"{one.values.size} {hemi}" for hemi, one in moved.items())
-    return f"{out}: {points_each} {where}, {missing:.0%} without a value"
+    missing = np.mean(np.isnan(np.concatenate([side.values.ravel() for side in moved.values()])))
+    points = "vertices of HippUnfold" if vertices else "nodes of the whole sheet"
+    points_each = ", ".join(f"{side.values.size} {hemi}" for hemi, side in moved.items())
+    return f"{out}: {points_each} {points}, {missing:.0%} without a value"
 
 
 def _write(out: Path, maps: Mapping[str, SheetMap], *, to_nodes: bool) -> None:
-    first, *others = maps.values()
+    first, *further_maps = maps.values()
     flat = {hemi: one.values.ravel() for hemi, one in maps.items()}
     if out.name.endswith(DENSE_SCALARS):
         sides = {hemi: flat[hemi][None] for hemi in sorted(flat)}
         files.write_bytes(out, gifti.cifti_bytes(sides, [first.name]))
         return
-    if others:
+    if further_maps:
         raise UsageError(f"{out}: holds one side; name a {DENSE_SCALARS} file for both")
     if out.suffix != TABLE:
         content = gifti.shape_bytes(
@@ -181,20 +182,20 @@ def _read(path: Path, column: str) -> list[SheetMap]:
             reason="unknown-hemisphere",
         )
     units = {row.name: row.unit for row in MAPS}
-    found = []
+    maps = []
     for hemi in hemis:
-        one = gifti.read_map(path, column, hemi)
-        found.append(
+        side = gifti.read_map(path, column, hemi)
+        maps.append(
             SheetMap(
-                values=one.values,
-                unit=units.get(one.name, one.unit),
-                nodes=one.nodes,
-                name=one.name or pairs["suffix"],
+                values=side.values,
+                unit=units.get(side.name, side.unit),
+                nodes=side.nodes,
+                name=side.name or pairs["suffix"],
                 hemi=hemi,
                 path=path,
             )
         )
-    return found
+    return maps
 
 
 def _hemi(path: Path) -> str | None:

@@ -94,7 +94,7 @@ MAX_LENGTH = 8.0
 """Lines from the mid-surface to a wall that are longer than this are lost, mm."""
 _FAR = 500.0
 """End planes moved by this far have all of the hippocampus between them, mm."""
-_SAME = 0.005
+_TOLERANCE = 0.005
 """mm; voxel edges that differ by less are the same."""
 _RIM = 0.9999
 """Beside the edges themselves, where rounding does not choose the triangle."""
@@ -110,20 +110,20 @@ class Own(NamedTuple):
 
 
 def measure_whole(
-    volume: LabelVolume, hemi: str, settings: Settings, clock: Clock, own: Own
+    volume: LabelVolume, hemi: str, settings: Settings, clock: Clock, body_alone: Own
 ) -> HemisphereMaps:
     """Measure head, body and, unless the region is ``headbody``, tail on one sheet.
 
-    ``own`` is the body measured alone. The other arguments, result and errors are those of
+    ``body_alone`` is the body measured alone. The other arguments, result and errors are those of
     `measure_hemisphere`.
     """
     region = settings.body.region
     with clock("body"):
-        side = check_side(own.body, hemi)
-        tissue = whole_tissue(volume, own.body.tissue)
-        ends = own.body.ends
+        side = check_side(body_alone.body, hemi)
+        tissue = whole_tissue(volume, body_alone.body.tissue)
+        ends = body_alone.body.ends
         far = ends.beyond(_FAR)
-        body = replace(own.body, tissue=tissue, inside=tissue > 0, region=region, ends=far)
+        body = replace(body_alone.body, tissue=tissue, inside=tissue > 0, region=region, ends=far)
     with clock("surface"):
         solid = partial(whole_surface, tissue > 0, volume.affine, settings.grid.spacing)
         surface, field, grid = solid(settings.surface)
@@ -141,7 +141,7 @@ def measure_whole(
         edges = _edges(disk, body, volume, ends.height, region)
         axes = sheet_levels(settings.sheet, region)
         limits = float(axes[1][0]), float(axes[1][-1])
-        within = _in_body(disk, own)
+        within = _in_body(disk, body_alone)
         plane = map_to_rectangle(disk, edges, within, settings.sheet.y_extent, limits)
     with clock("sheet"):
         lines_of = Lines(mesh, laplace.gradient(u))
@@ -160,8 +160,8 @@ def measure_whole(
             whole=whole,
             settings=settings,
         )
-        everywhere = measure_maps(measured)
-        maps = {k: np.where(sheet.valid, v, np.nan) for k, v in everywhere.items()}
+        all_maps = measure_maps(measured)
+        maps = {k: np.where(sheet.valid, v, np.nan) for k, v in all_maps.items()}
         maps["distortion"] = _distortion(sheet)
         maps["proximodistal"] = at_nodes(disk, plane, proximodistal(disk, edges), *axes[:2])
         folded = flipped_area(disk, plane)
@@ -173,7 +173,7 @@ def measure_whole(
             sheet=sheet,
             layers=sheet,
             maps=maps,
-            profiles=average_profiles(everywhere, sheet),
+            profiles=average_profiles(all_maps, sheet),
             sections=measure_sections(measured),
             subfield=subfield,
             repaired=np.zeros(subfield.shape, dtype=bool),
@@ -201,7 +201,7 @@ def measure_whole(
             },
             flags=(
                 *raise_flags(findings, sheet, lambda at: name_place(at, body)),
-                *(replace(f, message=f"the body alone: {f.message}") for f in own.flags),
+                *(replace(f, message=f"the body alone: {f.message}") for f in body_alone.flags),
             ),
             mesh=mesh,
             coordinates=Coordinates(values=np.column_stack([np.full((len(u), 2), np.nan), u])),
@@ -211,7 +211,7 @@ def measure_whole(
 def check_fine(volume: LabelVolume) -> None:
     """Refuse voxels in which head and tail cannot be measured."""
     longest = float(np.linalg.norm(volume.affine[:3, :3], axis=0).max())
-    if longest > MAX_VOXEL + _SAME:
+    if longest > MAX_VOXEL + _TOLERANCE:
         raise GeometryError(
             f"voxels of {longest:.2f} mm: head and tail need {MAX_VOXEL:g} mm or less along every "
             "edge; measure the body, or use a finer segmentation",
@@ -258,17 +258,17 @@ def _edges(
     return edges
 
 
-def _in_body(disk: Disk, own: Own) -> Float:
+def _in_body(disk: Disk, body_alone: Own) -> Float:
     """Coordinates (V, 2), x and y, of a disk's vertices in the body's own sheet; NaN outside.
 
     The body goes on beyond its end planes. One vertex there belongs to it, so that the rows at the
     planes lie between known values.
     """
-    found = coordinates_at(own.mesh, own.coordinates, disk.vertices)[:, :2]
-    inside = np.asarray((np.abs(found) <= 1).all(axis=1))
+    coordinates = coordinates_at(body_alone.mesh, body_alone.coordinates, disk.vertices)[:, :2]
+    inside = np.asarray((np.abs(coordinates) <= 1).all(axis=1))
     edges = unique_edges(disk.triangles)
     inside[edges[inside[edges].any(axis=1)]] = True
-    return np.where(inside[:, None] & (np.abs(found[:, :1]) <= 1), found, np.nan)
+    return np.where(inside[:, None] & (np.abs(coordinates[:, :1]) <= 1), coordinates, np.nan)
 
 
 def _length(disk: Disk, arc: Int) -> float:
@@ -287,12 +287,12 @@ def _sample(
     triangle, weights = locate_nodes(disk, plane, x, y)
     corner = disk.triangles[triangle]
     middle = np.einsum("xyk,xykd->xyd", weights, disk.vertices[corner])
-    known = (triangle >= 0) & (disk.cell[triangle] >= 0)
-    cells = disk.cell[triangle[known]]
-    columns, arrived = lines.columns(cells, middle[known], len(z), MAX_LENGTH)
+    on_sheet = (triangle >= 0) & (disk.cell[triangle] >= 0)
+    cells = disk.cell[triangle[on_sheet]]
+    columns, arrived = lines.columns(cells, middle[on_sheet], len(z), MAX_LENGTH)
     columns[~arrived] = np.nan
     points = np.full((len(x), len(y), len(z), 3), np.nan)
-    points[known] = columns
+    points[on_sheet] = columns
     thickness = np.linalg.norm(np.diff(points, axis=2), axis=3).sum(axis=2)
     far = np.einsum("xyk,xyk->xy", weights, disk.from_edges[corner]) > margin * np.fmax(
         thickness, 1.0
@@ -312,34 +312,34 @@ def _lost_clefts(
 
     ``head`` (Ny,) tells its rows.
     """
-    thickness, found = measure_thickness(sheet), []
+    thickness, findings = measure_thickness(sheet), []
     thick = thickness > THICK * np.median(thickness[sheet.valid])
     without = ~sheet.valid
     for banks in find_touching_banks(surface, faces):
         if banks.area > FLAG_TOUCHING:
             beside = thick & columns_near(sheet, banks.points, THICK_NEAR)
             columns = sheet.valid & (beside | columns_near(sheet, banks.points, MARGIN))
-            what = f"two banks of a fold touch over {banks.area:.0f} mm2: the cleft between them"
-            what += f" on the {banks.side} side is not in the labels"
-            found.append(_lost(what, banks.area, FLAG_TOUCHING, banks.points, columns))
+            text = f"two banks of a fold touch over {banks.area:.0f} mm2: the cleft between them"
+            text += f" on the {banks.side} side is not in the labels"
+            findings.append(_cleft_finding(text, banks.area, FLAG_TOUCHING, banks.points, columns))
             without |= columns
     sheet = replace(sheet, valid=~without)
     for columns, area in find_ridges(sheet, np.broadcast_to(head, without.shape)):
         if area > FLAG_RIDGE:
-            what = f"a ridge of {area:.0f} mm2 in the head is thicker than what lies round it: the"
-            what += " cleft of a low fold may not be in the labels"
+            text = f"a ridge of {area:.0f} mm2 in the head is thicker than what lies round it: the"
+            text += " cleft of a low fold may not be in the labels"
             middle = sheet.points[columns, sheet.middle]
-            found.append(_lost(what, area, FLAG_RIDGE, middle, columns))
+            findings.append(_cleft_finding(text, area, FLAG_RIDGE, middle, columns))
             without |= columns
-    return replace(sheet, valid=~without), found
+    return replace(sheet, valid=~without), findings
 
 
-def _lost(what: str, area: float, limit: float, points: Float, columns: Bool) -> Finding:
+def _cleft_finding(text: str, area: float, limit: float, points: Float, columns: Bool) -> Finding:
     return Finding(
         reason="fused-digitation",
         value=area if columns.any() else 0.0,
         limit=limit,
-        what=what,
+        text=text,
         remedy="correct the labels there; the sheet has no values there",
         points=points,
         share=float(columns.mean()),
@@ -354,12 +354,12 @@ def _distortion(sheet: Sheet) -> Float:
 
 def _findings(disk: Disk, edges: Edges, folded: float, masked: float, region: str) -> list[Finding]:
     """List what was found on the whole sheet, within its limit or not."""
-    found = [
+    findings = [
         Finding(
             reason="whole-hole",
             value=length,
             limit=FLAG_HOLE,
-            what=f"the sheet has a hole with a perimeter of {length:.0f} mm",
+            text=f"the sheet has a hole with a perimeter of {length:.0f} mm",
             remedy="look at the labels there; it has no values",
             points=center[None],
         )
@@ -369,23 +369,23 @@ def _findings(disk: Disk, edges: Edges, folded: float, masked: float, region: st
     for end in ends:
         arc = getattr(edges, end)
         length = _length(disk, arc)
-        found.append(
+        findings.append(
             Finding(
                 reason="whole-end",
                 value=length,
                 limit=FLAG_END,
-                what=f"the {end} end of the sheet is {length:.0f} mm long",
+                text=f"the {end} end of the sheet is {length:.0f} mm long",
                 remedy="look where the subiculum, and CA2 or CA3, end there",
                 points=disk.vertices[arc],
             )
         )
     return [
-        *found,
+        *findings,
         Finding(
             reason="folded",
             value=folded,
             limit=FLAG_FOLDED,
-            what=f"the map folds in {folded:.1%} of the area",
+            text=f"the map folds in {folded:.1%} of the area",
             remedy="look at the map",
             share=folded,
         ),
@@ -393,7 +393,7 @@ def _findings(disk: Disk, edges: Edges, folded: float, masked: float, region: st
             reason="whole-masked",
             value=masked,
             limit=FLAG_MASKED,
-            what=f"{masked:.0%} of the area, beside edges, ends and holes, has no values",
+            text=f"{masked:.0%} of the area, beside edges, ends and holes, has no values",
             remedy="look at the map",
             share=masked,
         ),

@@ -113,11 +113,11 @@ class CohortPlan:
 
     def __post_init__(self) -> None:
         regions = REGIONS if self.head is None else ("head",)
-        for name, value, known in (("region", self.region, regions), ("kind", self.kind, KINDS)):
-            if value not in known:
+        for name, value, choices in (("region", self.region, regions), ("kind", self.kind, KINDS)):
+            if value not in choices:
                 raise UsageError(
-                    f"phantom: {name} {value!r} is unknown; choose from {', '.join(known)}"
-                    f"{did_you_mean([value], known)}"
+                    f"phantom: {name} {value!r} is unknown; choose from {', '.join(choices)}"
+                    f"{did_you_mean([value], choices)}"
                 )
         problem = None
         if self.cortex and KINDS[self.kind].power != 1:
@@ -185,12 +185,12 @@ def _make_subject(plan: CohortPlan, number: int) -> Subject:
     label = f"{plan.site}{number + 1:0{max(2, len(str(plan.n_subjects)))}d}"
     hemispheres = []
     for hemi in "LR":
-        own = wall + plan.hemisphere_sd * float(random.standard_normal())
+        thickness = wall + plan.hemisphere_sd * float(random.standard_normal())
         spec: PhantomSpec | HeadSpec
         if plan.head is None:
-            spec = _spec(plan, thickness=own, scale=scale, offset=offset, dose=dose)
+            spec = _spec(plan, thickness=thickness, scale=scale, offset=offset, dose=dose)
         else:
-            spec = _head(plan, thickness=own, scale=scale, dose=dose)
+            spec = _head(plan, thickness=thickness, scale=scale, dose=dose)
         hemispheres.append(Hemisphere(subject=label, hemi=hemi, spec=spec, pose=pose))
     return Subject(
         label=label,
@@ -369,9 +369,9 @@ def _write_head_effect(out: Path, plan: CohortPlan) -> None:
 def _write_nodes(path: Path, columns: Mapping[str, NDArray[np.generic]]) -> None:
     """Write one row per node, x slowest: its numbers along x and y, u and v, and other columns."""
     x, y = np.indices(NODES) + 1
-    every = {"x": x, "y": y, **dict(zip("uv", _grid(), strict=True)), **columns}
+    all_columns = {"x": x, "y": y, **dict(zip("uv", _grid(), strict=True)), **columns}
     text = [
         [str(cell) if values.dtype.kind in "iu" else f"{cell:.5f}" for cell in values.ravel()]
-        for values in every.values()
+        for values in all_columns.values()
     ]
-    files.write_tsv(path, list(every), zip(*text, strict=True))
+    files.write_tsv(path, list(all_columns), zip(*text, strict=True))

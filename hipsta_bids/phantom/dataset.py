@@ -179,14 +179,14 @@ def write_demo_dataset(out: Path) -> None:
     )
 
 
-def refuse_taken(out: Path, what: str = "phantoms") -> None:
+def refuse_taken(out: Path, content: str = "phantoms") -> None:
     """Refuse a folder that holds something other than phantoms."""
     try:
-        taken = out.exists() and any(out.iterdir())
+        is_occupied = out.exists() and any(out.iterdir())
     except OSError as error:
         raise files.output_error(out, error) from error
-    if taken and not (out / TRUTH_TABLE).exists():
-        raise UsageError(f"{out}: holds something other than {what}; choose a new folder")
+    if is_occupied and not (out / TRUTH_TABLE).exists():
+        raise UsageError(f"{out}: holds something other than {content}; choose a new folder")
     files.check_writable(out)
 
 
@@ -196,12 +196,14 @@ def rigid_motion(degrees: tuple[float, float, float], shift: tuple[float, float,
     return np.asarray(from_matvec(turn, shift))
 
 
-def _refuse(layouts: Sequence[str], what: str, able: Callable[[Protocol], bool]) -> None:
+def _refuse(layouts: Sequence[str], feature: str, able: Callable[[Protocol], bool]) -> None:
     """Refuse a layout whose protocol lacks something, and name those that have it."""
     have = [key for key, row in LAYOUTS.items() if able(load_protocol(row.protocol))]
     for name in layouts:
         if name not in have:
-            raise bad(f"the protocol of layout {name} has no {what}; choose from {', '.join(have)}")
+            raise bad(
+                f"the protocol of layout {name} has no {feature}; choose from {', '.join(have)}"
+            )
 
 
 def _has_head(protocol: Protocol) -> bool:
@@ -244,14 +246,14 @@ def _write_truth(
 
 
 def write_sidecar(
-    table: Path, columns: Mapping[str, tuple[str, str | None]], **more: Mapping[str, Any]
+    table: Path, columns: Mapping[str, tuple[str, str | None]], **extras: Mapping[str, Any]
 ) -> None:
     """Write definitions and units of a table's columns beside it."""
     described = {
         name: {"Description": text} | ({"Units": unit} if unit else {})
         for name, (text, unit) in columns.items()
     }
-    files.write_json(table.with_suffix(".json"), described | more)
+    files.write_json(table.with_suffix(".json"), described | extras)
 
 
 def _write_participants(

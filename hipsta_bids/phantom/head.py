@@ -121,10 +121,10 @@ def _tissues(spec: HeadSpec, points: Float) -> NDArray[np.uint8]:
         surface, normals, top = _folded_surface(spec)
         near = ~hooked & (share > _FOLDED[0]) & (share < _FOLDED[1]) & (y > spec.ends[1])
         near &= (radius > 1) & (outward < top + spec.thickness)
-        found, nearest = cKDTree(surface).query(points[near])
+        distance, nearest = cKDTree(surface).query(points[near])
         side = ((points[near] - surface[nearest]) * normals[nearest]).sum(axis=1)
         height = outward / top
-        outward[near] = np.where(side > 0, found, -found)
+        outward[near] = np.where(side > 0, distance, -distance)
         if spec.filled:
             deep = height < 1 / 2
             half = deep if spec.filled == "deep" else ~deep & (height < 1)
@@ -165,11 +165,11 @@ def _labeled(
     Without labels of parts subfields go on in head and tail.
     """
     table = np.zeros((2, max(Tissue) + 1, max(Part) + 1), dtype=np.uint8)
-    for one in np.unique(tissue[tissue > 0]):
-        for each in (Part.BODY, Part.HEAD, Part.TAIL):
-            found = (label_for(protocol, Tissue(one), p) for p in (each, Part.BODY))
-            if label := next(filter(None, found), None):
-                table[:, one, each] = label.tissue, label.part
+    for code in np.unique(tissue[tissue > 0]):
+        for part_code in (Part.BODY, Part.HEAD, Part.TAIL):
+            labels = (label_for(protocol, Tissue(code), p) for p in (part_code, Part.BODY))
+            if label := next(filter(None, labels), None):
+                table[:, code, part_code] = label.tissue, label.part
     return table[0, tissue, part], table[1, tissue, part]
 
 
@@ -245,9 +245,9 @@ def _grid(spec: HeadSpec, low: float, high: float) -> tuple[Float, Float, Float]
         along, *bent = _line(spec, share)
         inside = (along > low) & (along < high)
         line = np.concatenate([[low], along[inside], [high]])
-        every = (line, *(np.pad(values[inside], 1) for values in bent))
+        all_lines = (line, *(np.pad(values[inside], 1) for values in bent))
         at = np.linspace(0, len(line) - 1, 2 * _CELLS)
-        lines.append([np.interp(at, np.arange(len(line)), values) for values in every])
+        lines.append([np.interp(at, np.arange(len(line)), values) for values in all_lines])
     along, *bent = np.stack(lines, axis=1)
     spared = _spared(spec, along)
     share = spared + shares[:, None] * (1 - 2 * spared)
@@ -277,8 +277,8 @@ def _sums(points: Float, normals: Float, thickness: Float) -> dict[str, float]:
 
 def _areas(points: Float) -> Float:
     """Area (S - 1, L - 1) of the cells of a grid of points (S, L, 3)."""
-    one, other = points[1:, 1:] - points[:-1, :-1], points[1:, :-1] - points[:-1, 1:]
-    return np.asarray(np.linalg.norm(np.cross(one, other), axis=-1) / 2)
+    diagonal, antidiagonal = points[1:, 1:] - points[:-1, :-1], points[1:, :-1] - points[:-1, 1:]
+    return np.asarray(np.linalg.norm(np.cross(diagonal, antidiagonal), axis=-1) / 2)
 
 
 def _place(

@@ -177,12 +177,12 @@ def label_for(protocol: Protocol, tissue: Tissue, part: Part) -> Label | None:
     """
     by_meaning = {(label.tissue, label.part): label for label in reversed(protocol.labels)}
     tissues = (tissue, *_STAND_INS.get(tissue, ()))
-    wanted = [(choice, part) for choice in tissues]
+    meanings = [(choice, part) for choice in tissues]
     if tissue not in CORTEX:
-        wanted += [(Tissue.HIPPOCAMPUS, part)]
+        meanings += [(Tissue.HIPPOCAMPUS, part)]
     if part is Part.BODY or tissue not in LATERAL_END:
-        wanted += [(choice, Part.UNKNOWN) for choice in tissues]
-    return next((by_meaning[key] for key in wanted if key in by_meaning), None)
+        meanings += [(choice, Part.UNKNOWN) for choice in tissues]
+    return next((by_meaning[key] for key in meanings if key in by_meaning), None)
 
 
 def encode(volume: LabelVolume) -> NDArray[np.int32]:

@@ -473,10 +473,10 @@ class Body:
         s = u.ravel() * self.spec.width
         for side in (-1.0, 1.0):
             boundary = self.curve.position(s) + side * half[:, None] * self.curve.normal(s)
-            astray = np.abs(self.curve.foot(boundary) - s) > _SAME_POINT
-            if astray.any():
+            overlapping = np.abs(self.curve.foot(boundary) - s) > _SAME_POINT
+            if overlapping.any():
                 raise bad(
-                    f"turns of the wall overlap near u = {u.ravel()[astray][0]:.2f}; "
+                    f"turns of the wall overlap near u = {u.ravel()[overlapping][0]:.2f}; "
                     "make it thinner, narrower or bend it less"
                 )
 

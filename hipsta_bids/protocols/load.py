@@ -163,11 +163,11 @@ def _check_agreement(protocol: Protocol, *, origin: str) -> None:
     """Check that the parts of a protocol agree with each other."""
     codes = [label.code for label in protocol.labels]
     top = max(codes, default=0)
-    twice = sorted({code for code in codes if codes.count(code) > 1})
-    used = {label.tissue for label in protocol.labels}
+    repeated = sorted({code for code in codes if codes.count(code) > 1})
+    labeled = {label.tissue for label in protocol.labels}
     named = (*protocol.sheet, *protocol.layer, *protocol.interior, *protocol.neighbors)
     named += protocol.recognized_by
-    absent = [tissue.name for tissue in dict.fromkeys(named) if tissue not in used]
+    absent = [tissue.name for tissue in dict.fromkeys(named) if tissue not in labeled]
     order = tuple(tissue for tissue in MEDIAL_TO_LATERAL if tissue in protocol.sheet)
     beside = tuple(tissue for tissue in FAR_TO_NEAR if tissue in protocol.neighbors)
     sheet = set(protocol.sheet)
@@ -176,7 +176,7 @@ def _check_agreement(protocol: Protocol, *, origin: str) -> None:
             "[A-Za-z0-9]+", protocol.name
         ),
         "there are no labels": not codes,
-        f"code {', '.join(map(str, twice))} is listed twice": twice,
+        f"code {', '.join(map(str, repeated))} is listed twice": repeated,
         "right_offset has to exceed every code": protocol.right_offset in range(1, top + 1),
         "left_offset has to exceed every code": protocol.left_offset in range(1, top + 1),
         "only one of left_offset and right_offset can be given": protocol.left_offset
@@ -211,9 +211,9 @@ def identify_tissue(name: str) -> tuple[Tissue, Part]:
     """Understand a label's name."""
     words = re.findall("[a-z0-9]+", name.lower())
     part = next((_PARTS[word] for word in words if word in _PARTS), Part.UNKNOWN)
-    rest = "".join(word for word in words if word not in _FILLERS and word not in _PARTS)
-    if rest:
-        return _TISSUES.get(rest, Tissue.OTHER), part
+    text = "".join(word for word in words if word not in _FILLERS and word not in _PARTS)
+    if text:
+        return _TISSUES.get(text, Tissue.OTHER), part
     if part is not Part.UNKNOWN or not _WHOLE.isdisjoint(words):
         return Tissue.HIPPOCAMPUS, part
     return Tissue.OTHER, part
@@ -255,12 +255,12 @@ def agrees(protocol: Protocol, rows: Iterable[NamedCode]) -> bool:
     has to mean the same tissue in the protocol. Codes whose names say nothing may be missing there.
     """
     table = {row.code: _label(row, 0).tissue for row in rows if row.code > 0}
-    known = {label.code: label.tissue for label in protocol.labels}
+    tissue_of = {label.code: label.tissue for label in protocol.labels}
     needed = {*protocol.sheet, *protocol.interior}
-    complete = all(code in table for code, tissue in known.items() if tissue in needed)
+    complete = all(code in table for code, tissue in tissue_of.items() if tissue in needed)
     silent = {Tissue.OTHER, Tissue.BACKGROUND}
     return complete and all(
-        known.get(code, tissue if tissue in silent else None) is tissue
+        tissue_of.get(code, tissue if tissue in silent else None) is tissue
         for code, tissue in table.items()
     )
 

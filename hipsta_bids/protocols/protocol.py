@@ -76,7 +76,7 @@ _RANKS.flags.writeable = False
 OUTSIDE = frozenset({Tissue.BACKGROUND, Tissue.OTHER, *FAR_TO_NEAR}) - {Tissue.PARASUBICULUM}
 
 #: How many codes an error message lists before it says how many more there are.
-SHOWN = 12
+LISTED_CODES = 12
 
 
 def _named(kind: type[IntEnum]) -> BeforeValidator:
@@ -160,16 +160,16 @@ class Protocol(TomlTable):
         """Return what is added to the codes of a hemisphere in files that carry both."""
         return self.left_offset if hemi == "L" else self.right_offset
 
-    def same_body(self, other: "Protocol") -> bool:
+    def same_body(self, protocol: "Protocol") -> bool:
         """Say whether codes that both protocols list give the same body."""
-        own, others = ({label.code: label for label in p.labels} for p in (self, other))
+        first, second = ({label.code: label for label in p.labels} for p in (self, protocol))
         return (self.sheet, self.layer, self.interior) == (
-            other.sheet,
-            other.layer,
-            other.interior,
+            protocol.sheet,
+            protocol.layer,
+            protocol.interior,
         ) and all(
-            (own[code].tissue, own[code].part) == (others[code].tissue, others[code].part)
-            for code in own.keys() & others.keys()
+            (first[code].tissue, first[code].part) == (second[code].tissue, second[code].part)
+            for code in first.keys() & second.keys()
         )
 
     def fits(self, values: frozenset[int]) -> bool:
@@ -180,9 +180,9 @@ class Protocol(TomlTable):
         """
         if not self.sheet or not values <= self.codes:
             return False
-        found = {label.tissue for label in self.labels if label.code in values}
+        present = {label.tissue for label in self.labels if label.code in values}
         needed = {*self.sheet, *self.recognized_by}
-        return needed <= found and not found.isdisjoint(self.interior)
+        return needed <= present and not present.isdisjoint(self.interior)
 
 
 def translate(
@@ -210,18 +210,19 @@ def translate(
         )
     absent = [t.name for t in protocol.sheet if not (occurs & (tissues == t)).any()]
     if protocol.complete and absent:
-        found = np.unique(codes[codes != 0])
+        present = np.unique(codes[codes != 0])
         raise ProtocolError(
-            f"no label of {', '.join(absent)} occurs (found {_some(found)}), which {protocol.name} "
+            f"no label of {', '.join(absent)} occurs (found {_some(present)}), which"
+            f" {protocol.name} "
             "always has: another protocol was used",
             reason="wrong-scheme",
         )
-    wanted = np.isin(tissues, protocol.sheet) if protocol.sheet else parts != Part.UNKNOWN
-    if not (occurs & wanted).any():
-        found = np.unique(codes[codes != 0])
+    needed = np.isin(tissues, protocol.sheet) if protocol.sheet else parts != Part.UNKNOWN
+    if not (occurs & needed).any():
+        present = np.unique(codes[codes != 0])
         raise ProtocolError(
             f"no label of {'the sheet' if protocol.sheet else 'a part'} of {protocol.name} occurs "
-            f"(found {_some(found)}): another protocol was used",
+            f"(found {_some(present)}): another protocol was used",
             reason="wrong-scheme",
         )
     return tissues[rows], parts[rows]
@@ -229,8 +230,8 @@ def translate(
 
 def _some(values: NDArray[np.integer]) -> str:
     """List the first few values."""
-    more = f" and {len(values) - SHOWN} more" if len(values) > SHOWN else ""
-    return ", ".join(str(value) for value in values[:SHOWN].tolist()) + more
+    suffix = f" and {len(values) - LISTED_CODES} more" if len(values) > LISTED_CODES else ""
+    return ", ".join(str(value) for value in values[:LISTED_CODES].tolist()) + suffix
 
 
 def lateral_rank(tissue: NDArray[np.uint8]) -> NDArray[np.int8]:

@@ -66,7 +66,7 @@ class SettingsTable(TomlTable):
             for name, value in values.items()
             if isinstance(value, Mapping)
         }
-        return settings_from({**dict(self), **values, **groups}, type(self), where="settings")
+        return settings_from({**dict(self), **values, **groups}, type(self), origin="settings")
 
 
 def _odd(value: int) -> int:
@@ -94,20 +94,23 @@ def did_you_mean(name: str, names: Iterable[str]) -> str:
 def first_mistake(error: ValidationError, kind: type[BaseModel]) -> str:
     """Return what is wrong first, unknown keys before all else."""
     # A mistyped key is also a missing one, but says more.
-    mistake = min(error.errors(), key=lambda found: found["type"] != "extra_forbidden")
-    position, given, words = mistake["loc"], mistake["input"], mistake["type"]
+    mistake = min(error.errors(), key=lambda fault: fault["type"] != "extra_forbidden")
+    position, value, words = mistake["loc"], mistake["input"], mistake["type"]
     name = _name(position)
     table, colon, key = name.rpartition(": ")
     if words == "extra_forbidden":
-        known = _table_at(kind, position[:-1]).model_fields
-        hint = did_you_mean(str(position[-1]), known) or f"; known here: {', '.join(known)}"
+        known_names = _table_at(kind, position[:-1]).model_fields
+        hint = (
+            did_you_mean(str(position[-1]), known_names)
+            or f"; known here: {', '.join(known_names)}"
+        )
         return f"{table}{colon}unknown key {key}{hint}"
     if words == "missing":
         return f"{table}{colon}key {key} is missing"
     expected = _EXPECTED.get(words, "{msg}").format(msg=mistake["msg"], **mistake.get("ctx", {}))
-    if isinstance(given, Mapping | BaseModel):  # a rule on several of its values
+    if isinstance(value, Mapping | BaseModel):  # a rule on several of its values
         return f"{name}: {expected}".removeprefix(": ")
-    return f"{name} is {given!r}, but has to be {expected}"
+    return f"{name} is {value!r}, but has to be {expected}"
 
 
 def _name(position: Iterable[str | int]) -> str:
@@ -141,16 +144,16 @@ def read_settings(path: Path | None, kind: type[Table]) -> Table:
         raise SettingsError(
             f"{path}: not a TOML file ({error}); start from `hipsta-bids settings`"
         ) from error
-    return settings_from(values, kind, where=str(path))
+    return settings_from(values, kind, origin=str(path))
 
 
-def settings_from(values: Mapping[str, Any], kind: type[Table], *, where: str) -> Table:
+def settings_from(values: Mapping[str, Any], kind: type[Table], *, origin: str) -> Table:
     """Make settings of nested tables, or say what is wrong in them."""
     try:
         return kind.model_validate(values)
     except ValidationError as error:
         mistake = first_mistake(error, kind)
-        raise SettingsError(f"{where}: {mistake}", reason="setting-out-of-range") from error
+        raise SettingsError(f"{origin}: {mistake}", reason="setting-out-of-range") from error
 
 
 def resolve(settings: BaseModel) -> dict[str, Any]:

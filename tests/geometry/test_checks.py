@@ -217,7 +217,7 @@ def test_an_end_at_which_all_labels_end_is_flagged(arc, part):
     found = check_end_labels(volume, extract_body(volume, ALL.body), CHECKS)
     flags = [finding for finding in found if finding.raised]
     assert [flag.reason for flag in flags] == ["labels-end"]
-    assert ("anterior" if part is Part.HEAD else "posterior") in flags[0].what
+    assert ("anterior" if part is Part.HEAD else "posterior") in flags[0].text
 
 
 def test_short_head_and_tail_labels_are_enough(arc):

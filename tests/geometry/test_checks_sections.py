@@ -201,7 +201,7 @@ def test_a_band_across_the_axis_is_flagged_where_it_is(size, wanted, rows):
     sheet = plates(thickness=1.7)
     (flag,) = raised(check_ridges(sheet, banded(size, rows), CHECKS))
     assert flag.reason == wanted
-    assert f"{abs(size):.1f} mm" in flag.what
+    assert f"{abs(size):.1f} mm" in flag.text
     middle = sheet.points[20, rows, sheet.middle].mean(axis=0)
     # Within the band: half of its 5.7 x 1.6 mm.
     assert (np.abs(place_of(flag) - middle) <= [2.9, 0.9, 0.05]).all()
@@ -254,6 +254,6 @@ def test_a_subfield_that_rows_lack_between_others_is_flagged(edge, width, rows, 
     assert found.value == pytest.approx(value)
     assert (found.value > found.limit) == (value > 1.5)
     if value:
-        assert found.what.startswith("SUBICULUM is" if edge == "medial" else "CA3 is")
+        assert found.text.startswith("SUBICULUM is" if edge == "medial" else "CA3 is")
         assert set(found.points[:, 0]) == {0.0 if edge == "medial" else 12.0}
         assert len(found.points) == rows.stop - rows.start

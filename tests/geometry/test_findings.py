@@ -18,7 +18,7 @@ from hipsta_bids.types import Finding
 
 def finding(value=2.0, limit=1.0, **others):
     return Finding(
-        reason="section-bump", value=value, limit=limit, what="odd", remedy="look", **others
+        reason="section-bump", value=value, limit=limit, text="odd", remedy="look", **others
     )
 
 

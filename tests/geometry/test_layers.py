@@ -71,14 +71,14 @@ def test_where_layers_fold_they_keep_equal_distances():
     assert np.isfinite(layers.points).all()
     found = check_layers(folded, sheet)
     assert (found.reason, found.raised) == ("layers-fold", True)
-    assert f"{folded.sum()} of 861 columns" in found.what
+    assert f"{folded.sum()} of 861 columns" in found.text
     assert len(found.points) == folded.sum()
 
 
 def test_a_fold_is_placed_by_its_first_column():
     folded = np.zeros((41, 21), dtype=bool)
     folded[[6, 7], [3, 1]] = True
-    what = check_layers(folded, tube()).what
+    what = check_layers(folded, tube()).text
     assert "in 2 of 861 columns, the first at x 7, y 4," in what  # counted from 1
 
 

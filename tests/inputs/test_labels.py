@@ -31,7 +31,7 @@ def make_item(*files, protocol="hippunfold", **options):
         files=files,
         source="test",
         source_path=files[0].parent,
-        why="test",
+        explanation="test",
         **options,
     )
 

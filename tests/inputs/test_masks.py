@@ -36,7 +36,7 @@ def make_item(*files, edits=(), protocol="hippunfold", **options):
         files=files,
         source="test",
         source_path=files[0].parent,
-        why="test",
+        explanation="test",
         edits=tuple(
             Edit(kind=kind, path=path, source="edited", source_path=path.parent)
             for kind, path in edits

@@ -99,7 +99,7 @@ def test_the_option_decides_and_nothing_is_opened(tmp_path, name):
     touch(folder(tmp_path), f"x_left_{GRAY}")  # empty: opening it would be a problem
     item = only(tmp_path, ashs_atlas=name)
     assert item.protocol.name == "ashsUtrecht7T"
-    assert "--ashs-atlas" in item.why
+    assert "--ashs-atlas" in item.explanation
 
 
 def test_an_unknown_atlas_is_refused(tmp_path):
@@ -123,7 +123,7 @@ def test_values_decide_if_one_atlas_only_fits(tmp_path, values, protocol):
     item = only(tmp_path)
     assert item.protocol.name == protocol
     assert item.problem is None
-    assert "only this atlas has such labels" in item.why
+    assert "only this atlas has such labels" in item.explanation
 
 
 def test_ambiguous_values_are_never_guessed(tmp_path):
@@ -143,7 +143,7 @@ def test_two_atlases_with_the_same_body_share_a_name(tmp_path):
     item = only(tmp_path)
     assert item.problem is None
     assert item.protocol.name == "ashsABC3T"
-    assert "fit ashsABC3T and ashsMagdeburg7T; the body is the same" in item.why
+    assert "fit ashsABC3T and ashsMagdeburg7T; the body is the same" in item.explanation
     assert only(tmp_path, ashs_atlas="magdeburg7t").protocol.name == "ashsMagdeburg7T"
 
 
@@ -152,14 +152,14 @@ def test_one_file_with_a_code_of_its_own_names_the_whole_dataset(tmp_path):
     left(tmp_path, "sub-02", MAGDEBURG)
     first, second = find(tmp_path)
     assert first.protocol.name == second.protocol.name == "ashsMagdeburg7T"
-    assert "fit ashsABC3T and ashsMagdeburg7T, those of 2 other files" in first.why
+    assert "fit ashsABC3T and ashsMagdeburg7T, those of 2 other files" in first.explanation
     # Without it, whichever the others are named by.
     left(tmp_path, "sub-02", [*CORTEX, 20])
     assert {item.protocol.name for item in find(tmp_path)} == {"ashsABC3T"}
     left(tmp_path, "sub-02", BOTH)
     first, second = find(tmp_path)
     assert first.protocol.name == second.protocol.name == "ashsABC3T"
-    assert "; the body is the same" in first.why
+    assert "; the body is the same" in first.explanation
 
 
 @pytest.mark.parametrize("name", ["T1", "ashsT1", "ASHS-T1"])
@@ -195,7 +195,7 @@ def test_the_atlas_carries_over_within_a_dataset(tmp_path):
     left(tmp_path, "sub-02", BOTH)
     first, second = find(tmp_path)
     assert first.protocol.name == second.protocol.name == "ashsABC3T"
-    assert "1 other file of the dataset only this one" in second.why
+    assert "1 other file of the dataset only this one" in second.explanation
     # Also when the other one is not asked for: the choice may not depend on the selection.
     alone = only(tmp_path, participant_labels=("02",))
     assert alone == second
@@ -228,7 +228,7 @@ def test_a_large_dataset_is_sampled_not_read(tmp_path, monkeypatch):
     assert len(items) == 40
     assert {item.protocol.name for item in items} == {"ashsABC3T"}
     assert 0 < len(opened) <= 16
-    assert "8 other files of the dataset" in items[1].why
+    assert "8 other files of the dataset" in items[1].explanation
 
 
 def test_an_unreadable_file_is_its_own_problem(tmp_path):
@@ -261,7 +261,7 @@ def test_snaplabels_beside_or_above_the_file_decides(tmp_path, place):
     table.write_text(SNAP, encoding="utf-8")
     item = only(tmp_path)
     assert item.protocol.name == "ashsPMC"
-    assert "snaplabels.txt" in item.why
+    assert "snaplabels.txt" in item.explanation
 
 
 def test_a_dseg_table_decides(tmp_path):

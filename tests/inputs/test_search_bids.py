@@ -137,7 +137,7 @@ def test_a_table_beside_or_above_names_the_labels(tmp_path, table):
     assert [label.abbreviation for label in item.protocol.labels] == ["Sub", "CA1", "CA3"]
     assert item.protocol.labels[0].color == "#112233"
     assert item.protocol.sheet == tuple(label.tissue for label in item.protocol.labels)
-    assert table.rpartition("/")[2] in item.why
+    assert table.rpartition("/")[2] in item.explanation
 
 
 def test_the_most_specific_table_that_applies_is_taken(tmp_path):

@@ -98,7 +98,7 @@ def test_freesurfer_6(tmp_path):
     item = one(tmp_path, "hippoSfLabels-T1.v10.mgz", "hippoSfLabels-T1.v10.FSvoxelSpace.mgz")
     assert names(item) == ["lh.hippoSfLabels-T1.v10.mgz"]
     assert item.protocol.name == "freesurferFS60"
-    assert "FreeSurfer 6.0" in item.why
+    assert "FreeSurfer 6.0" in item.explanation
     newer = one(tmp_path, f"{FULL}.mgz")
     assert newer.protocol.name == "freesurfer"
     assert any("hippoSfLabels" in name for name, _ in newer.passed_over)

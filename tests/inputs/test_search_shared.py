@@ -38,7 +38,7 @@ def test_all_twelve_are_found_with_the_right_files(found):
 
 def test_the_third_brains_atlas_is_known_from_the_others(found):
     for hemi in "LR":
-        why = found["03", "", hemi, "ashsABC3T"].why
+        why = found["03", "", hemi, "ashsABC3T"].explanation
         assert "fit ashsABC3T and ashsPMC" in why
         assert "4 other files" in why
     (alone,) = find(
@@ -76,7 +76,7 @@ def test_freesurfer_hierarchies_of_one_brain_agree(found):
             files=(folder / f"{stem}.CA.mgz", folder / f"{stem}.HBT.mgz"),
             source=item.source,
             source_path=item.source_path,
-            why="test",
+            explanation="test",
         )
     )
     np.testing.assert_array_equal(full.part, combined.part)

@@ -41,7 +41,7 @@ def test_the_named_mode_is_taken_and_nothing_is_opened(tmp_path, name):
     right = found["01", "", "R", name]
     assert [path.name for path in right.files] == [HSF.format("right")]
     assert (right.bilateral, right.code_offset, right.problem) == (False, 0, None)
-    assert right.why == f"HSF, protocol {name} from --scheme"
+    assert right.explanation == f"HSF, protocol {name} from --scheme"
 
 
 def test_hsf_writes_beside_the_images(tmp_path):
@@ -109,7 +109,7 @@ def test_a_tools_protocol_leaves_other_files_alone(tmp_path):
 def test_a_bundled_protocol_reads_files_without_a_table(tmp_path):
     put(tmp_path, "sub-01_hemi-L_dseg.nii.gz")
     (item,) = find(tmp_path, protocol="hsf")
-    assert (item.protocol.name, item.why) == ("hsf", "labels named by --scheme")
+    assert (item.protocol.name, item.explanation) == ("hsf", "labels named by --scheme")
 
 
 def test_the_protocol_without_subfields_is_refused(tmp_path):
@@ -130,7 +130,7 @@ def test_maget_has_one_file_for_both_hemispheres(tmp_path, name, generator, opti
         assert [path.name for path in item.files] == [name]
         assert (item.bilateral, item.code_offset, item.problem) == (True, shift, None)
         assert item.protocol.name == "cobralab"
-        assert "MAGeT Brain, both hemispheres in one file" in item.why
+        assert "MAGeT Brain, both hemispheres in one file" in item.explanation
 
 
 def test_names_that_other_programs_use_too_have_to_be_claimed(tmp_path):

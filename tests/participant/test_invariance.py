@@ -30,7 +30,7 @@ def read(path):
             files=(path,),
             source="tests",
             source_path=path.parent,
-            why="test",
+            explanation="test",
         )
     )
 

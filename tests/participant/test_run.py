@@ -84,7 +84,7 @@ def test_quality_record_says_what_came_in(tmp_path):
         {"file": "bids:tests:sub-01_L.txt", "sha256": files.sha256_of(item.files[0])}
     ]
     assert record["passed_over"] == [{"file": "bids:tests:other.txt", "reason": "coarser"}]
-    assert record["chosen_because"] == item.why
+    assert record["chosen_because"] == item.explanation
     assert record["scheme"] == "demo"
     (row,) = read_status(tmp_path / "out")
     assert record["input_hash"] == row["input_hash"]

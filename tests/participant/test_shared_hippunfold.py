@@ -70,7 +70,7 @@ def test_labels_of_a_millimeter_are_refused(hemi):
         files=(TEMPLATES / "tpl-OASIS30ANTs" / name,),
         source="hippunfold",
         source_path=DATA,
-        why="",
+        explanation="",
     )
     volume = read_label_volume(item)
     with pytest.raises(GeometryError, match=r"voxels of 1\.00 mm in plane are too") as caught:

@@ -217,7 +217,7 @@ def test_a_page_that_cannot_be_made_is_a_warning(copy, monkeypatch):
 def run_block(root, error=None, *, wanted=True):
     plan = reporting.PagePlan(root=root, n_workers=1, log=root / "log")
     with reporting.reports_after(plan, [("01", None)]) as pages:
-        pages.wanted = wanted
+        pages.enabled = wanted
         if error:
             raise error
     return pages.problems

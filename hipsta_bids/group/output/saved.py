@@ -101,7 +101,7 @@ def load_effects(path: Path) -> SavedEffects:
     ModelError if it is too large, of another format, or its parts do not fit each other.
     """
     try:
-        return foreign.read_foreign(path, SavedEffects, most=_LARGEST).model_copy(
+        return foreign.read_foreign(path, SavedEffects, max_bytes=_LARGEST).model_copy(
             update={"file": str(path)}
         )
     except ValueError as error:
@@ -124,10 +124,10 @@ _Age = Annotated[foreign.Number, Field(ge=-1000, le=1000)]  # charts have a row 
 class NormArrays(TomlTable):
     """The arrays of :class:`Norms`; null where nothing is known."""
 
-    mean: list[foreign.Known]
-    spread: Annotated[list[foreign.Known], Field(min_length=2, max_length=2)]
-    shape: Annotated[list[foreign.Known], Field(min_length=2, max_length=2)]
-    shift: list[foreign.Known]
+    mean: list[foreign.FileNumbers]
+    spread: Annotated[list[foreign.FileNumbers], Field(min_length=2, max_length=2)]
+    shape: Annotated[list[foreign.FileNumbers], Field(min_length=2, max_length=2)]
+    shift: list[foreign.FileNumbers]
     scale: list[list[Annotated[foreign.Number, Field(gt=0)] | None]]
     n: list[list[Annotated[int, Field(ge=0)]]]
 
@@ -227,7 +227,7 @@ def load_norms(path: Path) -> tuple[NormsFile, dict[Key, Norms]]:
     ModelError if it is too large, changed, of another format, or its parts do not fit each other.
     """
     try:
-        file = foreign.read_foreign(path, NormsFile, most=_LARGEST)
+        file = foreign.read_foreign(path, NormsFile, max_bytes=_LARGEST)
         return file, file.arrays()
     except (ValueError, RecursionError) as error:
         raise ModelError(

@@ -29,7 +29,7 @@ from hipsta_bids.group.stats.arrays import Float, Int
 from hipsta_bids.group.stats.glm import FittedMaps, PointTest, fit_points, with_mean
 from hipsta_bids.group.stats.meta import SiteFit
 from hipsta_bids.io import files
-from hipsta_bids.io.foreign import Known, Number, Text, read_foreign, rounded
+from hipsta_bids.io.foreign import FileNumbers, Number, Text, read_foreign, rounded
 from hipsta_bids.protocols.toml import TomlTable
 
 #: File of a summary, in the folder of an analysis.
@@ -65,13 +65,13 @@ class ModelSummary(TomlTable):
     """(columns, columns) of the coefficients, over the residual variance."""
     contrasts: Annotated[dict[Text, Numbers], Field(min_length=1)]
     """Weights of the columns."""
-    coefficients: list[Known]
+    coefficients: list[FileNumbers]
     """(columns, points); null where a participant lacks a value."""
-    sd: Known
+    sd: FileNumbers
     """(points,) residual standard deviation."""
-    estimate: dict[Text, Known]
+    estimate: dict[Text, FileNumbers]
     """(points,) by contrast."""
-    se: dict[Text, Known]
+    se: dict[Text, FileNumbers]
     """(points,) by contrast."""
     subfield: list[Text | None] | None = None
     """(points,) of a map, most frequent."""
@@ -190,7 +190,7 @@ def read_summary(path: Path) -> SiteSummary:
     if not path.exists():
         raise InputError(f"{path}: no summary; it is written by `group --export-summary`")
     try:
-        summary = read_foreign(path, SiteSummary, most=_MOST_BYTES)
+        summary = read_foreign(path, SiteSummary, max_bytes=_MOST_BYTES)
         _ = summary.template_hash
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: not a summary: {error}; ask the site for it again") from error
