@@ -391,7 +391,7 @@ def test_standard_deviations_of_measurements_follow_the_scale_of_their_site():
         saved=None,
     )
     done = harmonize_cohort(cohort, plan, settings, Measures(maps=("thickness",)), {})
-    changed, (effects, _) = done.cohort.sides["L"], done.maps["L", "thickness"]
+    changed, (effects, _) = done.cohort.sides["L"], done.effects["map", "L", "thickness"]
     for number, site in enumerate("AB"):
         np.testing.assert_allclose(
             changed.errors["thickness"][sites == site].reshape(n // 2, -1),

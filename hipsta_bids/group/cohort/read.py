@@ -141,17 +141,17 @@ def read_sheets(
             columns = {str(name): one.to_numpy() for name, one in side.summary.items()}
             doubtful = {name: one for name, one in columns.items() if why_impossible(name, one)}
             problems = [_damage(side, i, doubtful, max_gap) for i in range(len(records_of_side))]
-            found = [
+            impossible = [
                 Exclusion.of_sheet(record.place.name, "damaged-map", text)
                 for record, text in zip(records_of_side, problems, strict=True)
                 if text
             ]
-            if len(found) == len(records_of_side):
+            if len(impossible) == len(records_of_side):
                 raise InputError(
-                    f"hemisphere {hemi}: no sheet can be used; {found[0].participant}:"
-                    f" {found[0].message}"
+                    f"hemisphere {hemi}: no sheet can be used; {impossible[0].participant}:"
+                    f" {impossible[0].message}"
                 )
-            damaged += found
+            damaged += impossible
             sides[hemi] = side.sheets(np.array([not text for text in problems]))
             records_of_side = [
                 r for r, text in zip(records_of_side, problems, strict=True) if not text

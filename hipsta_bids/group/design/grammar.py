@@ -45,10 +45,8 @@ _HIGHEST_POWER = 9  # of a sum of terms
 _MOST_COLUMNS = 50  # of a spline or polynomial
 
 
-@dataclass(frozen=True)
-class _Token:
-    kind: str
-    text: str
+#: Kind and text.
+_Token = tuple[str, str]
 
 
 @dataclass(frozen=True)
@@ -71,29 +69,29 @@ def closed_formula(text: str) -> ClosedFormula:
     tokens = _tokens(text)
     position, after_operand = 0, False
     while position < len(tokens):
-        token = tokens[position]
+        kind, word = tokens[position]
         end = position + 1
-        is_call = token.kind == "name" and end < len(tokens) and tokens[end].text == "("
-        is_operand = token.kind in {"name", "quoted", "number"}
-        if after_operand and (is_operand or token.text == "("):
-            _refuse(text, f"{tokens[position - 1].text} {token.text}")
+        is_call = kind == "name" and end < len(tokens) and tokens[end][1] == "("
+        is_operand = kind in {"name", "quoted", "number"}
+        if after_operand and (is_operand or word == "("):
+            _refuse(text, f"{tokens[position - 1][1]} {word}")
         if is_call:
             end = _call_end(tokens, position)
             inside = _check_call(text, tokens[position:end])
             names |= dict.fromkeys(inside)
-            plain |= set(inside) if token.text != "C" else set()
-        elif token.kind == "number":
-            is_power = position > 0 and tokens[position - 1].text == "**"
+            plain |= set(inside) if word != "C" else set()
+        elif kind == "number":
+            is_power = position > 0 and tokens[position - 1][1] == "**"
             powers = [str(power) for power in range(1, _HIGHEST_POWER + 1)]
-            if token.text not in (powers if is_power else ["0", "1"]):
-                _refuse(text, token.text)
-        elif token.kind in {"name", "quoted"}:
-            names[_column(text, token)] = None
-            plain.add(_column(text, token))
-        elif token.text not in _OPERATORS | {"(", ")"}:
-            _refuse(text, token.text)
-        after_operand = is_operand or token.text == ")"
-        parts.append("".join(part.text for part in tokens[position:end]))
+            if word not in (powers if is_power else ["0", "1"]):
+                _refuse(text, word)
+        elif kind in {"name", "quoted"}:
+            names[_column(text, word)] = None
+            plain.add(_column(text, word))
+        elif word not in _OPERATORS | {"(", ")"}:
+            _refuse(text, word)
+        after_operand = is_operand or word == ")"
+        parts.append("".join(part for _, part in tokens[position:end]))
         position = end
     return ClosedFormula(" ".join(parts), tuple(names), frozenset(names) - plain)
 
@@ -120,7 +118,7 @@ def _tokens(text: str) -> list[_Token]:
         if match is None:
             _refuse(text, text[position:].split(maxsplit=1)[0])
         kind = str(match.lastgroup)
-        tokens.append(_Token(kind, match[kind]))
+        tokens.append((kind, match[kind]))
         depth += {"(": 1, ")": -1}.get(match[kind], 0)
         if not 0 <= depth <= _DEEPEST:
             _refuse(text, text[: match.end()].strip())
@@ -134,33 +132,32 @@ def _call_end(tokens: Sequence[_Token], start: int) -> int:
     """Position after the parenthesis that closes a call."""
     depth, end = 0, start + 1
     while True:
-        depth += {"(": 1, ")": -1}.get(tokens[end].text, 0)
+        depth += {"(": 1, ")": -1}.get(tokens[end][1], 0)
         end += 1
         if depth == 0:
             return end
 
 
-def _column(text: str, token: _Token) -> str:
+def _column(text: str, word: str) -> str:
     """Name of a column; Python's own words have a meaning unless they are quoted."""
-    if keyword.iskeyword(token.text):
-        _refuse(text, token.text)
-    return token.text.strip("`")
+    if keyword.iskeyword(word):
+        _refuse(text, word)
+    return word.strip("`")
 
 
 def _check_call(text: str, tokens: Sequence[_Token]) -> list[str]:
     """Check the call of a function, and list the columns in it."""
-    quoted = [token.text for token in tokens if token.kind == "quoted"]
-    if any(token.text.startswith(_PLACEHOLDER) for token in tokens):
+    quoted = [word for kind, word in tokens if kind == "quoted"]
+    if any(word.startswith(_PLACEHOLDER) for _, word in tokens):
         _refuse(text, _PLACEHOLDER)
     numbers = iter(range(len(quoted)))
     source = " ".join(
-        f"{_PLACEHOLDER}{next(numbers)}" if token.kind == "quoted" else token.text
-        for token in tokens
+        f"{_PLACEHOLDER}{next(numbers)}" if kind == "quoted" else word for kind, word in tokens
     )
     try:
         tree = ast.parse(source, mode="eval").body
     except SyntaxError:
-        _refuse(text, " ".join(token.text for token in tokens))
+        _refuse(text, " ".join(word for _, word in tokens))
     return _Call(text, quoted).columns(tree)
 
 

@@ -315,8 +315,9 @@ def draw_sites(cohort: Cohort, analysis: Analysis) -> "list[Figure]":
         raise ValueError("nothing was harmonized")
     shown_sites = [site for site in harmonization.plan.sites if site in harmonization.plan.counts]
     height = 2 * (20 + 5 * len(shown_sites))
-    figure, axes = _panels(2, len(harmonization.maps), (panels.TWO_COLUMNS, height))
-    for j, ((hemi, measure), (effects, moments)) in enumerate(harmonization.maps.items()):
+    maps = {key: pair for key, pair in harmonization.effects.items() if key[0] == "map"}
+    figure, axes = _panels(2, len(maps), (panels.TWO_COLUMNS, height))
+    for j, ((_, hemi, measure), (effects, moments)) in enumerate(maps.items()):
         states = {"before": moments, "after": moments.after(effects)}
         unit = cohort.units.get(measure, "1")
         for number, (name, state) in enumerate(states.items()):
@@ -447,7 +448,7 @@ def draw_figures(
             f"{measure}_maps",
             partial(panels.draw_measure, cohort, analysis, shapes, views, measure),
         )
-    if analysis.harmonization is not None and analysis.harmonization.maps:
+    if analysis.harmonization is not None and analysis.fitted:
         name = "sites" if analysis.sides else f"{next(iter(analysis.measured.maps))}_sites"
         yield name, partial(draw_sites, cohort, analysis)
     if analysis.sides and all(

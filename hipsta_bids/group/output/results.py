@@ -75,10 +75,8 @@ class Harmonization:
     plan: SitePlan
     cohort: data.Cohort
     """Visits after it."""
-    maps: Mapping[tuple[str, str], tuple[SiteEffects, SiteMoments]]
-    """By hemisphere and measure."""
-    summaries: Mapping[tuple[str, str], tuple[SiteEffects, SiteMoments]]
-    """By hemisphere and measure, each a single point."""
+    effects: Mapping[tuple[str, str, str], tuple[SiteEffects, SiteMoments]]
+    """By kind (``map``, or ``summary`` of a single point), hemisphere and measure; maps first."""
     notes: tuple[str, ...]
     """What to know, one line each."""
 
@@ -263,9 +261,14 @@ def effects_of(parts: Sequence[Harmonization], templates: Mapping[str, str]) -> 
         repeated=plan.visits.participant is not None,
         icv=plan.icv,
         templates=dict(templates),
-        maps=as_nested({k: found[0] for part in parts for k, found in part.maps.items()}, ARRAYS),
-        summaries=as_nested({k: found[0] for k, found in parts[0].summaries.items()}, ARRAYS),
+        maps=as_nested(_of_kind("map", parts), ARRAYS),
+        summaries=as_nested(_of_kind("summary", parts[:1]), ARRAYS),
     )
+
+
+def _of_kind(kind: str, parts: Sequence[Harmonization]) -> dict[tuple[str, str], SiteEffects]:
+    pairs = (pair for part in parts for pair in part.effects.items())
+    return {key[1:]: effects for key, (effects, _) in pairs if key[0] == kind}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

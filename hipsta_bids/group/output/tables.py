@@ -283,27 +283,26 @@ def _sites(name: str, cohort: Cohort, analysis: results.Analysis) -> Iterator[Na
 
 def _site_rows(harmonization: results.Harmonization, units: Mapping[str, str]) -> Iterator[Columns]:
     """List shifts and scales of sites: means over the points of a map, or of a summary measure."""
-    for kind, part in (("map", harmonization.maps), ("summary", harmonization.summaries)):
-        for (hemi, measure), (effects, moments) in part.items():
-            shift, after = effects.shift * effects.sd, moments.after(effects)
-            for number, site in enumerate(harmonization.plan.sites):
-                if moments.n[number].any():
-                    yield {
-                        "measure": measure,
-                        "unit": units.get(measure, "1"),
-                        "kind": kind,
-                        "hemi": hemi,
-                        "site": site,
-                        "estimated": site in harmonization.plan.estimated,
-                        "n": int(moments.n[number].max()),
-                        "site_shift": _mean_known(shift[number]),
-                        "site_shift_rms": _root_mean_square(shift[number]),
-                        "site_scale": _mean_known(effects.scale[number]),
-                        "offset_before": _root_mean_square(moments.mean[number]),
-                        "offset_after": _root_mean_square(after.mean[number]),
-                        "spread_before": _mean_known(moments.sd[number]),
-                        "spread_after": _mean_known(after.sd[number]),
-                    }
+    for (kind, hemi, measure), (effects, moments) in harmonization.effects.items():
+        shift, after = effects.shift * effects.sd, moments.after(effects)
+        for number, site in enumerate(harmonization.plan.sites):
+            if moments.n[number].any():
+                yield {
+                    "measure": measure,
+                    "unit": units.get(measure, "1"),
+                    "kind": kind,
+                    "hemi": hemi,
+                    "site": site,
+                    "estimated": site in harmonization.plan.estimated,
+                    "n": int(moments.n[number].max()),
+                    "site_shift": _mean_known(shift[number]),
+                    "site_shift_rms": _root_mean_square(shift[number]),
+                    "site_scale": _mean_known(effects.scale[number]),
+                    "offset_before": _root_mean_square(moments.mean[number]),
+                    "offset_after": _root_mean_square(after.mean[number]),
+                    "spread_before": _mean_known(moments.sd[number]),
+                    "spread_after": _mean_known(after.sd[number]),
+                }
 
 
 def _mean_known(values: Float) -> float:

@@ -102,8 +102,10 @@ def write_results(
 ) -> None:
     """Write tables, maps and text; cohorts and analyses are by surface."""
     cohort, analysis = cohorts[SHEET], analyses[SHEET]
-    for surface, own in cohorts.items():
-        for name, table in tables.result_tables(surface, own, analyses[surface], settings):
+    for surface, surface_cohort in cohorts.items():
+        for name, table in tables.result_tables(
+            surface, surface_cohort, analyses[surface], settings
+        ):
             write_table(folder, name, table)
     if analysis.found:
         write_table(folder, "maps", tables.overview_table(analysis.found))

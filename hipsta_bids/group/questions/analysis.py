@@ -127,12 +127,12 @@ def analyze_cohort(
         comparison=comparison,
         settings=settings,
     )
-    how = {hemi: side.registration for hemi, side in sides.items()}
-    done, compared, fitted, found = fit(measured, registrations=how)
+    registrations = {hemi: side.registration for hemi, side in sides.items()}
+    harmonization, compared, fitted, discoveries = fit(measured, registrations=registrations)
     unregistered: Mapping[inference.MapKey, inference.Discoveries] = {}
     # Effects of sites from a file are those of registered nodes.
-    again = settings.registration.align != "none" and (plan is None or plan.saved is None)
-    if again and settings.multiplicity.method not in inference.PERMUTATIONS:
+    is_repeated = settings.registration.align != "none" and (plan is None or plan.saved is None)
+    if is_repeated and settings.multiplicity.method not in inference.PERMUTATIONS:
         unregistered = fit(cohort)[3]
     scores = score_cohort(
         compared,
@@ -153,28 +153,29 @@ def analyze_cohort(
         icv=icv,
         rows_of=make_rows,
     )
-    told = compared
-    if done is not None and groups is not None and done.leaks(groups.column):
-        told = data.compare_sessions(measured, comparison)
-    once = told.take(~table[PARTICIPANT].duplicated().to_numpy())
-    pairs, more = classify_groups(once, groups, settings.classification) if groups else ([], [])
+    classified = compared
+    if harmonization is not None and groups is not None and harmonization.leaks(groups.column):
+        classified = data.compare_sessions(measured, comparison)
+    first_visits = classified.take(~table[PARTICIPANT].duplicated().to_numpy())
+    classification = settings.classification
+    pairs, more = classify_groups(first_visits, groups, classification) if groups else ([], [])
     return results.Analysis(
         model=model,
         comparison=comparison,
         design=design,
         groups=groups,
         sides=sides,
-        harmonization=done,
+        harmonization=harmonization,
         measured=measures,
         compared=compared,
         row_model=rows,
         fitted=fitted,
-        found=found,
+        found=discoveries,
         unregistered=unregistered,
         scores=scores,
         measures=summaries,
         pairs=pairs,
-        skipped=[*(done.notes if done else ()), *notes, *more],
+        skipped=[*(harmonization.notes if harmonization else ()), *notes, *more],
     )
 
 
@@ -183,10 +184,10 @@ def analyze_points(
 ) -> results.Analysis:
     """Fit the model of an analysis to further maps, which are not registered."""
     maps = tuple(dict.fromkeys(name for side in cohort.sides.values() for name in side.maps))
-    measured, done = data.Measures(maps=maps, summaries=()), analysis.harmonization
-    done, compared, fitted, found = _fit_cohort(
+    measured = data.Measures(maps=maps, summaries=())
+    harmonization, compared, fitted, discoveries = _fit_cohort(
         cohort,
-        plan=None if done is None else done.plan,
+        plan=analysis.harmonization.plan if analysis.harmonization else None,
         measures=measured,
         rows=analysis.row_model,
         comparison=analysis.comparison,
@@ -203,11 +204,11 @@ def analyze_points(
     return replace(
         analysis,
         sides={},
-        harmonization=done,
+        harmonization=harmonization,
         measured=measured,
         compared=compared,
         fitted=fitted,
-        found=found,
+        found=discoveries,
         unregistered={},
         measures=(),
         pairs=(),

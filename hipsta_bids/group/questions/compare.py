@@ -78,12 +78,12 @@ def _analyze(options: study.GroupOptions, settings: GroupSettings) -> study.Grou
         for surface in inputs.cohorts
     }
     joint = fitting.combine_maps(list(analyses.values()), settings)
-    found = {key: test for one in analyses.values() for key, test in one.found.items()}
-    found |= {key: one.found for key, one in joint.items()}
+    discoveries = {key: test for one in analyses.values() for key, test in one.found.items()}
+    discoveries |= {key: one.found for key, one in joint.items()}
     tested = tuple(joint.values())
-    analysis = analyses[SHEET] = replace(analysis, found=found)
+    analysis = analyses[SHEET] = replace(analysis, found=discoveries)
     exclusions = [*inputs.exclusions, *_incomplete(analysis)]
-    wanted = designs.wanted_measures(options.model, options.measures)
+    measures = designs.wanted_measures(options.model, options.measures)
     notes = [*inputs.notes, *_notes(options, inputs, analysis, settings)]
     summary = _summary(options, inputs, analysis, settings, notes)
     tell("average surfaces")
@@ -113,7 +113,7 @@ def _analyze(options: study.GroupOptions, settings: GroupSettings) -> study.Grou
 
     return study.write_folder(
         options,
-        designs.folder_name(model.formula, wanted) + options.comparison.suffix,
+        designs.folder_name(model.formula, measures) + options.comparison.suffix,
         inputs,
         settings,
         notes=notes,
@@ -132,20 +132,20 @@ def _summary(
     """Make the summary for other sites, if it is asked for."""
     if options.export_summary is None:
         return None
-    found = inputs.found
-    summary, more = summarize(
+    collection = inputs.found
+    summary, notes_of_summary = summarize(
         inputs.cohort,
         analysis,
         settings,
         site=options.export_summary or options.bids_dir.resolve().name,
         inputs={
-            "versions": list(found.versions),
-            "seg": found.records[0].place.name.seg if found.records else "none",
+            "versions": list(collection.versions),
+            "seg": collection.records[0].place.name.seg if collection.records else "none",
             "region": options.sheets.region,
-            "settings_hash": found.settings_hash,
+            "settings_hash": collection.settings_hash,
         },
     )
-    notes += more
+    notes += notes_of_summary
     return summary
 
 
@@ -156,7 +156,7 @@ def _notes(
     settings: GroupSettings,
 ) -> list[str]:
     """List what a reader of the results should know, one line each."""
-    found, notes = inputs.found, list(analysis.skipped)
+    collection, notes = inputs.found, list(analysis.skipped)
     time = inputs.time.column if inputs.time else None
     notes += [note for name, note in analysis.design.notes.items() if name != time]
     if options.model.formula is None and options.model.file is None:
@@ -165,11 +165,11 @@ def _notes(
             f" differences that {name} might explain"
             for name in designs.empty_covariates(inputs.cohort.table, settings)
         ]
-    if later := sum(one.reason == "later-session" for one in inputs.exclusions):
+    if n_later := sum(one.reason == "later-session" for one in inputs.exclusions):
         notes.append(
-            f"{later} later sessions are not in it; --longitudinal takes all, --paired two"
+            f"{n_later} later sessions are not in it; --longitudinal takes all, --paired two"
         )
-    if flagged := sum(record.flagged for record in found.records):
+    if flagged := sum(record.flagged for record in collection.records):
         notes.append(
             f"{flagged} flagged hemispheres are in it; look at them, or use --exclude-flagged"
         )

@@ -323,8 +323,8 @@ def harmonize_cohort(
     return Harmonization(
         plan=plan,
         cohort=replace(cohort, sides=sides),
-        maps={(hemi, name): maps[hemi, name] for name in measures.maps for hemi in sides},
-        summaries=summaries,
+        effects={("map", hemi, name): maps[hemi, name] for name in measures.maps for hemi in sides}
+        | {("summary", *key): pair for key, pair in summaries.items()},
         notes=tuple(_notes(plan, settings, unknown)),
     )
 

@@ -95,14 +95,15 @@ def run_norms(
         return _score_people(options, path, settings, among, controls)
     study = studies.Study.read(options, among, settings)
     file, people = _planned(study)
-    template, tables, cohorts, found = _registered(
+    template, tables, cohorts, values = _registered(
         study, studies.read_templates(options.template, study.cohort)
     )
     tell("norms")
     file = file.model_copy(update={"template": template})
-    norms, tables["coverage"] = _fit(found, people, file, settings.norms)
-    known = len(file.sites)
-    return _write(study, _Made(None, None, file, norms, people, cohorts, found, tables, known), ())
+    norms, tables["coverage"] = _fit(values, people, file, settings.norms)
+    n_sites = len(file.sites)
+    scoring = _Made(None, None, file, norms, people, cohorts, values, tables, n_sites)
+    return _write(study, scoring, ())
 
 
 def _score_people(
@@ -114,7 +115,7 @@ def _score_people(
 ) -> studies.GroupResult:
     """Score people by the norms of a file."""
     file, norms = load_norms(path)
-    known = len(file.sites)
+    n_sites = len(file.sites)
     measures = options.measures or tuple({m: 0 for _, m in norms})
     comparison = Comparison(longitudinal=True)  # each visit has a score
     options = replace(options, measures=measures, comparison=comparison)
@@ -135,25 +136,27 @@ def _score_people(
     references = controls_kept & (controls is not None) & ~repeated.to_numpy()
     file = _with_new_sites(study, path, file, people, references, controls=controls)
     templates = None if file.template is None else templates_from_json(file.template, str(path))
-    _, tables, cohorts, found = _registered(study, templates)
-    found = {key: own for key, own in found.items() if key in norms}
-    adapted = references & people.known & (people.site >= known)
+    _, tables, cohorts, values = _registered(study, templates)
+    values = {key: numbers for key, numbers in values.items() if key in norms}
+    adapted = references & people.known & (people.site >= n_sites)
     tell("norms")
     extended = {}
-    for key, (rows, own) in found.items():
-        if norms[key].mean.shape[1] != own.shape[1]:
-            points = f"{norms[key].mean.shape[1]} points, these people {own.shape[1]}"
+    for key, (rows, numbers) in values.items():
+        if norms[key].mean.shape[1] != numbers.shape[1]:
+            points = f"{norms[key].mean.shape[1]} points, these people {numbers.shape[1]}"
             raise ModelError(f"{path}: norms of {listed(key)} have {points}")
         at, least = adapted[rows], settings.norms.least_controls // 2
-        extended[key] = norms[key].extended(own[at], people.take(rows[at]), len(file.sites), least)
+        extended[key] = norms[key].extended(
+            numbers[at], people.take(rows[at]), len(file.sites), least
+        )
     scored = {
-        name: _score_maps(one, found, extended, people, adapted) for name, one in cohorts.items()
+        name: _score_maps(one, values, extended, people, adapted) for name, one in cohorts.items()
     }
-    made = _Made(
-        path, controls, file, extended, people, cohorts, found, tables, known, scored, adapted
+    scoring = _Made(
+        path, controls, file, extended, people, cohorts, values, tables, n_sites, scored, adapted
     )
-    tables["zscores"] = pd.concat(_score_rows(made, adapted, settings), ignore_index=True)
-    return _write(study, made, notes)
+    tables["zscores"] = pd.concat(_score_rows(scoring, adapted, settings), ignore_index=True)
+    return _write(study, scoring, notes)
 
 
 def _registered(
@@ -169,11 +172,11 @@ def _registered(
             for hemi, side in cohort.sides.items()
         }
         cohorts[name] = replace(cohort, sides=sides)
-    found = {
+    values = {
         (layer.hemi, layer.measure): (layer.rows, layer.data)
         for layer in layers(cohorts, inputs.measures.maps, inputs.measures.summaries)
     }
-    return template, tables, cohorts, found
+    return template, tables, cohorts, values
 
 
 def _write(study: studies.Study, scoring: _Made, notes: Iterable[str]) -> studies.GroupResult:
@@ -203,13 +206,13 @@ def _write(study: studies.Study, scoring: _Made, notes: Iterable[str]) -> studie
 
     def fill(folder: Path) -> list[str]:
         save_norms(folder / "norms.json", file, scoring.norms)
-        for surface, one in scoring.cohorts.items():
-            for hemi, side in one.sides.items():
+        for surface, cohort in scoring.cohorts.items():
+            for hemi, side in cohort.sides.items():
                 if side.maps:
-                    write.write_surface(folder, one, points_of(side), hemi)
-            if found := scoring.scored.get(surface):
+                    write.write_surface(folder, cohort, points_of(side), hemi)
+            if scored := scoring.scored.get(surface):
                 write.write_scores(
-                    folder, one, one.table, found, letter="z", sheets=surface == SHEET
+                    folder, cohort, cohort.table, scored, letter="z", sheets=surface == SHEET
                 )
         files.write_text(folder / "methods.md", text)
         return write.write_figures(folder, _figures(scoring))
@@ -232,8 +235,8 @@ def _write(study: studies.Study, scoring: _Made, notes: Iterable[str]) -> studie
     }
     name = studies.folder_of(["norms" if scoring.path is None else "scores"], study.among)
     notes = [*notes]
-    if later := sum(one.reason == "later-session" for one in study.inputs.exclusions):
-        notes.append(f"{later} later sessions are not in the norms, which take first ones")
+    if n_later := sum(one.reason == "later-session" for one in study.inputs.exclusions):
+        notes.append(f"{n_later} later sessions are not in the norms, which take first ones")
     if file.site not in cohort.table:
         notes.append(f"no column {file.site!r}: all are taken to be at one, {_NO_SITE!r}")
     return study.write(name, notes, visits=visits, tables=scoring.tables, record=record, fill=fill)
@@ -251,7 +254,7 @@ def _planned(study: studies.Study) -> tuple[NormsFile, normative.People]:
     Refuses a cohort that is too small, or whose sexes are those of sites.
     """
     cohort, inputs, settings = study.cohort, study.inputs, study.settings
-    rules, found, table = settings.norms, inputs.found, cohort.table
+    rules, collection, table = settings.norms, inputs.found, cohort.table
     check_names([rules.age], table.columns)
     sites, complete = _site_labels(table, rules.site), np.ones(len(table), dtype=bool)
     sexes = level_labels(table[rules.sex]) if rules.sex in table else None
@@ -263,10 +266,10 @@ def _planned(study: studies.Study) -> tuple[NormsFile, normative.People]:
         format=1,
         hash="",
         version=__version__,
-        versions=list(found.versions),
+        versions=list(collection.versions),
         seg=_protocol(inputs)[0],
         region=_protocol(inputs)[1],
-        settings_hash=found.settings_hash,
+        settings_hash=collection.settings_hash,
         registration=resolve(settings)["registration"],
         template=None,
         x=cohort.x.tolist(),
@@ -341,7 +344,7 @@ def _people(study: studies.Study, file: NormsFile) -> normative.People:
 
 def _check(file: NormsFile, path: Path, inputs: studies.GroupInputs) -> list[str]:
     """Refuse people who were measured in another way; note what may differ."""
-    cohort, found = inputs.cohort, inputs.found
+    cohort, collection = inputs.cohort, inputs.found
     is_same_grid = all(
         len(a) == len(b) and np.allclose(a, b) for a, b in ((file.x, cohort.x), (file.y, cohort.y))
     )
@@ -351,7 +354,7 @@ def _check(file: NormsFile, path: Path, inputs: studies.GroupInputs) -> list[str
     for subject, value, expected in (
         ("segmentation protocol", seg, file.seg),
         ("region", region, file.region),
-        ("hash of the participant level's settings", found.settings_hash, file.settings_hash),
+        ("hash of the participant level's settings", collection.settings_hash, file.settings_hash),
         ("grid of the sheet", grid_text, file_text),
     ):
         if value != expected:
@@ -366,10 +369,10 @@ def _check(file: NormsFile, path: Path, inputs: studies.GroupInputs) -> list[str
             f"{path}: has no norms of {listed(unknown)}, only of {listed(sorted(available))};"
             " choose by --measures"
         )
-    if set(found.versions) - set(file.versions):
+    if set(collection.versions) - set(file.versions):
         note = (
             f"the norms are of maps of hipsta_bids {listed(file.versions)}, these people were"
-            f" measured with {listed(found.versions)}; a version may change numbers"
+            f" measured with {listed(collection.versions)}; a version may change numbers"
         )
         return [note]
     return []
@@ -489,7 +492,7 @@ def _score_rows(scoring: _Made, adapted: Bool, settings: GroupSettings) -> Itera
             columns = {"adapted": adapted[rows_known], "z": z, "low": np.nan, "high": np.nan}
             labels = {"hemi": hemi, "measure": measure, "region": None, **columns}
             yield score_rows(
-                scoring.cohorts[""], rows_known, **labels, centile=100 * special.ndtr(z)
+                scoring.cohorts[SHEET], rows_known, **labels, centile=100 * special.ndtr(z)
             )
 
 

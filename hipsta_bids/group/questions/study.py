@@ -136,7 +136,7 @@ def write_folder(
     ``fill`` writes into the folder, adds to the notes, and returns what is recorded; ``counts`` are
     of participants and of what is left out.
     """
-    found, region = inputs.found, options.sheets.region
+    collection, region = inputs.found, options.sheets.region
     name = options.model.name or (name if region == "body" else f"{name}_{region}")
     _describe_dataset(options)
     with write.model_folder(options.out_dir, name) as folder:
@@ -146,9 +146,9 @@ def write_folder(
             "version": __version__,
             "inputs": {
                 "datasets": [str(root.resolve()) for root in options.sheets.roots],
-                "settings_hash": found.settings_hash,
-                "versions": found.versions,
-                "seg": found.records[0].place.name.seg if found.records else None,
+                "settings_hash": collection.settings_hash,
+                "versions": collection.versions,
+                "seg": collection.records[0].place.name.seg if collection.records else None,
                 "region": region,
                 "maps": dict(options.maps),
                 "volumes": dict(options.volumes),
@@ -157,7 +157,7 @@ def write_folder(
                 "harmonization": options.harmonize_model and str(options.harmonize_model),
             },
             **fill(folder),
-            "notes": [*found.warnings, *notes],
+            "notes": [*collection.warnings, *notes],
             "settings": resolve(settings),
         }
         files.write_json(folder / "analysis.json", record)
@@ -166,21 +166,21 @@ def write_folder(
         n_participants=counts[0],
         n_excluded=counts[1],
         notes=tuple(notes),
-        warnings=found.warnings,
+        warnings=collection.warnings,
     )
 
 
 def read_inputs(options: GroupOptions, settings: GroupSettings) -> GroupInputs:
     """Find and read sheets, other maps, volumes and covariates."""
     external.check_volumes(options.volumes)
-    found = collect.collect_sheets(options.sheets, may_lack=bool(options.maps))
-    taken = external.taken_names(with_sheets=bool(found.records))
-    requests = external.map_patterns(options.maps, options.surfaces, taken)
-    wanted = designs.wanted_measures(options.model, options.measures)
-    measures = read.choose_measures(wanted, found.records, [one.name for one in requests])
-    sheets, surfaces, map_notes = _read_maps(options, found, requests, measures, settings)
+    collection = collect.collect_sheets(options.sheets, may_lack=bool(options.maps))
+    reserved = external.taken_names(with_sheets=bool(collection.records))
+    requests = external.map_patterns(options.maps, options.surfaces, reserved)
+    requested = designs.wanted_measures(options.model, options.measures)
+    measures = read.choose_measures(requested, collection.records, [one.name for one in requests])
+    sheets, surfaces, map_notes = _read_maps(options, collection, requests, measures, settings)
     measured, volume_notes = external.add_volumes(
-        sheets, found.records, options.volumes, options.bids_dir
+        sheets, collection.records, options.volumes, options.bids_dir
     )
     read.check_summaries(measures, measured.sides)
     all_visits = Cohort(
@@ -209,7 +209,7 @@ def read_inputs(options: GroupOptions, settings: GroupSettings) -> GroupInputs:
     sheet_maps = tuple(name for name in measures.maps if name not in surfaces)
     reason = "other-session" if options.comparison.pair else "later-session"
     return GroupInputs(
-        found=found,
+        found=collection,
         cohorts={SHEET: cohort}
         | {
             surface: replace(one.take(keep), table=cohort.table)
@@ -219,41 +219,44 @@ def read_inputs(options: GroupOptions, settings: GroupSettings) -> GroupInputs:
         icv=icv,
         time=time,
         exclusions=(
-            *found.exclusions,
+            *collection.exclusions,
             *measured.damaged,
             *collect.exclude_visits(
                 measured.visits, {visit: (reason, message) for visit, message in reasons.items()}
             ),
         ),
-        notes=(*found.notes, *map_notes, *volume_notes, *_damaged(measured)),
+        notes=(*collection.notes, *map_notes, *volume_notes, *_damaged(measured)),
     )
 
 
 def _read_maps(
     options: GroupOptions,
-    found: collect.Collection,
+    collection: collect.Collection,
     requests: Sequence[external.MapPattern],
     measures: Measures,
     rules: GroupSettings,
 ) -> tuple[read.Measured, dict[str, Cohort], list[str]]:
     """Read the maps that are asked for, of the sheets and of other programs."""
     error_window = 0 if rules.glm.weights == "none" else ERROR_WINDOW
-    asked = [one for one in requests if one.name in measures.maps]
+    requested = [one for one in requests if one.name in measures.maps]
     files_of, visits = external.find_all(
-        asked, options.bids_dir, read.visits_of(found.records), collect.wanted_by(options.sheets)
+        requested,
+        options.bids_dir,
+        read.visits_of(collection.records),
+        collect.wanted_by(options.sheets),
     )
     names = {one.name for one in requests}
-    own = [name for name in measures.maps if name not in names]
-    if error_window and asked:
-        names_of = ", ".join(one.name for one in asked)
+    sheet_maps = [name for name in measures.maps if name not in names]
+    if error_window and requested:
+        names_of = ", ".join(one.name for one in requested)
         raise InputError(
             f"--weights uncertainty: there are no SDs of {names_of}; leave --maps or the"
             " weights out"
         )
     measured = read.read_sheets(
-        found.records,
-        found.grid,
-        own,
+        collection.records,
+        collection.grid,
+        sheet_maps,
         visits,
         max_gap=rules.registration.max_gap,
         error_window=error_window,
