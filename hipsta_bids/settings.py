@@ -11,26 +11,17 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 from pydantic.types import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
-from hipsta_bids.protocols.toml import (
-    Fraction,
-    Numbers,
-    Odd,
-    OpenFraction,
-    OpenFractions,
-    PositiveFraction,
-    SettingsTable,
-    read_settings,
-)
+from hipsta_bids.protocols import toml
 
 
-class BodySettings(SettingsTable):
+class BodySettings(toml.SettingsTable):
     """From labels to the body's mask and end planes."""
 
     region: Literal["body", "extended", "entorhinal", "headbody", "whole"] = "body"
     """What is measured: ``body`` (the subfields between the end planes), ``extended`` (with the
     neighboring cortex), ``entorhinal`` (that cortex alone), and, experimental, ``headbody`` and
     ``whole`` (with the tail)."""
-    min_cortex_reach: PositiveFraction = 0.9
+    min_cortex_reach: toml.PositiveFraction = 0.9
     """Refuse cortex with labels along less than this share of the body."""
     layer_rule: Literal["nearest-sheet", "nearest-label"] = "nearest-sheet"
     """Who gets the molecular layer: ``nearest-sheet`` (the nearest sheet subfield; Diers et al.
@@ -50,7 +41,7 @@ class BodySettings(SettingsTable):
     """Gaps larger than this are filled if they go through the sheet, mm2."""
     slit_voxel: NonNegativeFloat = 0.8
     """Gaps are filled if no voxel edge is longer, mm: folds between thick slices look alike."""
-    end_fullness: OpenFraction = 0.9
+    end_fullness: toml.OpenFraction = 0.9
     """Cross-sections where labels end obliquely go below this share of those behind them."""
     end_reach: NonNegativeFloat = 3.0
     """Length behind an end that is compared, and of which all may be left out, mm."""
@@ -60,7 +51,7 @@ class BodySettings(SettingsTable):
     """Flag an edited mask that adds and removes more than this share of the body."""
 
 
-class GridSettings(SettingsTable):
+class GridSettings(toml.SettingsTable):
     """The working grid on which the surface is made."""
 
     spacing: Annotated[float, Field(ge=0.1, le=1)] = 0.35
@@ -75,7 +66,7 @@ class GridSettings(SettingsTable):
     oblique, and too long, next to a plane that cuts the sheet obliquely."""
 
 
-class SliceSettings(SettingsTable):
+class SliceSettings(toml.SettingsTable):
     """Shapes between thick slices."""
 
     min_ratio: NonNegativeFloat = 1.8
@@ -88,7 +79,7 @@ class SliceSettings(SettingsTable):
     """Smaller holes in a slice are filled, mm2."""
 
 
-class TopologySettings(SettingsTable):
+class TopologySettings(toml.SettingsTable):
     """Repair of holes, bridges, islands and cavities."""
 
     rounds: NonNegativeInt = 12
@@ -105,14 +96,14 @@ class TopologySettings(SettingsTable):
     """Flag a repair, or all together, beyond this fraction of the body."""
 
 
-class SurfaceSettings(SettingsTable):
+class SurfaceSettings(toml.SettingsTable):
     """The closed surface of the body."""
 
     taubin_iterations: NonNegativeInt = 16
     """Pairs of shrinking and inflating steps."""
 
 
-class TetraSettings(SettingsTable):
+class TetraSettings(toml.SettingsTable):
     """The tetrahedral mesh."""
 
     radius_edge_ratio: Annotated[float, Field(ge=1)] = 2.0
@@ -121,7 +112,7 @@ class TetraSettings(SettingsTable):
     """Give up after this time, s."""
 
 
-class BoundarySettings(SettingsTable):
+class BoundarySettings(toml.SettingsTable):
     """Medial and lateral boundary strips, and which side is interior."""
 
     solver: Literal["two-level", "lapy"] = "two-level"
@@ -135,7 +126,7 @@ class BoundarySettings(SettingsTable):
     """The two rules may differ by this much, mm; beyond it the rims are taken."""
 
 
-class SheetSettings(SettingsTable):
+class SheetSettings(toml.SettingsTable):
     """The grid of the sheet, in coordinates from -1 to 1 along each axis.
 
     The grid of Hipsta (Diers et al. 2023) is x_extent 0.9, y_extent 0.975, z_extent 0.9.
@@ -145,29 +136,29 @@ class SheetSettings(SettingsTable):
     """Nodes from medial to lateral."""
     y_nodes: Annotated[int, Field(ge=3, le=1000)] = 21
     """Nodes from posterior to anterior."""
-    z_nodes: Odd = 9
+    z_nodes: toml.Odd = 9
     """Nodes from interior to exterior, odd so that the middle one is the mid-surface."""
-    x_extent: PositiveFraction = 0.9
+    x_extent: toml.PositiveFraction = 0.9
     """The grid spans plus and minus this along x."""
-    y_extent: PositiveFraction = 1.0
+    y_extent: toml.PositiveFraction = 1.0
     """The grid spans plus and minus this along y."""
-    z_extent: PositiveFraction = 1.0
+    z_extent: toml.PositiveFraction = 1.0
     """The grid spans plus and minus this along z; 1 is the whole wall."""
-    max_filled: Fraction = 0.2
+    max_filled: toml.Fraction = 0.2
     """Refuse a sheet with a larger fraction of columns that could not be measured."""
     depths: Literal["distance", "volume"] = "distance"
     """How layers are spaced along each column: ``distance`` (evenly) or ``volume`` (the same volume
     between any two; Bok 1929, Leprince et al. 2015). The measures do not depend on it."""
 
 
-class MeasureSettings(SettingsTable):
+class MeasureSettings(toml.SettingsTable):
     """Measures on the sheet."""
 
-    curvature_window: Odd = 9
+    curvature_window: toml.Odd = 9
     """Grid nodes over which a local polynomial is fitted, odd."""
     curvature_order: Annotated[int, Field(ge=2)] = 3
     """Order of the local polynomials."""
-    gaussian_window: Odd = 21
+    gaussian_window: toml.Odd = 21
     """Grid nodes along y over which they are fitted for the Gaussian curvature, odd: it multiplies
     noise along the axis with the curvature across it."""
     max_curvature: PositiveFloat = 2.5
@@ -182,7 +173,7 @@ class MeasureSettings(SettingsTable):
         return self
 
 
-class CheckSettings(SettingsTable):
+class CheckSettings(toml.SettingsTable):
     """What makes a map doubtful (flag) or wrong (refusal)."""
 
     max_voxel: PositiveFloat = 0.9
@@ -207,7 +198,7 @@ class CheckSettings(SettingsTable):
     """The report marks sides whose lengths differ by more, mm (2.8 at most in real labels)."""
     end_label_share: NonNegativeFloat = 0.005
     """Flag them if they are more than this share of the body's voxels."""
-    notch_share: Numbers = (0.12, 0.3, 0.35)
+    notch_share: toml.Numbers = (0.12, 0.3, 0.35)
     """Flag if more than this share of what both sides have is missing, one per distance."""
     bump_contrast: NonNegativeFloat = 4.5
     """Flag a section with more of what others lack than so often the usual (suite population)."""
@@ -219,11 +210,11 @@ class CheckSettings(SettingsTable):
     """Flag rows narrower than the widest on both sides by more than this (from the population)."""
     flag_subfield_gap: NonNegativeFloat = 1.5
     """Flag rows without their edge's subfield over more than this, mm (1.2 at most in 128)."""
-    flag_edge: Numbers = (1.8, 2.2, 2.7)
+    flag_edge: toml.Numbers = (1.8, 2.2, 2.7)
     """Flag an edge that recedes behind both by more than this, one per distance, mm."""
-    flag_ridge: Numbers = (0.85, 1.4, 1.3)
+    flag_ridge: toml.Numbers = (0.85, 1.4, 1.3)
     """Flag a band that is thicker than both by more than this, one per distance, mm."""
-    flag_groove: Numbers = (0.55, 0.75, 0.75)
+    flag_groove: toml.Numbers = (0.55, 0.75, 0.75)
     """Flag a band that is thinner than both by more than this, one per distance, mm."""
     uncus_reach: NonNegativeFloat = 2.0
     """Warn of an uncus that begins farther than this behind the anterior plane, mm."""
@@ -239,16 +230,16 @@ class CheckSettings(SettingsTable):
     """Flag if rim paths and boundary curves differ by more than this, multiples of thickness."""
 
 
-class MapSettings(SettingsTable):
+class MapSettings(toml.SettingsTable):
     """Other volumes on the sheet (``--map``)."""
 
-    min_known: Fraction = 0.5
+    min_known: toml.Fraction = 0.5
     """A value is missing if less than this share of its voxels, or of the depth, is known."""
     flag_outside: NonNegativeFloat = 0.05
     """Flag if a larger share of the points lies outside the volume's field of view."""
 
 
-class UncertaintySettings(SettingsTable):
+class UncertaintySettings(toml.SettingsTable):
     """Perturbed copies of the labels; their spread says how certain a map is (`--uncertainty`)."""
 
     jitter: NonNegativeFloat = 0.5
@@ -264,10 +255,10 @@ class UncertaintySettings(SettingsTable):
     """Least ``grid.spacing`` of copies, mm: what all copies share cancels out, and time matters."""
 
 
-class SurrogateSettings(SettingsTable):
+class SurrogateSettings(toml.SettingsTable):
     """Thickness from the medial axis of single slices (``hipsta-bids surrogate``)."""
 
-    positions: OpenFractions = (0.5,)
+    positions: toml.OpenFractions = (0.5,)
     """Where the slices are, fractions of the body's length from its posterior end."""
     pixel: Annotated[float, Field(ge=0.02, le=1)] = 0.1
     """Edge of the pixels on which the slices are drawn, mm."""
@@ -275,7 +266,7 @@ class SurrogateSettings(SettingsTable):
     """Standard deviation of the Gaussian that rounds the voxels' corners, in-plane voxels."""
 
 
-class Settings(SettingsTable):
+class Settings(toml.SettingsTable):
     """All settings of the participant level."""
 
     body: BodySettings = Field(default_factory=BodySettings)
@@ -311,4 +302,4 @@ def load_settings(path: Path | None) -> Settings:
     SettingsError
         If the file cannot be read, or a key or a value in it is wrong.
     """
-    return read_settings(path, Settings)
+    return toml.read_settings(path, Settings)

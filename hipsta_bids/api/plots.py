@@ -11,18 +11,8 @@ from hipsta_bids.api.maps import Measurement, attributes, check_choice
 from hipsta_bids.geometry.catalog import MAPS
 from hipsta_bids.group.questions.models import GroupFit
 from hipsta_bids.io.gifti import sheet_triangles
+from hipsta_bids.reports import display
 from hipsta_bids.reports.cells import display_name, unit_of
-from hipsta_bids.reports.display import (
-    EFFECT_COLORS,
-    MAP_KINDS,
-    Y_ENDS,
-    Effects,
-    MapKind,
-    effect_reach,
-    kind_of,
-    parts_of,
-    scale_of,
-)
 from hipsta_bids.reports.group_maps import EFFECT_NAMES
 from hipsta_bids.reports.maps import draw_sheet
 from hipsta_bids.reports.results import SheetTable
@@ -96,9 +86,9 @@ def plot_sheet(
 
         ax = plt.gca()
     extents = [float(np.nanmean(columns.get(f"extent_{axis}", np.nan))) for axis in "xy"]
-    scale = limits or scale_of(kind, [columns[measure]])
+    scale = limits or display.scale_of(kind, [columns[measure]])
     image = draw_sheet(ax, sheet, kind, scale, extents=extents, hemi=side)
-    ax.set_ylabel("  ←  →  ".join(Y_ENDS))
+    ax.set_ylabel("  ←  →  ".join(display.Y_ENDS))
     if colorbar:
         _bar(ax, image, kind)
     return ax
@@ -164,7 +154,7 @@ def plot_surface(
         raise ValueError("a surface needs axes in three dimensions: projection='3d'")
     elevation, azimuth = view or _VIEW.get(side, _VIEW["R"])
     ax.view_init(elev=elevation, azim=azimuth)
-    scale = Normalize(*(limits or scale_of(kind, [columns[measure]])))
+    scale = Normalize(*(limits or display.scale_of(kind, [columns[measure]])))
     colors = colormaps[kind.colors](scale(np.nan_to_num(values)))
     colors[~np.isfinite(values)] = (0.8, 0.8, 0.8, 1.0)
     colors[:, :3] *= _light(corners, elevation, azimuth)[:, None]
@@ -256,11 +246,11 @@ def plot_group(
         ax = plt.gca()
     finite = np.isfinite(effect)
     names = np.full(effect.shape, "") if subfield is None else np.asarray(subfield, dtype=np.str_)
-    kind = MapKind(
+    kind = display.MapKind(
         column="effect",
         title=EFFECT_NAMES[fit.test(side, contrast).kind],
         unit="",
-        colors=EFFECT_COLORS,
+        colors=display.EFFECT_COLORS,
         centered=True,
         digits=2,
     )
@@ -272,7 +262,9 @@ def plot_group(
         points={},
     )
     statistic, df = (fit.maps[name][at] for name in ("statistic", "df"))
-    reach = effect_reach([Effects(fit.test(side, contrast).kind, effect, statistic, df)])
+    reach = display.effect_reach(
+        [display.Effects(fit.test(side, contrast).kind, effect, statistic, df)]
+    )
     scale = limits or (-reach, reach)
     image = draw_sheet(ax, sheet, kind, scale, extents=(np.nan, np.nan), hemi=side)
     if significant.any() and not significant.all():
@@ -281,7 +273,7 @@ def plot_group(
     count = f"{int(significant.sum())} of {int(finite.sum())} points survive"
     ax.set_title(f"{ax.get_title()}, {contrast}: {count}")
     ax.set_aspect("auto")
-    ax.set_ylabel("  ←  nodes  →  ".join(Y_ENDS))
+    ax.set_ylabel("  ←  nodes  →  ".join(display.Y_ENDS))
     if colorbar:
         _bar(ax, image, kind)
     return ax
@@ -320,7 +312,7 @@ def _sheet(data: Any, columns: dict[str, Float]) -> SheetTable:  # noqa: ANN401
 
 
 def _body_ends(data: Any) -> tuple[int, int] | None:  # noqa: ANN401
-    parts = parts_of(data.coords["y"].to_numpy()) if "y" in data.coords else None
+    parts = display.parts_of(data.coords["y"].to_numpy()) if "y" in data.coords else None
     if parts is None:
         return None
     rows = np.flatnonzero(parts == "body")
@@ -350,14 +342,14 @@ def _light(corners: Float, elevation: float, azimuth: float) -> Float:
     return np.asarray(1 - _SHADE + _SHADE * facing)
 
 
-def _kind(measure: str) -> MapKind:
+def _kind(measure: str) -> display.MapKind:
     """How a map is shown: as the pages do, or after its unit."""
-    kinds = {kind.column: kind for kind in MAP_KINDS}
+    kinds = {kind.column: kind for kind in display.MAP_KINDS}
     if measure in kinds:
         return kinds[measure]
     is_map = measure in {row.name for row in MAPS}
     return replace(
-        kind_of(measure),
+        display.kind_of(measure),
         column=measure,
         title=display_name(measure).capitalize(),
         unit=unit_of(attributes(measure)["units"]) if is_map else "",
@@ -365,7 +357,7 @@ def _kind(measure: str) -> MapKind:
     )
 
 
-def _bar(ax: Any, image: Any, kind: MapKind) -> None:  # noqa: ANN401  (of matplotlib)
+def _bar(ax: Any, image: Any, kind: display.MapKind) -> None:  # noqa: ANN401  (of matplotlib)
     label = kind.title.lower() if kind.unit else kind.title
     unit = f" [{kind.unit}]" if kind.unit else ""
     ax.figure.colorbar(image, ax=ax, label=f"{label}{unit}", extend="both", shrink=0.8)

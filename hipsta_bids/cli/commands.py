@@ -4,18 +4,9 @@ import argparse
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from hipsta_bids.cli import participant
 from hipsta_bids.cli.console import echo, echo_table, warn
 from hipsta_bids.cli.parser import Parser, adder, from_namespace, given_settings
-from hipsta_bids.cli.participant import (
-    LEVELS,
-    add_segmentations,
-    add_selection,
-    build_parser,
-    check_folders,
-    check_output_is_no_input,
-    input_request,
-    run_participant_level,
-)
 from hipsta_bids.errors import ExitCode, UsageError
 
 _DEMO_PROTOCOL = "freesurfer"  # the layout that the demo dataset has
@@ -115,8 +106,8 @@ def surrogate_parser() -> Parser:
     parser.add_argument(
         "output_dir", type=Path, metavar="OUT_DIR", help="the output dataset, new or with results"
     )
-    add_selection(parser)
-    add_segmentations(parser)
+    participant.add_selection(parser)
+    participant.add_segmentations(parser)
     adder(parser)("--settings", "FILE.toml", "those of the results in OUT_DIR")
     return parser
 
@@ -244,7 +235,9 @@ def run_demo(arguments: Sequence[str]) -> ExitCode:
     folder = _demo_folder("demo", text, arguments)
     data, out = folder / "bids", folder / "out"
     _write_demo(data)
-    code = run_participant_level(build_parser().parse_args([str(data), str(out), LEVELS[0]]))
+    code = participant.run_participant_level(
+        participant.build_parser().parse_args([str(data), str(out), participant.LEVELS[0]])
+    )
     for line in compare_with_truth(data, out):
         echo(line)
     return code
@@ -307,29 +300,26 @@ def run_surrogate(arguments: Sequence[str]) -> ExitCode:
     """Measure thickness in single slices."""
     parsed = surrogate_parser().parse_args(arguments)
     # Options of the participant level that this command lacks have their defaults.
-    defaults = build_parser().parse_args([str(parsed.bids_dir), str(parsed.output_dir), LEVELS[0]])
+    defaults = participant.build_parser().parse_args(
+        [str(parsed.bids_dir), str(parsed.output_dir), participant.LEVELS[0]]
+    )
     options = argparse.Namespace(**vars(defaults) | vars(parsed))
-    check_folders(options)
+    participant.check_folders(options)
     from hipsta_bids.settings import load_settings  # noqa: PLC0415  (start-up time)
 
     settings = load_settings(options.settings)
-    from hipsta_bids.inputs.search import (  # noqa: PLC0415  (heavy)
-        dataset_notes,
-        find_inputs,
-        ignored_table,
-        selection_table,
-    )
+    from hipsta_bids.inputs import search  # noqa: PLC0415  (heavy)
     from hipsta_bids.participant.surrogate import crosscheck  # noqa: PLC0415  (heavy)
 
-    request = input_request(options)
-    findings = find_inputs(request)
-    for note in (*dataset_notes(request, findings.items), *findings.notes):
+    request = participant.input_request(options)
+    findings = search.find_inputs(request)
+    for note in (*search.dataset_notes(request, findings.items), *findings.notes):
         echo(f"note: {note}")
     if options.dry_run:
-        echo_table(selection_table(findings.items))
-        echo_table(ignored_table(findings.ignored))
+        echo_table(search.selection_table(findings.items))
+        echo_table(search.ignored_table(findings.ignored))
         return ExitCode.OK
-    check_output_is_no_input(options.output_dir, findings.items)
+    participant.check_output_is_no_input(options.output_dir, findings.items)
     return crosscheck(findings.items, options.output_dir, settings, echo, warn)
 
 

@@ -10,15 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hipsta_bids import __version__
-from hipsta_bids.cli.console import (
-    Progress,
-    echo,
-    echo_result,
-    echo_start,
-    echo_table,
-    quiet,
-    warn,
-)
+from hipsta_bids.cli import console
 from hipsta_bids.cli.parser import (
     Parser,
     accept,
@@ -325,7 +317,7 @@ def _gigabytes(text: str) -> float:
 
 def run_participant_level(options: "Namespace", arguments: Sequence[str] = ()) -> ExitCode:
     """Measure, collect or list hemispheres, as a parsed command line says."""
-    with quiet(options.quiet):
+    with console.quiet(options.quiet):
         return _run(options, arguments)
 
 
@@ -334,7 +326,7 @@ def _run(options: "Namespace", arguments: Sequence[str]) -> ExitCode:
     from hipsta_bids.settings import load_settings  # noqa: PLC0415  (start-up time)
 
     for name, reason in options.ignored.items():
-        echo(f"note: {name} has no effect: {reason}")
+        console.echo(f"note: {name} has no effect: {reason}")
     check_folders(options)
     collects = options.analysis_level == COLLECT
     if collects and options.shard is not None:
@@ -345,9 +337,9 @@ def _run(options: "Namespace", arguments: Sequence[str]) -> ExitCode:
     if options.region is not None:
         settings = settings.changed(body={"region": options.region})
     if settings.body.region in EXPERIMENTAL:
-        echo(f"note: region {settings.body.region} is experimental")
+        console.echo(f"note: region {settings.body.region} is experimental")
     request = input_request(options)
-    echo_start(options.analysis_level, options.bids_dir)
+    console.echo_start(options.analysis_level, options.bids_dir)
     from hipsta_bids.inputs.edits import attach_ends  # noqa: PLC0415  (heavy)
     from hipsta_bids.inputs.maps import attach, map_requests  # noqa: PLC0415  (heavy)
     from hipsta_bids.inputs.search import dataset_notes, ignored_table, selection_table  # noqa: PLC0415  (heavy)
@@ -355,31 +347,31 @@ def _run(options: "Namespace", arguments: Sequence[str]) -> ExitCode:
 
     limit_memory(options.mem)
     requests = map_requests(options.map, options.map_sampling, options.map_interpolation)
-    findings = _find(request, options.shard, say=echo if options.dry_run else None)
+    findings = _find(request, options.shard, say=console.echo if options.dry_run else None)
     if findings is None:
-        echo(f"part {options.shard.name} of the dataset has nothing to process")
+        console.echo(f"part {options.shard.name} of the dataset has nothing to process")
         return ExitCode.OK
     items, end_notes = attach_ends(findings.items, options.ends)
     items, map_notes = attach(items, requests, options.roi, options.bids_dir)
     notes = (*dataset_notes(request, items), *findings.notes, *end_notes, *map_notes)
     for note in notes:
-        echo(f"note: {note}")
+        console.echo(f"note: {note}")
     if options.dry_run:
-        echo_table(selection_table(items))
-        echo_table(ignored_table(findings.ignored))
+        console.echo_table(selection_table(items))
+        console.echo_table(ignored_table(findings.ignored))
         return ExitCode.OK
     check_output_is_no_input(options.output_dir, items)
     from hipsta_bids.participant.run import collect, run_participants  # noqa: PLC0415  (heavy)
 
     notes += tuple(f"not used: {entry.path}: {entry.reason}" for entry in findings.ignored)
     out, run_options = options.output_dir, _run_options(options, arguments, notes)
-    with Progress(-1 if options.quiet else options.verbose) as progress:
+    with console.Progress(-1 if options.quiet else options.verbose) as progress:
         if collects:
             result = collect(items, out, settings, run_options)
         else:
             progress.show("hemispheres", 0, len(items))
             result = run_participants(items, out, settings, run_options, progress.report)
-    echo_result(result, out)
+    console.echo_result(result, out)
     return result.exit_code
 
 
@@ -430,7 +422,7 @@ def _rebuild_reports(options: "Namespace") -> ExitCode:
             f"{root}: no results of these participants; run without --reports-only first"
         )
     check_writable(root)
-    progress = Progress(-1 if options.quiet else options.verbose)
+    progress = console.Progress(-1 if options.quiet else options.verbose)
     with log_file(root, options.verbose) as log, progress:
         problems = list(
             write_reports(
@@ -444,8 +436,8 @@ def _rebuild_reports(options: "Namespace") -> ExitCode:
             )
         )
     for problem in problems:
-        warn(f"report: {problem.message}")
-    echo(f"reports of {len(visits)} visits: {root / DATASET_FILES['report']}")
+        console.warn(f"report: {problem.message}")
+    console.echo(f"reports of {len(visits)} visits: {root / DATASET_FILES['report']}")
     if any(problem.fatal for problem in problems):
         return ExitCode.NOT_WRITABLE
     return ExitCode.INTERNAL if problems else ExitCode.OK

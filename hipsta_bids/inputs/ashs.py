@@ -11,17 +11,9 @@ from functools import cached_property
 from pathlib import Path
 
 from hipsta_bids.errors import HipstaError, InputError, ProtocolError
+from hipsta_bids.inputs import scan
 from hipsta_bids.inputs.generic import find_table, read_table, table_protocol
 from hipsta_bids.inputs.labels import label_values
-from hipsta_bids.inputs.scan import (
-    HemisphereInput,
-    InputRequest,
-    Source,
-    VisitFolders,
-    list_visits,
-    sort_folders,
-    unknown_protocol,
-)
 from hipsta_bids.inputs.selection import Selection, SidedFile, choose_file, measurable
 from hipsta_bids.protocols.load import agrees, load_protocol, protocol_names
 from hipsta_bids.protocols.protocol import Protocol, Tissue
@@ -53,7 +45,7 @@ def _protocols(*, refused: bool = False) -> tuple[Protocol, ...]:
     )
 
 
-def choose_atlas(request: InputRequest) -> Protocol | None:
+def choose_atlas(request: scan.InputRequest) -> Protocol | None:
     """Take the atlas from ``--ashs-atlas``, if it is given."""
     if request.ashs_atlas is None:
         return None
@@ -89,7 +81,7 @@ class AtlasFinder:
             return *self._from_values(image), None
         except (ProtocolError, InputError) as found:
             problem = self._without_subfields(image) or found
-            unknown = unknown_protocol(_TOOL, "ASHS, atlas not identified")
+            unknown = scan.unknown_protocol(_TOOL, "ASHS, atlas not identified")
             return unknown, "atlas not identified", problem
 
     def _from_table(self, path: Path) -> Protocol:
@@ -206,8 +198,8 @@ def volume_table(path: Path) -> Path | None:
 
 
 def find_ashs(
-    visit: VisitFolders, source: Source, selection: Selection, atlases: AtlasFinder
-) -> Iterator[HemisphereInput]:
+    visit: scan.VisitFolders, source: scan.Source, selection: Selection, atlases: AtlasFinder
+) -> Iterator[scan.HemisphereInput]:
     """Find ASHS's segmentations of one visit."""
     all_files = _files(visit)
     for hemi in selection.wanted_hemis():
@@ -237,9 +229,9 @@ def find_ashs(
 
 def _sample_files(root: Path) -> Iterator[_Image]:
     """List a sample of a dataset's segmentations, the same whoever is processed."""
-    folders = sort_folders(root)[0]
+    folders = scan.sort_folders(root)[0]
     step = max(len(folders) // _SAMPLE, 1)
-    for visit in list_visits(folders[::step]):
+    for visit in scan.list_visits(folders[::step]):
         files = _files(visit)
         for hemi in _SIDES.values():
             best = next((file for file in files if file.hemi in (hemi, None)), None)
@@ -247,7 +239,7 @@ def _sample_files(root: Path) -> Iterator[_Image]:
                 yield best.path, hemi, best.hemi is None
 
 
-def _files(visit: VisitFolders) -> list[SidedFile]:
+def _files(visit: scan.VisitFolders) -> list[SidedFile]:
     """List the segmentations of one visit, best first."""
     matches = (
         (folder.path / name, _NAME.fullmatch(name))

@@ -18,17 +18,8 @@ from pathlib import Path
 from typing import cast
 
 from hipsta_bids.errors import HipstaError, InputError
+from hipsta_bids.inputs import scan
 from hipsta_bids.inputs.generic import is_edited, table_protocol
-from hipsta_bids.inputs.scan import (
-    HEMIS,
-    Edit,
-    HemisphereInput,
-    Ignored,
-    InputRequest,
-    VisitFolders,
-    list_visits,
-    sort_folders,
-)
 from hipsta_bids.inputs.selection import Selection
 from hipsta_bids.io import files
 from hipsta_bids.io.files import entities
@@ -50,7 +41,7 @@ _ENDS = ("posterior", "anterior")
 class EditedFile(Visit):
     """An edited file, and whose it is."""
 
-    edit: Edit
+    edit: scan.Edit
     beside: bool
     """Found in a dataset of segmentations, not in the folder of edits."""
 
@@ -61,18 +52,18 @@ class EditedFile(Visit):
 
 
 def edits_of_visit(
-    visit: VisitFolders, root: Path, source: str, *, beside: bool
+    visit: scan.VisitFolders, root: Path, source: str, *, beside: bool
 ) -> Iterator[EditedFile]:
     """List the edited files in the folders of one visit."""
     for folder in visit.folders:
         for name in filter(is_edited, folder.names):
             kind = _KINDS[entities(name)["suffix"]]
-            edit = Edit(kind=kind, path=folder.path / name, source=source, source_path=root)
+            edit = scan.Edit(kind=kind, path=folder.path / name, source=source, source_path=root)
             yield EditedFile(edit=edit, subject=visit.subject, session=visit.session, beside=beside)
 
 
 def list_edits(
-    request: InputRequest, selection: Selection, ignored: list[Ignored]
+    request: scan.InputRequest, selection: Selection, ignored: list[scan.Ignored]
 ) -> list[EditedFile]:
     """List the edited files of ``--edited-dir`` and of the output dataset."""
     edited_files = []
@@ -86,14 +77,14 @@ def list_edits(
 
 
 def _edits_of_dataset(
-    root: Path, name: str, selection: Selection, ignored: list[Ignored]
+    root: Path, name: str, selection: Selection, ignored: list[scan.Ignored]
 ) -> list[EditedFile]:
-    folders, other_entries = sort_folders(root)
+    folders, other_entries = scan.sort_folders(root)
     ignored += other_entries
     selected_folders = filter(selection.wants_folder, folders)
     return [
         file
-        for visit in filter(selection.wants_visit, list_visits(selected_folders, ignored))
+        for visit in filter(selection.wants_visit, scan.list_visits(selected_folders, ignored))
         for file in edits_of_visit(visit, root, name, beside=False)
     ]
 
@@ -106,15 +97,15 @@ def each_once(edited: Iterable[EditedFile]) -> list[EditedFile]:
 
 
 def attach_edits(
-    items: Iterable[HemisphereInput], edited: Iterable[EditedFile], selection: Selection
-) -> tuple[tuple[HemisphereInput, ...], tuple[str, ...]]:
+    items: Iterable[scan.HemisphereInput], edited: Iterable[EditedFile], selection: Selection
+) -> tuple[tuple[scan.HemisphereInput, ...], tuple[str, ...]]:
     """Attach the files that correct each hemisphere, and note those that correct none."""
     corrected = list(items)
     corrections: dict[int, list[EditedFile]] = {}
     notes = []
     for file in edited:
         hemi = file.names.get("hemi")
-        if hemi in HEMIS and hemi not in selection.wanted_hemis():
+        if hemi in scan.HEMIS and hemi not in selection.wanted_hemis():
             continue
         matching = [n for n, item in enumerate(corrected) if _corrects(file, item)]
         for n in matching:
@@ -135,7 +126,7 @@ def attach_edits(
     return tuple(corrected), tuple(notes)
 
 
-def _corrects(file: EditedFile, item: HemisphereInput) -> bool:
+def _corrects(file: EditedFile, item: scan.HemisphereInput) -> bool:
     names = file.names
     return (
         _misnamed(file) is None
@@ -148,7 +139,7 @@ def _corrects(file: EditedFile, item: HemisphereInput) -> bool:
 def _misnamed(file: EditedFile) -> str | None:
     """Describe what is wrong with a name, if anything."""
     names = file.names
-    if names.get("hemi") not in HEMIS:
+    if names.get("hemi") not in scan.HEMIS:
         return "its name has no hemi-L or hemi-R"
     for key, folder_label in (("sub", file.subject), ("ses", file.session)):
         if names.get(key, folder_label) != folder_label:
@@ -156,7 +147,7 @@ def _misnamed(file: EditedFile) -> str | None:
     return None
 
 
-def _why_not(file: EditedFile, items: list[HemisphereInput]) -> str:
+def _why_not(file: EditedFile, items: list[scan.HemisphereInput]) -> str:
     """Explain why a file corrects nothing."""
     misnamed = _misnamed(file)
     if misnamed:
@@ -182,7 +173,7 @@ def _why_not(file: EditedFile, items: list[HemisphereInput]) -> str:
     )
 
 
-def _corrected(item: HemisphereInput, edits: list[Edit]) -> HemisphereInput:
+def _corrected(item: scan.HemisphereInput, edits: list[scan.Edit]) -> scan.HemisphereInput:
     """Attach the edits of one hemisphere, if there is one of each kind at most."""
     for kind in _KINDS.values():
         rivals = [edit.path for edit in edits if edit.kind == kind]
@@ -196,7 +187,7 @@ def _corrected(item: HemisphereInput, edits: list[Edit]) -> HemisphereInput:
     return _described(replace(item, edits=tuple(edits)))
 
 
-def _described(item: HemisphereInput) -> HemisphereInput:
+def _described(item: scan.HemisphereInput) -> scan.HemisphereInput:
     """Let a label table of the same name as the edited labels say what their codes are."""
     labels = item.edit("labels")
     if labels is None:
@@ -232,7 +223,7 @@ class EndRow(Visit):
     end: GivenEnd | HipstaError
     """The plane, or what is wrong with the row."""
 
-    def is_of(self, item: HemisphereInput) -> bool:
+    def is_of(self, item: scan.HemisphereInput) -> bool:
         """Say whether a hemisphere is meant; a row without a session means any."""
         return (self.subject, self.hemi) == (item.subject, item.hemi) and (
             self.session in (None, item.session)
@@ -262,7 +253,7 @@ def _row(origin: str, row: dict[str, str]) -> EndRow:
     subject = cells["participant_id"].removeprefix("sub-")
     session = cells.get("session", "").removeprefix("ses-")
     hemi = cells["hemi"].upper()
-    if hemi not in HEMIS or not subject or subject == files.MISSING:
+    if hemi not in scan.HEMIS or not subject or subject == files.MISSING:
         fault = f"hemi {cells['hemi']!r} is not L or R" if subject else "it has no participant_id"
         raise InputError(f"{origin}: {fault}; correct it", reason="unreadable-table")
     end: GivenEnd | HipstaError
@@ -310,8 +301,8 @@ def _vector(cells: dict[str, str], names: Sequence[str]) -> tuple[float, float, 
 
 
 def attach_ends(
-    items: Sequence[HemisphereInput], path: Path | None
-) -> tuple[tuple[HemisphereInput, ...], tuple[str, ...]]:
+    items: Sequence[scan.HemisphereInput], path: Path | None
+) -> tuple[tuple[scan.HemisphereInput, ...], tuple[str, ...]]:
     """Attach the ends that a table has to the hemispheres, and note how many rows are of others.
 
     A row that cannot be used, or may be of several sessions, makes its hemispheres fail.
@@ -334,8 +325,8 @@ def attach_ends(
 
 
 def _attached(
-    item: HemisphereInput, rows: list[EndRow], items: Sequence[HemisphereInput]
-) -> HemisphereInput:
+    item: scan.HemisphereInput, rows: list[EndRow], items: Sequence[scan.HemisphereInput]
+) -> scan.HemisphereInput:
     problem: HipstaError | None = item.problem
     ends: dict[End, GivenEnd] = {}
     sessions = {other.session for other in items if other.subject == item.subject}

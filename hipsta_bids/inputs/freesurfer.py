@@ -14,13 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hipsta_bids.errors import HipstaError, InputError
-from hipsta_bids.inputs.scan import (
-    Folder,
-    HemisphereInput,
-    Source,
-    SubjectFolder,
-    VisitFolders,
-)
+from hipsta_bids.inputs import scan
 from hipsta_bids.inputs.selection import Selection
 from hipsta_bids.protocols.load import load_protocol
 
@@ -118,14 +112,14 @@ def volume_table(path: Path) -> Path | None:
     return path.with_name(f"{match['hemi']}h.hippoSfVolumes{match['analysis']}.txt")
 
 
-def without_labels(visit: VisitFolders) -> Iterator[Path]:
+def without_labels(visit: scan.VisitFolders) -> Iterator[Path]:
     """List the subjects' folders of FreeSurfer that hold no segmentation of subfields."""
     for folder in visit.folders:
         if folder.path.name == "mri" and not any(map(_NAME.fullmatch, folder.names)):
             yield folder.path.parent
 
 
-def same_labels(folders: Iterable[SubjectFolder]) -> dict[str, HipstaError]:
+def same_labels(folders: Iterable[scan.SubjectFolder]) -> dict[str, HipstaError]:
     """Describe, by label, the folders of several names that would get the same label."""
     spellings: dict[str, set[str]] = {}
     renamed = set()
@@ -145,8 +139,8 @@ def same_labels(folders: Iterable[SubjectFolder]) -> dict[str, HipstaError]:
 
 
 def find_freesurfer(
-    visit: VisitFolders, source: Source, selection: Selection
-) -> Iterator[HemisphereInput]:
+    visit: scan.VisitFolders, source: scan.Source, selection: Selection
+) -> Iterator[scan.HemisphereInput]:
     """Find FreeSurfer's segmentations of one visit.
 
     Taken are the files that are not resampled, of the preferred analysis (see
@@ -168,7 +162,7 @@ def find_freesurfer(
         if run.old and run.way:
             protocol = "freesurferFS60"
         coarse = "only .FSvoxelSpace exists: labels resampled to 1 mm lose thin layers"
-        yield HemisphereInput(
+        yield scan.HemisphereInput(
             subject=visit.subject,
             session=visit.session,
             hemi=hemi,
@@ -184,7 +178,7 @@ def find_freesurfer(
         )
 
 
-def _runs(visit: VisitFolders, hemi: str) -> list[_Run]:
+def _runs(visit: scan.VisitFolders, hemi: str) -> list[_Run]:
     """Group a hemisphere's files by analysis and resolution, best first."""
     runs: dict[tuple[object, ...], _Run] = {}
     for folder in _each_once(visit.folders):
@@ -201,7 +195,7 @@ def _runs(visit: VisitFolders, hemi: str) -> list[_Run]:
     return sorted(runs.values(), key=lambda run: run.rank)
 
 
-def _each_once(folders: tuple[Folder, ...]) -> tuple[Folder, ...]:
+def _each_once(folders: tuple[scan.Folder, ...]) -> tuple[scan.Folder, ...]:
     """Leave out longitudinal folders that are links to others here, as FastSurfer's tools make."""
     if not any(folder.longitudinal for folder in folders):
         return folders

@@ -8,15 +8,7 @@ from functools import cache, lru_cache
 from pathlib import Path
 
 from hipsta_bids.errors import HipstaError, InputError, ProtocolError
-from hipsta_bids.inputs.scan import (
-    HEMIS,
-    HemisphereInput,
-    Ignored,
-    Source,
-    VisitFolders,
-    list_folder,
-    unknown_protocol,
-)
+from hipsta_bids.inputs import scan
 from hipsta_bids.inputs.selection import Selection
 from hipsta_bids.inputs.tools import is_hippunfold
 from hipsta_bids.io.files import entities
@@ -121,7 +113,7 @@ def forget_tables() -> None:
 def _tables_in(folder: Path) -> tuple[dict[str, dict[str, str]], bool]:
     """List a folder's ``dseg.tsv`` tables by the entities they require, and look for ITK-SNAP's."""
     try:
-        names = list_folder(folder)[1]
+        names = scan.list_folder(folder)[1]
     except InputError:  # no such folder, which is the usual case for "snap"
         return {}, False
     parsed = {name: entities(name) for name in names if name.endswith("dseg.tsv")}
@@ -171,8 +163,8 @@ def is_edited(name: str) -> bool:
 
 
 def find_named(
-    visit: VisitFolders, source: Source, selection: Selection
-) -> Iterator[HemisphereInput]:
+    visit: scan.VisitFolders, source: scan.Source, selection: Selection
+) -> Iterator[scan.HemisphereInput]:
     """Find segmentations of one visit that a table or the user's protocol describes.
 
     Files whose table names no subiculum and CA1 are of something else, and are left out; so are
@@ -189,7 +181,7 @@ def find_named(
                 yield _choose(group, visit, hemi, source)
 
 
-def without_side(visit: VisitFolders) -> Iterator[Ignored]:
+def without_side(visit: scan.VisitFolders) -> Iterator[scan.Ignored]:
     """List label images whose names have a ``hemi`` that is neither L nor R."""
     for folder in visit.folders:
         for name in folder.names:
@@ -197,12 +189,18 @@ def without_side(visit: VisitFolders) -> Iterator[Ignored]:
                 continue
             pairs = entities(name)
             hemi = pairs.get("hemi", "")
-            if hemi not in HEMIS and pairs["suffix"] == "dseg" and pairs["extension"] in _IMAGES:
+            if (
+                hemi not in scan.HEMIS
+                and pairs["suffix"] == "dseg"
+                and pairs["extension"] in _IMAGES
+            ):
                 reason = f"hemi-{hemi} is neither hemi-L nor hemi-R"
-                yield Ignored(path=folder.path / name, reason=reason, subject=visit.subject)
+                yield scan.Ignored(path=folder.path / name, reason=reason, subject=visit.subject)
 
 
-def _choose(files: list[_File], visit: VisitFolders, hemi: str, source: Source) -> HemisphereInput:
+def _choose(
+    files: list[_File], visit: scan.VisitFolders, hemi: str, source: scan.Source
+) -> scan.HemisphereInput:
     best = files[0]
     problem = best.problem
     if problem is None and not _OWN_SPACE.fullmatch(best.space):
@@ -216,12 +214,12 @@ def _choose(files: list[_File], visit: VisitFolders, hemi: str, source: Source) 
     mismatches = [
         f"{k}-{named[k]}" for k, v in visit_entities.items() if v and named.get(k, v) != v
     ]
-    return HemisphereInput(
+    return scan.HemisphereInput(
         subject=visit.subject,
         session=visit.session,
         hemi=hemi,
         protocol=best.protocol
-        or unknown_protocol("unknown", f"Labels of {best.path.name}, not described"),
+        or scan.unknown_protocol("unknown", f"Labels of {best.path.name}, not described"),
         files=(best.path,),
         source=source.name,
         source_path=source.path,
@@ -232,7 +230,9 @@ def _choose(files: list[_File], visit: VisitFolders, hemi: str, source: Source) 
     )
 
 
-def _files(visit: VisitFolders, hemi: str, source: Source, selection: Selection) -> Iterator[_File]:
+def _files(
+    visit: scan.VisitFolders, hemi: str, source: scan.Source, selection: Selection
+) -> Iterator[_File]:
     for folder in visit.folders:
         for name in folder.names:
             if f"_hemi-{hemi}_" not in name or "dseg." not in name or is_edited(name):
@@ -251,7 +251,7 @@ def _files(visit: VisitFolders, hemi: str, source: Source, selection: Selection)
 
 
 def _describe(
-    path: Path, pairs: dict[str, str], source: Source, selection: Selection
+    path: Path, pairs: dict[str, str], source: scan.Source, selection: Selection
 ) -> _File | None:
     """Find out what a file's labels mean; None if they are not the hippocampus's."""
     space = pairs.get("space", "")
@@ -277,7 +277,7 @@ def _describe(
     return _File(path=path, space=space, protocol=protocol, origin=table.name)
 
 
-def _protocol_name(pairs: dict[str, str], source: Source) -> str:
+def _protocol_name(pairs: dict[str, str], source: scan.Source) -> str:
     """Name a protocol after the file's atlas, or else its dataset."""
     for text in (pairs.get("atlas"), pairs.get("seg"), source.name):
         plain = re.sub("[^A-Za-z0-9]", "", text or "")

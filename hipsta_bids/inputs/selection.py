@@ -10,16 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from hipsta_bids.errors import HipstaError, InputError, ProtocolError, UsageError
-from hipsta_bids.inputs.scan import (
-    HEMIS,
-    HemisphereInput,
-    Ignored,
-    InputRequest,
-    Source,
-    SubjectFolder,
-    VisitFolders,
-    plain_label,
-)
+from hipsta_bids.inputs import scan
 from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.protocols.protocol import Protocol
 
@@ -37,7 +28,7 @@ class Selection:
     """Empty for all, as in ``sessions``."""
     excluded: frozenset[str] = frozenset()
     sessions: frozenset[str] = frozenset()
-    hemis: tuple[str, ...] = HEMIS
+    hemis: tuple[str, ...] = scan.HEMIS
     rules: Mapping[str, _Rule] = field(default_factory=dict)
     """By entity, in pybids's long names; from the filter file."""
     fs_analysis: str | None = None
@@ -49,7 +40,7 @@ class Selection:
         """Check whether the user's protocol is one for the files of a tool."""
         return self.protocol is not None and self.protocol.tool in ("", tool)
 
-    def wants_folder(self, folder: SubjectFolder) -> bool:
+    def wants_folder(self, folder: scan.SubjectFolder) -> bool:
         """Check whether a subject's folder has to be looked into."""
         return (
             (not self.subjects or folder.subject in self.subjects)
@@ -58,21 +49,23 @@ class Selection:
             and self._passes("subject", folder.subject)
         )
 
-    def misses(self, entry: Ignored) -> bool:
+    def misses(self, entry: scan.Ignored) -> bool:
         """Check whether an entry that was not used belongs to a subject that is wanted."""
         subject = entry.subject
         return subject is None or (
             (not self.subjects or subject in self.subjects) and subject not in self.excluded
         )
 
-    def wants_visit(self, visit: VisitFolders) -> bool:
+    def wants_visit(self, visit: scan.VisitFolders) -> bool:
         """Check whether a session of a subject is wanted."""
         is_selected = not self.sessions or visit.session in self.sessions
         return is_selected and self._passes("session", visit.session)
 
     def wanted_hemis(self) -> tuple[str, ...]:
         """List the hemispheres that are wanted."""
-        return tuple(hemi for hemi in HEMIS if hemi in self.hemis and self._passes("hemi", hemi))
+        return tuple(
+            hemi for hemi in scan.HEMIS if hemi in self.hemis and self._passes("hemi", hemi)
+        )
 
     def wants_file(self, path: Path) -> bool:
         """Check whether a file with BIDS entities in its name is wanted."""
@@ -102,14 +95,14 @@ class SidedFile:
 
 def choose_file(
     files: Sequence[SidedFile],
-    visit: VisitFolders,
+    visit: scan.VisitFolders,
     hemi: str,
-    source: Source,
+    source: scan.Source,
     *,
     candidate: tuple[Protocol, HipstaError | None],
     explanation: tuple[str, str],
     passed_over: Iterable[tuple[str, str]],
-) -> HemisphereInput:
+) -> scan.HemisphereInput:
     """Take the first file of a hemisphere, unless another one is as good."""
     (protocol, problem), best = candidate, files[0]
     rivals = [file.path.name for file in files if file.rank == best.rank]
@@ -120,7 +113,7 @@ def choose_file(
             reason="several-files",
         )
     note = ", both hemispheres in one file" if best.hemi is None else ""
-    return HemisphereInput(
+    return scan.HemisphereInput(
         subject=visit.subject,
         session=visit.session,
         hemi=hemi,
@@ -135,11 +128,13 @@ def choose_file(
     )
 
 
-def make_selection(request: InputRequest) -> Selection:
+def make_selection(request: scan.InputRequest) -> Selection:
     """Prepare what the user asked for."""
-    wrong = [hemi for hemi in request.hemis if hemi not in HEMIS]
+    wrong = [hemi for hemi in request.hemis if hemi not in scan.HEMIS]
     if wrong or not request.hemis:
-        raise UsageError(f"--hemi {' '.join(map(str, wrong))}: choose among {', '.join(HEMIS)}")
+        raise UsageError(
+            f"--hemi {' '.join(map(str, wrong))}: choose among {', '.join(scan.HEMIS)}"
+        )
     choice = request.protocol or None
     return Selection(
         subjects=_labels(
@@ -165,9 +160,9 @@ def measurable(protocol: Protocol) -> Protocol:
     return protocol
 
 
-def _plain(request: InputRequest, labels: tuple[str, ...]) -> tuple[str, ...]:
+def _plain(request: scan.InputRequest, labels: tuple[str, ...]) -> tuple[str, ...]:
     """Read names of FreeSurfer's folders as labels, where these may have any name."""
-    return labels if request.freesurfer_dir is None else tuple(map(plain_label, labels))
+    return labels if request.freesurfer_dir is None else tuple(map(scan.plain_label, labels))
 
 
 def _labels(labels: Iterable[str], prefix: str, option: str) -> frozenset[str]:

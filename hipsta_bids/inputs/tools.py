@@ -13,13 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hipsta_bids.errors import HipstaError, InputError, ProtocolError
-from hipsta_bids.inputs.scan import (
-    Folder,
-    HemisphereInput,
-    Source,
-    VisitFolders,
-    unknown_protocol,
-)
+from hipsta_bids.inputs import scan
 from hipsta_bids.inputs.selection import Selection, SidedFile, choose_file
 from hipsta_bids.io.files import entities
 from hipsta_bids.protocols.load import load_protocol, protocol_names
@@ -69,8 +63,8 @@ _TOOLS = (
 
 
 def find_tools(
-    visit: VisitFolders, source: Source, selection: Selection
-) -> Iterator[HemisphereInput]:
+    visit: scan.VisitFolders, source: scan.Source, selection: Selection
+) -> Iterator[scan.HemisphereInput]:
     """Find the segmentations of these tools in one visit."""
     for tool in _TOOLS:
         candidates = [
@@ -94,7 +88,7 @@ def find_tools(
 
 
 def _files(
-    folder: Folder, tool: _Tool, source: Source, selection: Selection
+    folder: scan.Folder, tool: _Tool, source: scan.Source, selection: Selection
 ) -> Iterator[SidedFile]:
     """List the files of one tool in a folder."""
     named = tool.name == (selection.protocol.tool if selection.protocol else None) or any(
@@ -127,7 +121,11 @@ def _protocol(
         return fitting[0], f"protocol {fitting[0].name}", None
     names = " or ".join(f"--scheme {each.name} ({each.title})" for each in fitting)
     problem = ProtocolError(f"{path}: {tool.choice}; say which: {names}", reason="ambiguous-scheme")
-    return unknown_protocol(tool.name, f"{tool.title}, mode not given"), "mode not given", problem
+    return (
+        scan.unknown_protocol(tool.name, f"{tool.title}, mode not given"),
+        "mode not given",
+        problem,
+    )
 
 
 _HIPPUNFOLD = "hippunfold"
@@ -160,7 +158,7 @@ class _UnfoldFile:
         return self.scaled, atlas, not self.cropped, self.path.name
 
 
-def is_hippunfold(name: str, source: Source) -> bool:
+def is_hippunfold(name: str, source: scan.Source) -> bool:
     """Check whether a file is HippUnfold's segmentation of hippocampal subfields."""
     if "desc-subfields" not in name or "_hemi-" not in name:
         return False
@@ -176,8 +174,8 @@ def is_hippunfold(name: str, source: Source) -> bool:
 
 
 def find_hippunfold(
-    visit: VisitFolders, source: Source, selection: Selection
-) -> Iterator[HemisphereInput]:
+    visit: scan.VisitFolders, source: scan.Source, selection: Selection
+) -> Iterator[scan.HemisphereInput]:
     """Find HippUnfold's segmentations of one visit.
 
     ``space-crop*`` comes first (the finest grid in the subject's own space), then the image's own
@@ -191,7 +189,7 @@ def find_hippunfold(
         is_known = best.atlas in _ATLASES
         users = selection.protocol if not is_known and selection.describes(_HIPPUNFOLD) else None
         note = "labels on the image's own grid, which may be coarse; no space-crop* file exists"
-        yield HemisphereInput(
+        yield scan.HemisphereInput(
             subject=visit.subject,
             session=visit.session,
             hemi=hemi,
@@ -207,7 +205,7 @@ def find_hippunfold(
 
 
 def _unfold_files(
-    visit: VisitFolders, hemi: str, source: Source, selection: Selection
+    visit: scan.VisitFolders, hemi: str, source: scan.Source, selection: Selection
 ) -> Iterator[_UnfoldFile]:
     for folder in visit.folders:
         for name in folder.names:

@@ -298,12 +298,12 @@ def _measure(job: Job) -> Outcome:
                 record |= mapped.record
         spread = None
         if job.copies:
-            from hipsta_bids.participant.uncertainty import (  # noqa: PLC0415  (as above)
-                estimate_uncertainty,
-            )
+            from hipsta_bids.participant import uncertainty  # noqa: PLC0415  (heavy)
 
             with clock("uncertainty"):
-                spread = estimate_uncertainty(volume, job.item.hemi, job.settings, job.copies)
+                spread = uncertainty.estimate_uncertainty(
+                    volume, job.item.hemi, job.settings, job.copies
+                )
                 maps = replace(maps, qc={**maps.qc, **spread.metrics})
                 record["notes"] = [*record["notes"], *spread.notes]
         with clock("write"):

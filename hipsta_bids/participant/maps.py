@@ -14,14 +14,8 @@ from hipsta_bids.derivatives import hemisphere
 from hipsta_bids.derivatives.dataset import source_address
 from hipsta_bids.derivatives.hemisphere import ResultPlace
 from hipsta_bids.errors import InputError
+from hipsta_bids.geometry import sampling
 from hipsta_bids.geometry.catalog import MAPS
-from hipsta_bids.geometry.sampling import (
-    Regions,
-    RegionStatistics,
-    SampledMap,
-    sample_on_sheet,
-    summarize_regions,
-)
 from hipsta_bids.inputs.maps import read_regions
 from hipsta_bids.inputs.scan import HemisphereInput, MapSource
 from hipsta_bids.io import files, gifti
@@ -40,7 +34,7 @@ def _column_names(name: str, count: int) -> list[str]:
 
 
 def write_map(
-    place: ResultPlace, source: MapSource, sampled: SampledMap, about: Mapping[str, object]
+    place: ResultPlace, source: MapSource, sampled: sampling.SampledMap, about: Mapping[str, object]
 ) -> None:
     """Write one map: table, sidecar and GIFTI."""
     count = sampled.values.shape[2]
@@ -75,7 +69,9 @@ def _cells(values: Float, digits: int = 7) -> list[str]:
     return [f"{v:.{digits}g}" if np.isfinite(v) else files.MISSING for v in values.tolist()]
 
 
-def _write_regions(place: ResultPlace, regions: Regions, statistics: RegionStatistics) -> None:
+def _write_regions(
+    place: ResultPlace, regions: sampling.Regions, statistics: sampling.RegionStatistics
+) -> None:
     """Write one row per region, and the sidecar."""
     definitions: dict[str, dict[str, object]] = {
         "region": {"Description": "region, as the user named it"},
@@ -111,8 +107,8 @@ def _write_regions(place: ResultPlace, regions: Regions, statistics: RegionStati
 class Mapped:
     """What was sampled on one sheet."""
 
-    maps: tuple[tuple[MapSource, SampledMap], ...] = ()
-    regions: Regions | None = None
+    maps: tuple[tuple[MapSource, sampling.SampledMap], ...] = ()
+    regions: sampling.Regions | None = None
     record: Mapping[str, Any] = field(default_factory=dict)
     """For the quality record."""
 
@@ -184,10 +180,10 @@ def add_signals(
 
 def _sample(
     source: MapSource, path: Path, maps: HemisphereMaps, settings: MapSettings
-) -> SampledMap:
+) -> sampling.SampledMap:
     from hipsta_bids.io.volumes import read_scalars  # noqa: PLC0415  (nibabel, in workers only)
 
-    sampled = sample_on_sheet(
+    sampled = sampling.sample_on_sheet(
         read_scalars(path, maps.sheet.points.reshape(-1, 3)),
         maps.layers if source.sampling == "depth" else maps.sheet,
         settings,
@@ -211,7 +207,7 @@ def write_signals(place: ResultPlace, maps: HemisphereMaps, mapped: Mapped) -> N
         kind = numbers if source.interpolation == "linear" else labels
         kind |= {name: sampled.values[:, :, k] for k, name in enumerate(columns)}
     if mapped.regions is not None:
-        statistics = summarize_regions(mapped.regions, maps.sheet, numbers, labels)
+        statistics = sampling.summarize_regions(mapped.regions, maps.sheet, numbers, labels)
         _write_regions(place, mapped.regions, statistics)
 
 

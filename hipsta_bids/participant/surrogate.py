@@ -10,13 +10,8 @@ from hipsta_bids.derivatives import dataset
 from hipsta_bids.derivatives.hemisphere import ResultPlace, format_column, read_sheet
 from hipsta_bids.derivatives.names import HemisphereName
 from hipsta_bids.errors import ExitCode, HipstaError, InputError, OutputError, ProtocolError
+from hipsta_bids.geometry import surrogate
 from hipsta_bids.geometry.body import extract_body
-from hipsta_bids.geometry.surrogate import (
-    SurrogateProfile,
-    agreement,
-    compare_nearby,
-    surrogate_profiles,
-)
 from hipsta_bids.inputs.labels import read_label_volume
 from hipsta_bids.inputs.scan import HemisphereInput
 from hipsta_bids.io import files
@@ -88,10 +83,12 @@ def _measure(item: HemisphereInput, place: ResultPlace, settings: Settings) -> l
     rows: list[list[str]] = []
     lines = []
     for position in settings.surrogate.positions:
-        for profile in surrogate_profiles(body, position, settings.sheet, settings.surrogate):
+        for profile in surrogate.surrogate_profiles(
+            body, position, settings.sheet, settings.surrogate
+        ):
             mesh = np.full(len(profile.points), np.nan)
             if sheet is not None:
-                mesh = compare_nearby(profile.points, *sheet, MATCH_REACH)
+                mesh = surrogate.compare_nearby(profile.points, *sheet, MATCH_REACH)
             rows += _rows(profile, mesh)
             if profile.sampling == "proportional":
                 lines.append(_line(profile, mesh))
@@ -113,16 +110,16 @@ def _read_sheet(place: ResultPlace) -> tuple[Float, Float] | None:
     return None
 
 
-def _rows(profile: SurrogateProfile, mesh: Float) -> Iterator[list[str]]:
+def _rows(profile: surrogate.SurrogateProfile, mesh: Float) -> Iterator[list[str]]:
     places = (profile.fraction, profile.distance, *profile.points.T)
     columns = (format_column(column, _DIGITS) for column in (*places, profile.thickness, mesh))
     for number, cells in enumerate(zip(*columns, strict=True), start=1):
         yield [f"{profile.position:g}", profile.sampling, str(number), *cells]
 
 
-def _line(profile: SurrogateProfile, mesh: Float) -> str:
+def _line(profile: surrogate.SurrogateProfile, mesh: Float) -> str:
     line = f"slice at {profile.position:.0%}: mean thickness {profile.thickness.mean():.3f} mm"
-    comparison = agreement(profile.thickness, mesh)
+    comparison = surrogate.agreement(profile.thickness, mesh)
     if not comparison.count:
         return f"{line} (no sheet to compare with)"
     return (

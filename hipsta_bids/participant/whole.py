@@ -14,15 +14,10 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
+from hipsta_bids import types
 from hipsta_bids.errors import GeometryError
+from hipsta_bids.geometry import catalog
 from hipsta_bids.geometry.body import Body, check_side
-from hipsta_bids.geometry.catalog import (
-    Measured,
-    average_profiles,
-    measure_maps,
-    measure_sections,
-    summarize,
-)
 from hipsta_bids.geometry.checks import name_place
 from hipsta_bids.geometry.digital import voxel_points
 from hipsta_bids.geometry.disk import (
@@ -47,20 +42,7 @@ from hipsta_bids.geometry.mesh import fill_surface, tetra_quality, triangle_area
 from hipsta_bids.geometry.sheet import coordinates_at, fill_points, label_sheet, sheet_levels
 from hipsta_bids.protocols.protocol import CORE, LATERAL_END, MEDIAL_END, Tissue
 from hipsta_bids.settings import Settings
-from hipsta_bids.types import (
-    Bool,
-    Coordinates,
-    End,
-    Finding,
-    Flag,
-    Float,
-    HemisphereMaps,
-    Int,
-    LabelVolume,
-    Sheet,
-    Surface,
-    TetMesh,
-)
+from hipsta_bids.types import Bool, Finding, Float, Int, Sheet
 
 Clock = Callable[[str], AbstractContextManager[None]]
 
@@ -104,14 +86,14 @@ class Own(NamedTuple):
     """The body's own sheet, and what it was found in."""
 
     body: Body
-    mesh: TetMesh
-    coordinates: Coordinates
-    flags: tuple[Flag, ...]
+    mesh: types.TetMesh
+    coordinates: types.Coordinates
+    flags: tuple[types.Flag, ...]
 
 
 def measure_whole(
-    volume: LabelVolume, hemi: str, settings: Settings, clock: Clock, body_alone: Own
-) -> HemisphereMaps:
+    volume: types.LabelVolume, hemi: str, settings: Settings, clock: Clock, body_alone: Own
+) -> types.HemisphereMaps:
     """Measure head, body and, unless the region is ``headbody``, tail on one sheet.
 
     ``body_alone`` is the body measured alone. The other arguments, result and errors are those of
@@ -151,7 +133,7 @@ def measure_whole(
         whole = _sample(disk, plane, lines_of, edge_to_edge, 0.0)
         subfield = label_sheet(sheet, body)
     with clock("measures"):
-        measured = Measured(
+        measured = catalog.Measured(
             body=body,
             surface=surface,
             mesh=mesh,
@@ -160,7 +142,7 @@ def measure_whole(
             whole=whole,
             settings=settings,
         )
-        all_maps = measure_maps(measured)
+        all_maps = catalog.measure_maps(measured)
         maps = {k: np.where(sheet.valid, v, np.nan) for k, v in all_maps.items()}
         maps["distortion"] = _distortion(sheet)
         maps["proximodistal"] = at_nodes(disk, plane, proximodistal(disk, edges), *axes[:2])
@@ -169,16 +151,16 @@ def measure_whole(
         area = float(triangle_areas(disk.vertices, disk.triangles).sum())
         masked = max(0.0, 1 - measured_area / area)
         findings = [*_findings(disk, edges, folded, masked, region), *folds]
-        return HemisphereMaps(
+        return types.HemisphereMaps(
             sheet=sheet,
             layers=sheet,
             maps=maps,
-            profiles=average_profiles(all_maps, sheet),
-            sections=measure_sections(measured),
+            profiles=catalog.average_profiles(all_maps, sheet),
+            sections=catalog.measure_sections(measured),
             subfield=subfield,
             repaired=np.zeros(subfield.shape, dtype=bool),
             body_mask=volume.in_file(tissue > 0),
-            summary=summarize(measured, volume.protocol.sheet),
+            summary=catalog.summarize(measured, volume.protocol.sheet),
             qc={
                 "region": region,
                 "experimental": True,
@@ -204,11 +186,13 @@ def measure_whole(
                 *(replace(f, message=f"the body alone: {f.message}") for f in body_alone.flags),
             ),
             mesh=mesh,
-            coordinates=Coordinates(values=np.column_stack([np.full((len(u), 2), np.nan), u])),
+            coordinates=types.Coordinates(
+                values=np.column_stack([np.full((len(u), 2), np.nan), u])
+            ),
         )
 
 
-def check_fine(volume: LabelVolume) -> None:
+def check_fine(volume: types.LabelVolume) -> None:
     """Refuse voxels in which head and tail cannot be measured."""
     longest = float(np.linalg.norm(volume.affine[:3, :3], axis=0).max())
     if longest > MAX_VOXEL + _TOLERANCE:
@@ -229,7 +213,11 @@ def _check_pieces(disk: Disk) -> None:
 
 
 def _edges(
-    disk: Disk, body: Body, volume: LabelVolume, height: Callable[[Float, End], Float], region: str
+    disk: Disk,
+    body: Body,
+    volume: types.LabelVolume,
+    height: Callable[[Float, types.End], Float],
+    region: str,
 ) -> Edges:
     """Find edges and ends of the sheet on the boundary, by the labels beside it."""
     points = disk.vertices[disk.loop]
@@ -306,7 +294,7 @@ def _sample(
 
 
 def _lost_clefts(
-    surface: Surface, faces: Faces, sheet: Sheet, head: Bool
+    surface: types.Surface, faces: Faces, sheet: Sheet, head: Bool
 ) -> tuple[Sheet, list[Finding]]:
     """Find clefts that the labels do not have, and take the values there from the sheet.
 

@@ -10,14 +10,7 @@ from numpy.typing import NDArray
 
 from hipsta_bids.errors import UsageError, did_you_mean
 from hipsta_bids.io import files
-from hipsta_bids.phantom.dataset import (
-    Hemisphere,
-    Participants,
-    refuse_taken,
-    rigid_motion,
-    write_dataset,
-    write_sidecar,
-)
+from hipsta_bids.phantom import dataset
 from hipsta_bids.phantom.head import HeadPhantom, HeadSpec
 from hipsta_bids.phantom.labels import SUBFIELD_STARTS
 from hipsta_bids.phantom.phantom import Phantom
@@ -149,7 +142,7 @@ class Subject:
     icv: float
     """mL."""
     site: str
-    hemispheres: tuple[Hemisphere, ...]
+    hemispheres: tuple[dataset.Hemisphere, ...]
 
 
 def make_cohort(plan: CohortPlan) -> list[Subject]:
@@ -181,7 +174,7 @@ def _make_subject(plan: CohortPlan, number: int) -> Subject:
     wall += plan.subject_sd * float(random.standard_normal())
     scale = float(np.cbrt(icv / _ICV_MEAN))
     offset = plan.shift * dose + plan.offset_sd * float(random.standard_normal())
-    pose = rigid_motion(_three(random, _TURN), _three(random, _SHIFT))
+    pose = dataset.rigid_motion(_three(random, _TURN), _three(random, _SHIFT))
     label = f"{plan.site}{number + 1:0{max(2, len(str(plan.n_subjects)))}d}"
     hemispheres = []
     for hemi in "LR":
@@ -191,7 +184,7 @@ def _make_subject(plan: CohortPlan, number: int) -> Subject:
             spec = _spec(plan, thickness=thickness, scale=scale, offset=offset, dose=dose)
         else:
             spec = _head(plan, thickness=thickness, scale=scale, dose=dose)
-        hemispheres.append(Hemisphere(subject=label, hemi=hemi, spec=spec, pose=pose))
+        hemispheres.append(dataset.Hemisphere(subject=label, hemi=hemi, spec=spec, pose=pose))
     return Subject(
         label=label,
         group=plan.groups[dose],
@@ -263,10 +256,10 @@ def write_cohort(
 
     ``voxel_size`` is in mm along left, inferior and anterior, the axes of the images.
     """
-    refuse_taken(out)
+    dataset.refuse_taken(out)
     subjects = make_cohort(plan)
     hemispheres = [item for subject in subjects for item in subject.hemispheres]
-    write_dataset(
+    dataset.write_dataset(
         out,
         hemispheres,
         layouts=(layout,),
@@ -279,7 +272,7 @@ def write_cohort(
     (_write_effect if plan.head is None else _write_head_effect)(out, plan)
 
 
-def _participants(plan: CohortPlan, subjects: Sequence[Subject]) -> Participants:
+def _participants(plan: CohortPlan, subjects: Sequence[Subject]) -> dataset.Participants:
     rows = {
         one.label: (one.group, f"{one.age:.1f}", one.sex, f"{one.icv:.1f}", one.site)
         for one in subjects
@@ -291,7 +284,7 @@ def _participants(plan: CohortPlan, subjects: Sequence[Subject]) -> Participants
     sites = {f"site{i}": f"{add:+g} mm of thickness" for i, add in enumerate(plan.sites, 1)}
     if plan.site:
         sites = {plan.site: f"{plan.thickness:g} mm of thickness at 65 years"}
-    return Participants(
+    return dataset.Participants(
         columns={
             "group": {"Description": "group of the cohort", "Levels": groups},
             "age": {"Description": "age", "Units": "year"},
@@ -309,7 +302,7 @@ def _grid() -> tuple[Float, Float]:
     return u, v
 
 
-def _write_maps(out: Path, item: Hemisphere, phantom: Phantom) -> None:
+def _write_maps(out: Path, item: dataset.Hemisphere, phantom: Phantom) -> None:
     """Write the true map of one hemisphere."""
     u, v = _grid()
     truth = phantom.truth(u, v, hemi=item.hemi, pose=item.pose)
@@ -345,7 +338,7 @@ def _write_effect(out: Path, plan: CohortPlan) -> None:
             "mm",
         ),
     }
-    write_sidecar(out / EFFECT_TABLE, columns, Plan=asdict(plan))
+    dataset.write_sidecar(out / EFFECT_TABLE, columns, Plan=asdict(plan))
 
 
 def _write_head_effect(out: Path, plan: CohortPlan) -> None:
@@ -363,7 +356,7 @@ def _write_head_effect(out: Path, plan: CohortPlan) -> None:
         "in_region": ("1 where the effect was planted", None),
         "difference": ("mean thickness of the second group minus that of the first", "mm"),
     }
-    write_sidecar(out / EFFECT_TABLE, columns, Plan=asdict(plan))
+    dataset.write_sidecar(out / EFFECT_TABLE, columns, Plan=asdict(plan))
 
 
 def _write_nodes(path: Path, columns: Mapping[str, NDArray[np.generic]]) -> None:
