@@ -38,9 +38,6 @@ RUN command -v strip || { apt-get update; apt-get install --yes --no-install-rec
     rm -r matplotlib/mpl-data/fonts/afm matplotlib/mpl-data/fonts/pdfcorefonts; \
     rm matplotlib/mpl-data/fonts/ttf/cm* matplotlib/mpl-data/fonts/ttf/DejaVuSansMono* \
         matplotlib/mpl-data/fonts/ttf/DejaVuSerif*; \
-    # Network protocols, cloud storage, and two more names of one library, which have become copies of it.
-    rm pyarrow/_flight.* pyarrow/_s3fs.* pyarrow/lib*_flight.* pyarrow/libarrow_s3.*; \
-    find pyarrow \( -name 'libarrow_python*.so' -o -name 'libarrow_python*.so.*.*' \) -delete; \
     # Of fontTools matplotlib takes what puts the letters of a text into PDF; it works uncompiled.
     rm -r fontTools/t1Lib fontTools/diff fontTools/svgLib fontTools/mtiLib fontTools/merge \
         fontTools/voltLib fontTools/ufoLib fontTools/cu2qu fontTools/qu2cu fontTools/varLib/instancer; \

@@ -93,8 +93,9 @@ def test_imports_are_the_declared_dependencies():
         "skimage": "scikit-image",
         "sklearn": "scikit-learn",
     }
-    optional = PROJECT["optional-dependencies"]["xarray"]
-    declared = {canonical(requirement) for requirement in (*PROJECT["dependencies"], *optional)}
+    extras = PROJECT["optional-dependencies"]
+    requirements = (*PROJECT["dependencies"], *extras["arrow"], *extras["xarray"])
+    declared = {canonical(requirement) for requirement in requirements}
     trees = (
         ast.parse(path.read_text(encoding="utf-8")) for path in (ROOT / "hipsta_bids").rglob("*.py")
     )

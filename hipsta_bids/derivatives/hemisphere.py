@@ -3,8 +3,10 @@
 The quality record is written last and removed first, so that it stands for a complete set.
 """
 
+import io
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -502,27 +504,13 @@ def read_sheet(
     Missing numbers are NaN, missing words empty. Without ``numbers`` all columns that hold numbers
     are read; without ``shape`` the last row says how many nodes there are.
     """
-    import pyarrow as pa  # noqa: PLC0415  (slow to load)
-    from pyarrow import csv  # noqa: PLC0415  (likewise)
-
     try:
         if numbers is None:
             with path.open(encoding="utf-8") as file:
                 columns = file.readline().rstrip("\n").split("\t")
             numbers = [name for name in columns if name not in {*NODES, *STATE}]
-        types = dict.fromkeys(numbers, pa.float64()) | dict.fromkeys(words, pa.string())
-        table = csv.read_csv(
-            path,
-            read_options=csv.ReadOptions(use_threads=False),
-            parse_options=csv.ParseOptions(delimiter="\t"),
-            convert_options=csv.ConvertOptions(
-                include_columns=["x", "y", *numbers, *words],
-                column_types=types,
-                null_values=[files.MISSING],
-                strings_can_be_null=True,
-            ),
-        )
-        x, y = (table.column(name).to_numpy() for name in NODES)
+        read = _columns_by_arrow if find_spec("pyarrow") else _columns_by_pandas
+        x, y, *values = read(path, numbers, words)
         nx, ny = shape or (int(x[-1]), int(y[-1]))
     except (OSError, ValueError, KeyError, IndexError) as error:  # pyarrow's are among these
         first = str(error).partition("\n")[0]
@@ -533,9 +521,54 @@ def read_sheet(
     if len(x) != nx * ny or (x != expected[0] + 1).any() or (y != expected[1] + 1).any():
         suffix = ", as the settings say" if shape else ""
         raise InputError(f"{path}: not a sheet of {nx} x {ny} nodes{suffix}; {_REDO}")
-    cells = {name: table.column(name) for name in numbers}
-    cells |= {name: table.column(name).fill_null("") for name in words}
-    return {name: column.to_numpy().reshape(nx, ny) for name, column in cells.items()}
+    names = (*numbers, *words)
+    return {name: column.reshape(nx, ny) for name, column in zip(names, values, strict=True)}
+
+
+def _columns_by_arrow(
+    path: Path, numbers: Sequence[str], words: Sequence[str]
+) -> list[NDArray[Any]]:
+    """Read node numbers, numbers and words of a table with pyarrow, an optional extra."""
+    import pyarrow as pa  # noqa: PLC0415  (slow to load)
+    from pyarrow import csv  # noqa: PLC0415  (likewise)
+
+    types = dict.fromkeys(numbers, pa.float64()) | dict.fromkeys(words, pa.string())
+    table = csv.read_csv(
+        path,
+        read_options=csv.ReadOptions(use_threads=False),
+        parse_options=csv.ParseOptions(delimiter="\t"),
+        convert_options=csv.ConvertOptions(
+            include_columns=[*NODES, *numbers, *words],
+            column_types=types,
+            null_values=[files.MISSING],
+            strings_can_be_null=True,
+        ),
+    )
+    columns = [table.column(name) for name in (*NODES, *numbers)]
+    columns += [table.column(name).fill_null("") for name in words]
+    return [column.to_numpy() for column in columns]
+
+
+def _columns_by_pandas(
+    path: Path, numbers: Sequence[str], words: Sequence[str]
+) -> list[NDArray[Any]]:
+    """Read the same with pandas, which takes longer."""
+    import pandas as pd  # noqa: PLC0415  (slow to load)
+
+    content = path.read_bytes()
+    header, *lines = content.splitlines()
+    if any(line.count(b"\t") != header.count(b"\t") for line in lines):
+        raise ValueError("rows differ in their number of columns")
+    table = pd.read_csv(
+        io.BytesIO(content),
+        sep="\t",
+        usecols=[*NODES, *numbers, *words],
+        dtype=dict.fromkeys(numbers, float) | dict.fromkeys(words, object),
+        na_values=[files.MISSING],
+        keep_default_na=False,
+    )
+    columns = [table[name] for name in (*NODES, *numbers)]
+    return [column.to_numpy() for column in (*columns, *(table[name].fillna("") for name in words))]
 
 
 def read_units(place: ResultPlace) -> dict[str, str]:

@@ -51,7 +51,7 @@ UNLOADABLE = """
 import ctypes, sys, sysconfig
 from pathlib import Path
 
-import numpy, pyarrow.lib, scipy, PIL.Image  # they say where their libraries are
+import numpy, scipy, PIL.Image  # they say where their libraries are
 site = Path(sysconfig.get_path("purelib"))
 files = [path for path in site.rglob("*.so*") if path.is_file()]
 bad = []

@@ -1,4 +1,5 @@
 import json
+import sys
 
 import meshio
 import nibabel as nib
@@ -13,13 +14,14 @@ from hipsta_bids.derivatives.hemisphere import (
     ResultPlace,
     fill_from_nearest,
     format_column,
+    read_sheet,
     remove_results,
     verdict,
     write_failure,
     write_results,
 )
 from hipsta_bids.derivatives.names import OUTPUTS, HemisphereName
-from hipsta_bids.errors import GeometryError
+from hipsta_bids.errors import GeometryError, InputError
 from hipsta_bids.geometry.catalog import DIERS, MAPS, SECTIONS, SUMMARY
 from hipsta_bids.io.gifti import COORDINATE_NAMES
 from hipsta_bids.types import Flag
@@ -51,6 +53,27 @@ def test_every_output_is_written(written):
     assert {path.name for path in place.path("qc").parent.iterdir()} == {
         place.path(output.key).name for output in OUTPUTS
     }
+
+
+def test_pandas_reads_sheets_as_pyarrow_does(written, monkeypatch):
+    path = written[0].path("sheet")
+    by_arrow = read_sheet(path, words=["subfield"])
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    by_pandas = read_sheet(path, words=["subfield"])
+    assert list(by_arrow) == list(by_pandas)
+    for name, values in by_arrow.items():
+        np.testing.assert_array_equal(by_pandas[name], values)
+        assert by_pandas[name].dtype == values.dtype
+
+
+@pytest.mark.parametrize("library", ["pyarrow", "pandas"])
+def test_a_table_cut_within_a_row_is_refused(written, library, monkeypatch):
+    path = written[0].path("sheet")
+    path.write_text(path.read_text().rstrip().rpartition("\t")[0] + "\n")
+    if library == "pandas":
+        monkeypatch.setitem(sys.modules, "pyarrow", None)
+    with pytest.raises(InputError, match="not readable as a sheet"):
+        read_sheet(path)
 
 
 def test_sheet_table(written):

@@ -3,6 +3,8 @@
 import json
 import re
 import shutil
+import subprocess
+import sys
 
 import numpy as np
 import pandas as pd
@@ -370,6 +372,42 @@ def test_large_cohorts_take_single_precision_and_no_copies(results, dataset, qui
     maps = [parquet.read_table(folder / "maps.parquet").to_pandas() for folder in (large, results)]
     pd.testing.assert_frame_equal(*maps, rtol=1e-6)
     assert not maps[0].equals(maps[1])
+
+
+def test_without_pyarrow_only_parquet_files_are_missing(results, dataset, quick):
+    """In a process of its own: pandas uses pyarrow where it is installed."""
+    program = """
+import sys
+from importlib.machinery import PathFinder
+class Without(PathFinder):
+    def find_spec(name, *arguments):
+        return None if name == "pyarrow" else PathFinder.find_spec(name, *arguments)
+sys.meta_path = [Without if finder is PathFinder else finder for finder in sys.meta_path]
+from hipsta_bids.cli.main import main
+from hipsta_bids.group.output import write
+write.draw_figures = lambda *_: iter(())
+sys.exit(main(sys.argv[1:]))
+"""
+    data, out = dataset
+    command = [data, out, "group", *quick, "--name", "bare", "--no-reports"]
+    run = subprocess.run(
+        [sys.executable, "-c", program, *map(str, command)],
+        check=False,
+        capture_output=True,
+        text=True,
+    )
+    assert run.returncode == 0, run.stderr
+    assert run.stderr.count("hipsta_bids[arrow]") == 1
+    before, after = (
+        {
+            path.name: path.read_bytes()
+            for path in folder.iterdir()
+            if path.suffix in {".tsv", ".gii", ".parquet"}
+        }
+        for folder in (results, out / "group" / "bare")
+    )
+    assert before.pop("maps.parquet")
+    assert before == after
 
 
 def test_first_of_several_sessions_is_analyzed(tmp_path, quick):

@@ -8,13 +8,12 @@ import re
 import shutil
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from functools import partial
+from functools import cache, partial
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
-import pyarrow as pa
-from pyarrow import parquet
 
 from hipsta_bids.derivatives.names import DATASET_FILES
 from hipsta_bids.group.cohort.collect import Exclusion
@@ -26,7 +25,7 @@ from hipsta_bids.group.output.figures import Drawing, draw_figures, encode
 from hipsta_bids.group.output.joint import JointMap, draw_joint, joint_peaks, joint_points
 from hipsta_bids.group.output.methods import methods_text
 from hipsta_bids.group.output.shapes import AverageShape
-from hipsta_bids.group.stats.arrays import Float, Int, SideMaps, blocks, return_memory, some_sheets
+from hipsta_bids.group.stats.arrays import Float, blocks, return_memory
 from hipsta_bids.group.stats.glm import FittedMaps, PointTest
 from hipsta_bids.group.stats.inference import Discoveries, MapKey
 from hipsta_bids.io import files, gifti
@@ -38,20 +37,7 @@ _LOGGER = logging.getLogger(__name__)
 
 #: Folder of all models, in the output dataset.
 GROUP_FOLDER = DATASET_FILES["group"]
-#: Name of the surface of the sheets in files.
-_SHEET_NAME = "sheet"
-#: Values per row group of maps, and participants per row group of scores; bounds the memory.
-_BLOCK, _ROWS_OF_SCORES = 500_000, 500
 _ROWS = 10_000  # of tables that are spelled at once
-
-_WORD = pa.dictionary(pa.int32(), pa.string())
-_SUFFIXES = {
-    "": "as measured",
-    "_registered": "after registration",
-    "_harmonized": "after registration and harmonization",
-}
-
-Columns = dict[str, pa.Array]
 
 
 def model_folder(root: Path, name: str) -> contextlib.AbstractContextManager[Path]:
@@ -114,11 +100,13 @@ def write_results(
     write_table(folder, "covariates", rows_of_model, described=False)
     write_table(folder, "design", tables.design_table(analysis), described=False)
     registered = {hemi: side.registered for hemi, side in analysis.sides.items()}
-    if registered or len(cohorts) > 1:
+    if (registered or len(cohorts) > 1) and _parquet_possible():
+        from hipsta_bids.group.output import parquet  # noqa: PLC0415  (an optional extra)
+
         states = [cohort.sides, registered]
         if analysis.harmonization is not None:
             states.append(analysis.harmonization.cohort.sides)
-        _write_maps(folder / "maps.parquet", cohorts, states if registered else [])
+        parquet.write_maps(folder / "maps.parquet", cohorts, states if registered else [])
     if templates := results.templates_of(analysis.sides):
         files.write_json(folder / "template.json", templates)
     if analysis.harmonization is not None:
@@ -245,129 +233,6 @@ def _cell(value: object) -> str:
     return format(value, ".10g") if isinstance(value, float) else str(value)
 
 
-def _write_maps(
-    path: Path, cohorts: Mapping[str, Cohort], states: Sequence[Mapping[str, SideMaps]]
-) -> None:
-    """Write all analyzed maps as one Parquet file: a row per visit, hemisphere and point.
-
-    The states of the sheets are those before and after each step; none without sheets.
-    """
-    fields = [pa.field(name, _WORD) for name in (PARTICIPANT, SESSION, "hemi")]
-    about = {"description": f"{_SHEET_NAME}, or the name of maps with points of their own"}
-    fields.append(pa.field("surface", _WORD, metadata=about))
-    about = {"description": "point of the surface, the first is 0; on the sheet y is the faster"}
-    fields.append(pa.field("vertex", pa.int32(), metadata=about))
-    about = {"description": "node of the sheet, the first is 1"}
-    fields += [pa.field(f"node_{axis}", pa.int16(), metadata=about) for axis in "xy"]
-    about = {"description": "coordinate on the sheet, -1 to 1", "unit": "1"}
-    fields += [pa.field(axis, pa.float32(), metadata=about) for axis in "xy"]
-    measures = list(next(iter(states[0].values())).maps) if states else []
-    for suffix, text in list(_SUFFIXES.items())[: len(states)]:
-        if suffix != "_harmonized":
-            fields.append(pa.field(f"subfield{suffix}", _WORD, metadata={"description": text}))
-        fields += [_number(f"{name}{suffix}", cohorts[SHEET], name, text) for name in measures]
-    fields += [
-        _number(name, one, name, "as given") for name, one in cohorts.items() if name != SHEET
-    ]
-    about = {
-        "description": "one row per visit, hemisphere and point; x from medial to lateral, y"
-        " from posterior to anterior; a column is empty where the surface lacks the measure"
-    }
-    rows = _map_blocks(cohorts, states)
-    _write_parquet(path, pa.schema(fields, metadata=about), rows)
-
-
-def _number(column: str, cohort: Cohort, measure: str, text: str) -> pa.Field:
-    about = {"unit": cohort.units.get(measure, "1"), "description": f"{measure}, {text}"}
-    return pa.field(column, pa.float32(), metadata=about)
-
-
-def _write_parquet(path: Path, schema: pa.Schema, rows: Iterable[Columns]) -> None:
-    """Write blocks of columns; those that a block lacks are empty.
-
-    Measured values hardly repeat: a dictionary of them takes longer than it saves.
-    """
-    repeated = [one.name for one in schema if one.name in "xy" or not pa.types.is_float32(one.type)]
-    try:
-        with parquet.ParquetWriter(
-            path, schema, compression="zstd", use_dictionary=repeated
-        ) as writer:
-            for columns in rows:
-                count = len(columns["hemi"])
-                arrays = [
-                    columns[field.name] if field.name in columns else pa.nulls(count, field.type)
-                    for field in schema
-                ]
-                writer.write_table(pa.table(arrays, schema=schema))
-    except OSError as error:
-        raise files.output_error(path, error) from error
-
-
-def _map_blocks(
-    cohorts: Mapping[str, Cohort], states: Sequence[Mapping[str, SideMaps]]
-) -> Iterator[Columns]:
-    for surface, cohort in cohorts.items():
-        if surface == SHEET and not states:
-            continue
-        for hemi, side in cohort.sides.items():
-            points = int(np.prod(side.shape))
-            for part in blocks(len(side.rows), max(_BLOCK // points, 1)):
-                rows = side.rows[part]
-                name = surface or _SHEET_NAME
-                columns = _visit_columns(cohort.table, rows, points, hemi=hemi, surface=name)
-                vertices = np.tile(np.arange(points, dtype=np.int32), len(rows))
-                columns["vertex"] = pa.array(vertices)
-                if side.mesh is None:
-                    columns |= _node_columns(cohort, side.shape, len(rows))
-                if surface == SHEET:
-                    for suffix, state in zip(_SUFFIXES, states, strict=False):
-                        columns[f"subfield{suffix}"] = _subfields(state[hemi], part)
-                        own_maps = some_sheets(state[hemi].maps, part)
-                        columns |= _value_columns(own_maps, slice(None), suffix)
-                else:
-                    columns |= _value_columns(side.maps, part)
-                yield columns
-
-
-def _visit_columns(table: pd.DataFrame, rows: Int, points: int, **words: str) -> Columns:
-    """Participants and sessions of all points of some rows, and words that all have."""
-    visits = table.iloc[rows]
-    texts = {
-        PARTICIPANT: visits[PARTICIPANT].tolist(),
-        SESSION: [s if isinstance(s, str) else None for s in visits[SESSION]],
-        **{name: [word] * len(rows) for name, word in words.items()},
-    }
-    index = pa.array(np.repeat(np.arange(len(rows), dtype=np.int32), points))
-    return {
-        name: pa.array(values, pa.string()).dictionary_encode().take(index)
-        for name, values in texts.items()
-    }
-
-
-def _node_columns(cohort: Cohort, shape: tuple[int, int], n_rows: int) -> Columns:
-    """Nodes of the sheet and their coordinates, for some rows."""
-    x, y = np.divmod(np.tile(np.arange(shape[0] * shape[1]), n_rows), shape[1])
-    return {
-        "node_x": pa.array((x + 1).astype(np.int16)),
-        "node_y": pa.array((y + 1).astype(np.int16)),
-        "x": pa.array(cohort.x[x].astype(np.float32)),
-        "y": pa.array(cohort.y[y].astype(np.float32)),
-    }
-
-
-def _value_columns(maps: Mapping[str, Float], part: slice, suffix: str = "") -> Columns:
-    return {
-        f"{name}{suffix}": pa.array(values[part].ravel(), pa.float32(), from_pandas=True)
-        for name, values in maps.items()
-    }
-
-
-def _subfields(side: SideMaps, part: slice) -> pa.Array:
-    codes = side.subfield[part].ravel().astype(np.int32)
-    indices = pa.array(codes, pa.int32(), mask=codes < 0)
-    return pa.DictionaryArray.from_arrays(indices, pa.array(side.names, pa.string()))
-
-
 def _write_surfaces(folder: Path, cohort: Cohort, analysis: results.Analysis) -> None:
     """Write the surfaces to draw statistics on."""
     for hemi, fitted in analysis.fitted.items():
@@ -475,25 +340,19 @@ def write_scores(
                 f"hemi-{hemi}_stat-{letter}_desc-{tables.entity_label(measure)}_statmap.shape.gii"
             )
             files.write_bytes(folder / name, content)
-    if not (sheets and sides):
-        return
-    shape = len(cohort.x), len(cohort.y)
-    measures = list(next(iter(sides.values())).scores)
-    about = {"unit": "1"}
-    fields = [pa.field(name, _WORD) for name in (PARTICIPANT, SESSION, "hemi")]
-    fields += [pa.field(name, pa.int16()) for name in ("node_x", "node_y")]
-    fields += [pa.field(f"{name}_{letter}", pa.float32(), metadata=about) for name in measures]
-    about = {
-        "description": f"{letter}-scores, one row per participant, hemisphere and node of the"
-        " registered sheet; nodes along x from medial to lateral, y from posterior to anterior"
-    }
-    rows = (
-        {
-            **_visit_columns(table, side.rows[part], shape[0] * shape[1], hemi=hemi),
-            **_node_columns(cohort, shape, len(side.rows[part])),
-            **_value_columns({n: one.w for n, one in side.scores.items()}, part, f"_{letter}"),
-        }
-        for hemi, side in sides.items()
-        for part in blocks(len(side.rows), _ROWS_OF_SCORES)
-    )
-    _write_parquet(folder / f"{letter}scores.parquet", pa.schema(fields, metadata=about), rows)
+    if sheets and sides and _parquet_possible():
+        from hipsta_bids.group.output import parquet  # noqa: PLC0415  (an optional extra)
+
+        parquet.write_scores(folder, cohort, table, sides, letter)
+
+
+@cache
+def _parquet_possible() -> bool:
+    """Return whether pyarrow is installed; say once what is missing without it."""
+    possible = find_spec("pyarrow") is not None
+    if not possible:
+        _LOGGER.warning(
+            "Parquet files (maps.parquet and scores of participants) are not written: install"
+            " pyarrow, or hipsta_bids with it: hipsta_bids[arrow]"
+        )
+    return possible
