@@ -37,7 +37,7 @@ class JointMap:
     found: Discoveries
 
     @property
-    def place(self) -> FittedMaps:
+    def fitted(self) -> FittedMaps:
         """What tells where the points are."""
         return next(iter(self.parts.values()))[0]
 
@@ -54,7 +54,7 @@ class JointMap:
 
 def joint_points(joint_map: JointMap) -> pd.DataFrame:
     """List all points of a map, with the p-value of each measure by itself."""
-    frame = frame_of(joint_map.cohort, joint_map.place)
+    frame = frame_of(joint_map.cohort, joint_map.fitted)
     columns = {
         **frame.columns,
         "n": np.min([fit.fits[measure].n for fit, measure in joint_map.parts.values()], axis=0),
@@ -72,11 +72,11 @@ def joint_peaks(joint: Sequence[JointMap], neighbors: int) -> pd.DataFrame:
     rows = []
     for joint_map in joint:
         frame, tests, z = (
-            frame_of(joint_map.cohort, joint_map.place),
+            frame_of(joint_map.cohort, joint_map.fitted),
             joint_map.tests,
             joint_map.test.statistic,
         )
-        edges = edges_of(joint_map.place.maps, neighbors)
+        edges = edges_of(joint_map.fitted.maps, neighbors)
         for cluster in find_clusters(joint_map.found.rejected, z, frame.subfield, edges):
             at = cluster.peak
             words = [
@@ -109,7 +109,7 @@ def draw_joint(
     by_contrast: dict[str, dict[str, JointMap]] = {}
     for joint_map in joint:
         by_contrast.setdefault(joint_map.key.contrast, {})[joint_map.key.hemi] = joint_map
-    places = {joint_map.key.hemi: joint_map.place for joint_map in joint}
+    places = {joint_map.key.hemi: joint_map.fitted for joint_map in joint}
     blocks = [list(_rows(i, name, own)) for i, (name, own) in enumerate(by_contrast.items())]
     return draw_pages(joint[0].cohort, places, shapes, views, blocks)
 

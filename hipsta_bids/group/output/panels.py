@@ -140,7 +140,7 @@ def _means(
     pair = bool(analysis.comparison.pair)
     kind = display.kind_of(measure, change=pair or set(sides) == {DIFFERENCE})
     low, high = display.scale_of(
-        kind, [fitted for member in means.values() for fitted in member.values()]
+        kind, [values for maps in means.values() for values in maps.values()]
     )
     title = "mean change" if pair else "mean"
     for index, (group, values) in enumerate(means.items()):

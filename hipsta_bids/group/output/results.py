@@ -255,7 +255,7 @@ def effects_of(parts: Sequence[Harmonization], templates: Mapping[str, str]) -> 
     return SavedEffects(
         column=plan.column,
         formula=plan.kept.formula,
-        levels={name: list(known_sites) for name, known_sites in plan.kept.levels.items()},
+        levels={name: list(levels) for name, levels in plan.kept.levels.items()},
         columns=list(plan.kept.names),
         sites={one: known_sites.get(one, plan.counts.get(one, 0)) for one in plan.sites},
         repeated=plan.visits.participant is not None,

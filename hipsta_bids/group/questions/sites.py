@@ -313,7 +313,7 @@ def _forest(meta: Meta, item: Item, point: int) -> pd.DataFrame:
     }
     if is_map:
         frame = meta.frame[item.model.hemi]
-        labels |= {name: site_effect[point] for name, site_effect in frame.position.items()}
+        labels |= {name: values[point] for name, values in frame.position.items()}
         labels["subfield"] = frame.subfield[point]
     rows: list[dict[str, Any]] = []
     for number, site in enumerate(meta.sites):
