@@ -374,7 +374,7 @@ def load(out_dir: str | Path, *, protocol: str | None = None, region: str = "bod
     selected = [
         side
         for side in hemispheres
-        if (side.place.name.seg, side.place.name.region) == (seg, region)
+        if (side.result.name.seg, side.result.name.region) == (seg, region)
     ]
     table = pd.DataFrame([_row(side) for side in selected])
     return Results(maps=_lazy_dataset(root, selected, table), table=table)
@@ -383,7 +383,7 @@ def load(out_dir: str | Path, *, protocol: str | None = None, region: str = "bod
 def _one_protocol(
     root: Path, hemispheres: list[Hemisphere], protocol: str | None, region: str
 ) -> str:
-    pairs = sorted({(side.place.name.seg, side.place.name.region) for side in hemispheres})
+    pairs = sorted({(side.result.name.seg, side.result.name.region) for side in hemispheres})
     names = [seg for seg, pair_region in pairs if pair_region == region]
     if not names or protocol not in {None, *names}:
         available = ", ".join(f"{seg} (region {pair_region})" for seg, pair_region in pairs)
@@ -397,7 +397,7 @@ def _one_protocol(
 
 
 def _row(side: Hemisphere) -> dict[str, object]:
-    entities = identity(side.place.name)
+    entities = identity(side.result.name)
     return {
         "participant_id": entities["subject"],
         "session_id": entities["session"],
@@ -433,7 +433,7 @@ def _lazy_dataset(root: Path, hemispheres: list[Hemisphere], table: pd.DataFrame
 
     def read(name: str, at: tuple[int, ...]) -> NDArray[Any] | None:
         key, _ = extras.get(name, (("sheet",), {}))
-        if at not in measured or not (path := measured[at].place.path(*key)).is_file():
+        if at not in measured or not (path := measured[at].result.path(*key)).is_file():
             return None
         if name == "position":
             columns = read_sheet(path, tuple(POSITION), shape=shape)
@@ -468,7 +468,7 @@ def _beside_sheets(measured: list[Hemisphere]) -> dict[str, tuple[tuple[str, ...
     maps = {entry["name"] for one in measured for entry in one.record.get("maps") or ()}
     variables = {}
     for key in (("uncertainty",), *(("map_table", name) for name in sorted(maps))):
-        paths = (one.place.path(*key).with_suffix(".json") for one in measured)
+        paths = (one.result.path(*key).with_suffix(".json") for one in measured)
         path = next((path for path in paths if path.is_file()), None)
         for name, about in files.read_json(path).items() if path else ():
             if name.endswith("_sd") if key == ("uncertainty",) else name.partition("_")[0] in maps:

@@ -69,7 +69,7 @@ def crosscheck(
             raise
         except HipstaError as error:
             errors.append(error)
-            warn(f"{title}  failed  [{error.reason}] {error}")
+            warn(f"{title}  failed  {error}")
     if not errors:
         return ExitCode.OK
     bad = all(isinstance(error, (InputError, ProtocolError)) for error in errors)

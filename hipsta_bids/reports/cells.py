@@ -144,6 +144,11 @@ def _quartiles(values: pd.Series) -> str:
     return f"{middle} ({low} to {high})"
 
 
+def _decimals(value: float, digits: int) -> str:
+    """Write a number with as many decimals, and a hyphen as its sign."""
+    return f"{value:.{digits}f}" if np.isfinite(value) else files.MISSING
+
+
 def _count(value: float) -> str:
     """Write a number of participants, which may be beyond all that was tried."""
     return f"{value:,.0f}" if np.isfinite(value) else "more"
@@ -164,6 +169,7 @@ def _deviations(scores: pd.Series) -> str:
 #: By the names that templates use.
 FILTERS: dict[str, Callable[..., str]] = {
     "number": number_text,
+    "decimals": _decimals,
     "p": p_text,
     "percent": percent_text,
     "count": _count,

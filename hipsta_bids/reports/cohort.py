@@ -33,7 +33,7 @@ OUTLIER = 3.5
 _MAD_TO_SD = 1.4826  # of a normal distribution
 
 #: Columns of the table, with shorter titles than those of the measures.
-_SHOWN = {
+_SUMMARY = {
     "thickness_mean": "Thickness",
     "curvature_mean": "Curvature",
     "volume": "Volume",
@@ -100,35 +100,35 @@ class Cohort:
 
     def like(self, name: HemisphereName) -> list[Hemisphere]:
         """Measured hemispheres of the same side, protocol and region."""
-        wanted = _kind(name)
-        return [h for h in self.hemispheres if h.measured and _kind(h.place.name) == wanted]
+        kind = _kind(name)
+        return [h for h in self.hemispheres if h.measured and _kind(h.result.name) == kind]
 
     def origin(self, hemisphere: Hemisphere) -> Origin | None:
         """Find the run that measured a hemisphere, if its log is there."""
-        return self.origins.get(hemisphere.place.name.title)
+        return self.origins.get(hemisphere.result.name.title)
 
     @cached_property
     def verdicts(self) -> Mapping[str, Verdict]:
         """What each hemisphere's page says first, by title of the hemisphere."""
-        return {h.place.name.title: verdict_of(h) for h in self.hemispheres}
+        return {h.result.name.title: verdict_of(h) for h in self.hemispheres}
 
     @cached_property
     def ranking(self) -> list[Hemisphere]:
         """All hemispheres, the most severe first; of equal ones by name."""
         severity = {title: verdict.severity for title, verdict in self.verdicts.items()}
-        return sorted(self.hemispheres, key=lambda h: -severity[h.place.name.title])
+        return sorted(self.hemispheres, key=lambda h: -severity[h.result.name.title])
 
     def profiles(self, name: HemisphereName, column: str) -> Float:
         """(N, Nx) means over y of a map, of all hemispheres of the same kind."""
         rows = [h.profile[column] for h in self.like(name) if column in h.profile]
-        same = [row for row in rows if len(row) == len(rows[0])]
-        return np.array(same, dtype=np.float64)
+        profiles = [row for row in rows if len(row) == len(rows[0])]
+        return np.array(profiles, dtype=np.float64)
 
     def values(self, name: HemisphereName, measure: str) -> Float:
         """Collect a number of all hemispheres of the same kind, without NaN."""
-        found = [other.summary.get(measure, np.nan) for other in self.like(name)]
-        every = np.array(found, dtype=np.float64)
-        return every[np.isfinite(every)]
+        values = [other.summary.get(measure, np.nan) for other in self.like(name)]
+        array = np.array(values, dtype=np.float64)
+        return array[np.isfinite(array)]
 
 
 def _kind(name: HemisphereName) -> tuple[str, str, str]:
@@ -141,8 +141,8 @@ def read_cohort(root: Path) -> Cohort:
         settings = files.read_json(root / DATASET_FILES["settings"]).get("settings") or {}
     except InputError:
         settings = {}
-    found = tuple(hemisphere for hemisphere in find_results(root) if _is_readable(hemisphere))
-    return Cohort(hemispheres=found, settings=settings, origins=_read_origins(root))
+    hemispheres = tuple(hemisphere for hemisphere in find_results(root) if _is_readable(hemisphere))
+    return Cohort(hemispheres=hemispheres, settings=settings, origins=_read_origins(root))
 
 
 def _is_readable(hemisphere: Hemisphere) -> bool:
@@ -172,39 +172,32 @@ def _read_origins(root: Path) -> dict[str, Origin]:
     return origins
 
 
-@dataclass(frozen=True, kw_only=True)
-class Distance:
-    """How far a hemisphere is from the others."""
-
-    value: float
-    """Largest robust z-score; NaN where there are too few others."""
-    measure: str
-    """Title of the number in which it is farthest."""
-
-
 def robust_scores(values: Float) -> Float:
     """Robust z-scores: distance from the median over the scaled median absolute deviation.
 
     NaN where values are missing, 0 where nothing varies.
     """
-    away = values - np.nanmedian(values, axis=0)
-    spread = _MAD_TO_SD * np.nanmedian(np.abs(away), axis=0)
-    return np.where(spread > 0, away / np.where(spread > 0, spread, 1.0), 0.0 * away)
+    differences = values - np.nanmedian(values, axis=0)
+    spread = _MAD_TO_SD * np.nanmedian(np.abs(differences), axis=0)
+    return np.where(spread > 0, differences / np.where(spread > 0, spread, 1.0), 0.0 * differences)
 
 
-def distances(cohort: Cohort, thickness: Mapping[str, Float]) -> dict[str, Distance]:
-    """Measure how far each hemisphere is from those of the same side, protocol and region."""
+def distances(cohort: Cohort, thickness: Mapping[str, Float]) -> dict[str, tuple[float, str]]:
+    """Compute how far each hemisphere is from those of the same side, protocol and region.
+
+    Returns its largest robust z-score and the title of that number; nothing of few hemispheres.
+    """
     kinds: dict[tuple[str, str, str], list[Hemisphere]] = {}
     for hemisphere in cohort.hemispheres:
         if hemisphere.measured:
-            kinds.setdefault(_kind(hemisphere.place.name), []).append(hemisphere)
-    found = {}
+            kinds.setdefault(_kind(hemisphere.result.name), []).append(hemisphere)
+    farthest_of = {}
     for members in kinds.values():
         if len(members) < SMALLEST_COMPARED:
             continue
         table = np.array([[h.summary.get(m.name, np.nan) for m in MEASURES] for h in members])
         titles = [m.title for m in MEASURES]
-        maps = [thickness.get(h.place.name.title, np.empty((0, 0))) for h in members]
+        maps = [thickness.get(h.result.name.title, np.empty((0, 0))) for h in members]
         scores = np.abs(np.nan_to_num(robust_scores(table)))
         if maps[0].size and len({m.shape for m in maps}) == 1:
             # A map much like the median map is no outlier.
@@ -213,17 +206,15 @@ def distances(cohort: Cohort, thickness: Mapping[str, Float]) -> dict[str, Dista
             titles.append("Map of thickness")
         for row, hemisphere in zip(scores, members, strict=True):
             farthest = int(np.argmax(row))
-            found[hemisphere.place.name.title] = Distance(
-                value=float(row[farthest]), measure=titles[farthest]
-            )
-    return found
+            farthest_of[hemisphere.result.name.title] = float(row[farthest]), titles[farthest]
+    return farthest_of
 
 
 def _departure(maps: Float) -> Float:
     """(N,) root mean square over the sheet of each map's difference from the median map, mm."""
     maps = np.where(np.isfinite(maps).any(axis=0), maps, 0.0)  # none departs where none is known
-    away = maps - np.nanmedian(maps, axis=0)
-    return np.asarray(np.sqrt(np.nanmean(away**2, axis=(1, 2))), dtype=np.float64)
+    differences = maps - np.nanmedian(maps, axis=0)
+    return np.asarray(np.sqrt(np.nanmean(differences**2, axis=(1, 2))), dtype=np.float64)
 
 
 def cohort_page(cohort: Cohort) -> str | None:
@@ -233,35 +224,35 @@ def cohort_page(cohort: Cohort) -> str | None:
         return None
     maps = [read_maps(h) if h.measured else {} for h in hemispheres]
     thickness = {
-        h.place.name.title: found["thickness"]
+        h.result.name.title: found["thickness"]
         for h, found in zip(hemispheres, maps, strict=True)
         if found
     }
-    apart = distances(cohort, thickness)
+    outliers = distances(cohort, thickness)
     sprites, grid = make_sprites(maps)
     counts = Counter(str(h.status) for h in hemispheres)
     rows = [
-        _row(h, cohort, apart.get(h.place.name.title), grid.tiles.get(n))
+        _row(h, cohort, outliers.get(h.result.name.title), grid.tiles.get(n))
         for n, h in enumerate(hemispheres)
     ]
     return render(
         "cohort.html",
         title="All hemispheres",
         n=len(hemispheres),
-        n_participants=len({h.place.name.subject for h in hemispheres}),
+        n_participants=len({h.result.name.subject for h in hemispheres}),
         counts=[(str(status), counts[str(status)]) for status in Status if counts[str(status)]],
         copies=[
             describe_copies(names)
-            for names in same_labels((h.place.name, h.record) for h in hemispheres)
+            for names in same_labels((h.result.name, h.record) for h in hemispheres)
         ],
-        n_apart=sum(distance.value > OUTLIER for distance in apart.values()),
+        n_apart=sum(score > OUTLIER for score, _ in outliers.values()),
         apart=OUTLIER,
         smallest=SMALLEST_COMPARED,
-        compared=bool(apart),
+        compared=bool(outliers),
         sprites=sprites,
         ratings=RATINGS,
         data={
-            "columns": _columns(hemispheres, compared=bool(apart)),
+            "columns": _columns(hemispheres, compared=bool(outliers)),
             "rows": rows,
             "apart": OUTLIER,
             "ratings": RATINGS,
@@ -276,7 +267,7 @@ def cohort_page(cohort: Cohort) -> str | None:
 
 def _columns(hemispheres: Sequence[Hemisphere], *, compared: bool) -> list[Mapping[str, Any]]:
     """Columns of the table; those of one protocol, or of bodies alone, are left out."""
-    names = [h.place.name for h in hemispheres]
+    names = [h.result.name for h in hemispheres]
     measures = {measure.name: measure for measure in MEASURES}
     columns: list[Mapping[str, Any]] = [{"key": "participant", "title": "Participant"}]
     if any(name.session for name in names):
@@ -303,7 +294,7 @@ def _columns(hemispheres: Sequence[Hemisphere], *, compared: bool) -> list[Mappi
         score = {"title": "Outlier score", "digits": 1, "help": "largest robust z-score"}
         columns.append({"key": "distance", **score})
         columns.append({"key": "farthest", "title": "Outlier measure"})
-    for key, title in _SHOWN.items():
+    for key, title in _SUMMARY.items():
         unit, digits = measures[key].unit, measures[key].digits
         columns.append({"key": key, "title": title, "unit": unit, "digits": digits})
     for key, title in _QUALITY.items():
@@ -313,11 +304,11 @@ def _columns(hemispheres: Sequence[Hemisphere], *, compared: bool) -> list[Mappi
 
 
 def _row(
-    hemisphere: Hemisphere, cohort: Cohort, distance: Distance | None, tile: int | None
+    hemisphere: Hemisphere, cohort: Cohort, distance: tuple[float, str] | None, tile: int | None
 ) -> dict[str, Any]:
-    name, record = hemisphere.place.name, hemisphere.record
+    name, record = hemisphere.result.name, hemisphere.record
     verdict = cohort.verdicts[name.title]
-    numbers = {key: hemisphere.summary.get(key, np.nan) for key in _SHOWN}
+    numbers = {key: hemisphere.summary.get(key, np.nan) for key in _SUMMARY}
     numbers |= {key: number(hemisphere.metrics, key) for key in _QUALITY}
     return {
         "key": name.title,
@@ -335,8 +326,8 @@ def _row(
         "status": str(hemisphere.status),
         "reason": record.get("reason") or "",
         "message": hemisphere.message,
-        "distance": round(distance.value, 2) if distance else None,
-        "farthest": distance.measure.partition(",")[0] if distance else "",
+        "distance": round(distance[0], 2) if distance else None,
+        "farthest": distance[1].partition(",")[0] if distance else "",
         "tile": tile,
         **{key: float(f"{v:.6g}") if np.isfinite(v) else None for key, v in numbers.items()},
     }

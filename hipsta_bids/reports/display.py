@@ -124,16 +124,16 @@ def kind_of(measure: str, *, change: bool = False) -> MapKind:
 
 def known(values: Sequence[Float]) -> Float:
     """Join arrays of any shape to the (N,) numbers in them, without NaN."""
-    every = np.concatenate([np.empty(0), *(np.ravel(array) for array in values)])
-    return np.asarray(every[np.isfinite(every)], dtype=np.float64)
+    joined = np.concatenate([np.empty(0), *(np.ravel(array) for array in values)])
+    return np.asarray(joined[np.isfinite(joined)], dtype=np.float64)
 
 
 def scale_of(kind: MapKind, values: Sequence[Float]) -> tuple[float, float]:
     """Return the values at both ends of the colors: fixed ones, or from the values shown."""
     if kind.limits is not None:
         return kind.limits
-    every = known(values)
-    low, high = np.percentile(every, kind.percentiles).tolist() if len(every) else (-1.0, 1.0)
+    joined = known(values)
+    low, high = np.percentile(joined, kind.percentiles).tolist() if len(joined) else (-1.0, 1.0)
     if kind.centered:
         high = max(abs(low), abs(high), _SMALLEST)
         return -high, high
@@ -225,8 +225,8 @@ def subfield_title(name: str) -> str:
 def palette(protocol: Protocol | None, names: Sequence[str]) -> dict[str, str]:
     """Choose the colors of subfields: the protocol's own, of the body where parts differ."""
     labels = protocol.labels if protocol is not None else ()
-    own = {
+    colors = {
         label.abbreviation or label.name: label.color
         for label in sorted(labels, key=lambda label: label.part is Part.BODY)
     }
-    return {name: own.get(name, COLORS[n % len(COLORS)]) for n, name in enumerate(names)}
+    return {name: colors.get(name, COLORS[n % len(COLORS)]) for n, name in enumerate(names)}

@@ -108,7 +108,7 @@ def draw_map(kind: MapKind, hemispheres: Sequence[Hemisphere]) -> Picture:
     image: Any = None
     for axis, hemisphere in zip(axes[0], hemispheres, strict=True):
         extents = [hemisphere.summary.get(f"extent_{a}", np.nan) for a in "xy"]
-        hemi = hemisphere.place.name.hemi
+        hemi = hemisphere.result.name.hemi
         image = draw_sheet(axis, hemisphere.sheet, kind, (low, high), extents=extents, hemi=hemi)
     axes[0, 0].set_ylabel("  ←  mm  →  ".join(Y_ENDS))
     figure.colorbar(
@@ -127,14 +127,14 @@ def draw_map(kind: MapKind, hemispheres: Sequence[Hemisphere]) -> Picture:
 
 
 def draw_profiles(
-    kind: MapKind, hemispheres: Sequence[Hemisphere], others: Mapping[str, Float]
+    kind: MapKind, hemispheres: Sequence[Hemisphere], cohorts: Mapping[str, Float]
 ) -> Picture:
     """Draw a map along x: its mean over y and the range of nine tenths of the rows."""
     figure, axes = _new_figure(1, 1, (5.6, 2.9))
     axis = axes[0, 0]
     bands = []
     for hemisphere in hemispheres:
-        hemi = hemisphere.place.name.hemi
+        hemi = hemisphere.result.name.hemi
         values = hemisphere.sheet.columns[kind.column]
         x = np.linspace(0, 100, values.shape[0])
         color = HEMISPHERE_COLORS[hemi]
@@ -142,7 +142,7 @@ def draw_profiles(
         bands += [low, high]
         axis.fill_between(x, low, high, color=color, alpha=0.18, linewidth=0)
         axis.plot(x, np.nanmean(values, axis=1), color=color, label=hemisphere.side)
-        cohort = others.get(hemi)
+        cohort = cohorts.get(hemi)
         if cohort is not None and len(cohort):
             style = {"color": color, "linewidth": 0.9, "linestyle": (0, (2, 2))}
             for line in np.nanpercentile(cohort, [5, 95], axis=0):
@@ -212,64 +212,64 @@ def draw_sheet(
     hemi: str,
 ) -> Any:  # noqa: ANN401  (matplotlib's mappables have no common public type)
     """Draw one map of a sheet, its extents along x and y in mm or else in nodes."""
-    known = bool(np.isfinite(extents).all())
-    sizes = extents if known else [float(n) for n in sheet.shape]
+    has_extents = bool(np.isfinite(extents).all())
+    sizes = extents if has_extents else [float(n) for n in sheet.shape]
     x, y = (np.linspace(0, size, n) for size, n in zip(sizes, sheet.shape, strict=True))
     names, hatched = sheet.subfield, ~sheet.valid
     if sheet.ends is not None:
         names, hatched = np.where(sheet.valid, names, ""), np.zeros_like(hatched)
-        y = _row_positions(sheet) if known and sheet.points else y
+        y = _row_positions(sheet) if has_extents and sheet.points else y
     values = sheet.columns[kind.column].T
     axis.set_facecolor("0.85")
     image = axis.pcolormesh(
         x, y, values, cmap=kind.colors, vmin=scale[0], vmax=scale[1], shading="nearest",
         rasterized=True,
     )  # fmt: skip
-    for where, hatch in ((sheet.repaired, "////"), (hatched, "xxxx")):
-        if where.any():
-            _hatch(axis, where, x, y, hatch)
+    for nodes, hatch in ((sheet.repaired, "////"), (hatched, "xxxx")):
+        if nodes.any():
+            _hatch(axis, nodes, x, y, hatch)
     _draw_borders(axis, names, x, y)
     if sheet.ends is not None:
         _draw_ends(axis, sheet, y)
     axis.set_aspect("equal")
     axis.set_title(SIDES.get(hemi, hemi))
-    axis.set_xlabel(f"  ←  {'mm' if known else 'nodes'}  →  ".join(X_ENDS))
+    axis.set_xlabel(f"  ←  {'mm' if has_extents else 'nodes'}  →  ".join(X_ENDS))
     return image
 
 
 def _row_positions(sheet: SheetTable) -> Float:
     """Mean distance of rows from the first, mm: tail, body and head have steps of their own."""
-    middle, both = sheet.points["midthickness"], sheet.valid[:, 1:] & sheet.valid[:, :-1]
+    middle, valid = sheet.points["midthickness"], sheet.valid[:, 1:] & sheet.valid[:, :-1]
     steps = np.linalg.norm(np.diff(middle, axis=1), axis=2)
-    some, rows = both.any(axis=0), np.arange(both.shape[1])
-    mean = np.where(both, steps, 0.0).sum(axis=0) / np.maximum(both.sum(axis=0), 1)
-    return np.append(0.0, np.cumsum(np.interp(rows, rows[some], mean[some])))
+    measured, rows = valid.any(axis=0), np.arange(valid.shape[1])
+    mean = np.where(valid, steps, 0.0).sum(axis=0) / np.maximum(valid.sum(axis=0), 1)
+    return np.append(0.0, np.cumsum(np.interp(rows, rows[measured], mean[measured])))
 
 
 def _draw_ends(axis: "Axes", sheet: SheetTable, y: Float) -> None:
     """Mark the ends of the body, and name the parts of the sheet at the right."""
-    known = np.flatnonzero(sheet.valid.any(axis=0))
-    axis.set_ylim(*_edges(y)[[known[0], known[-1] + 1]])
+    valid_rows = np.flatnonzero(sheet.valid.any(axis=0))
+    axis.set_ylim(*_edges(y)[[valid_rows[0], valid_rows[-1] + 1]])
     for row in sheet.end_rows:
         axis.axhline(y[row], color="black", linewidth=1, dashes=(4, 2))
     for name, first, last in sheet.parts:
-        shown = known[(known >= first) & (known <= last)]
-        if not len(shown):
+        part_rows = valid_rows[(valid_rows >= first) & (valid_rows <= last)]
+        if not len(part_rows):
             continue
         axis.text(
-            1.02, (y[shown[0]] + y[shown[-1]]) / 2, name,
+            1.02, (y[part_rows[0]] + y[part_rows[-1]]) / 2, name,
             ha="left", va="center", rotation=90, fontsize=8, transform=axis.get_yaxis_transform(),
         )  # fmt: skip
 
 
-def _hatch(axis: "Axes", where: NDArray[np.bool_], x: Float, y: Float, hatch: str) -> None:
+def _hatch(axis: "Axes", nodes: NDArray[np.bool_], x: Float, y: Float, hatch: str) -> None:
     from matplotlib.collections import PolyCollection  # noqa: PLC0415  (slow to load)
 
     x_edges, y_edges = _edges(x), _edges(y)
     cells = [
         [(x_edges[i], y_edges[j]), (x_edges[i + 1], y_edges[j]),
          (x_edges[i + 1], y_edges[j + 1]), (x_edges[i], y_edges[j + 1])]
-        for i, j in np.argwhere(where)
+        for i, j in np.argwhere(nodes)
     ]  # fmt: skip
     axis.add_collection(
         PolyCollection(cells, facecolors="none", edgecolors="black", linewidths=0, hatch=hatch)
@@ -287,17 +287,17 @@ def _draw_borders(axis: "Axes", names: NDArray[np.str_], x: Float, y: Float) -> 
     from matplotlib.collections import LineCollection  # noqa: PLC0415  (slow to load)
 
     x_edges, y_edges = _edges(x), _edges(y)
-    known = names != ""
-    across = np.argwhere((names[1:] != names[:-1]) & known[1:] & known[:-1])
-    along = np.argwhere((names[:, 1:] != names[:, :-1]) & known[:, 1:] & known[:, :-1])
+    named = names != ""
+    across = np.argwhere((names[1:] != names[:-1]) & named[1:] & named[:-1])
+    along = np.argwhere((names[:, 1:] != names[:, :-1]) & named[:, 1:] & named[:, :-1])
     lines = [
         *(((x_edges[i + 1], y_edges[j]), (x_edges[i + 1], y_edges[j + 1])) for i, j in across),
         *(((x_edges[i], y_edges[j + 1]), (x_edges[i + 1], y_edges[j + 1])) for i, j in along),
     ]
     axis.add_collection(LineCollection(lines, colors="white", linewidths=2.2))
     axis.add_collection(LineCollection(lines, colors="black", linewidths=1.0))
-    fields = np.unique(names[known])
-    staggered = 0.07 * (y[-1] - y[0]) if known.any() and not known.all() else 0.0
+    fields = np.unique(names[named])
+    staggered = 0.07 * (y[-1] - y[0]) if named.any() and not named.all() else 0.0
     for name, side in zip(fields, cycle((-1, 1)), strict=False):
         i, j = np.nonzero(names == name)
         label = {"facecolor": "white", "alpha": 0.75, "edgecolor": "none", "pad": 1.2}
@@ -331,22 +331,6 @@ def _mark_subfields(axis: "Axes", hemisphere: Hemisphere) -> None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Sprites:
-    """All maps of one kind."""
-
-    name: str
-    title: str
-    unit: str
-    low: str
-    high: str
-    """Values at the ends of the colors."""
-    gradient: str
-    """Of the color bar, in CSS."""
-    address: str
-    """Data address of the picture."""
-
-
-@dataclass(frozen=True, kw_only=True)
 class Grid:
     """Where tiles lie in the pictures."""
 
@@ -359,31 +343,31 @@ class Grid:
 def read_maps(hemisphere: Hemisphere) -> dict[str, Float]:
     """Read the maps that are shown, faster than the whole sheet."""
     try:
-        return read_sheet(hemisphere.place.path("sheet"), [kind.column for kind in MAP_KINDS])
+        return read_sheet(hemisphere.result.path("sheet"), [kind.column for kind in MAP_KINDS])
     except InputError:
         return {}
 
 
-def make_sprites(maps: Sequence[Mapping[str, Float]]) -> tuple[list[Sprites], Grid]:
+def make_sprites(maps: Sequence[Mapping[str, Float]]) -> tuple[list[dict[str, Any]], Grid]:
     """Draw the maps of all hemispheres, on tiles for the longest; without one, a tile is empty."""
     shapes = [found[MAP_KINDS[0].column].shape for found in maps if found]
     usual = max(set(shapes), key=shapes.count) if shapes else (0, 0)
-    shown = [
+    drawn = [
         row
         for row, found in enumerate(maps)
         if found and next(iter(found.values())).shape[0] == usual[0]
     ]
     longest = max((shape[1] for shape in shapes if shape[0] == usual[0]), default=0)
     grid = Grid(
-        columns=min(_COLUMNS, max(1, len(shown))),
-        rows=max(1, -(-len(shown) // _COLUMNS)),
-        tiles={row: tile for tile, row in enumerate(shown)},
+        columns=min(_COLUMNS, max(1, len(drawn))),
+        rows=max(1, -(-len(drawn) // _COLUMNS)),
+        tiles={row: tile for tile, row in enumerate(drawn)},
     )
-    step = 1 if len(shown) <= _FULL_SIZE else 2
+    step = 1 if len(drawn) <= _FULL_SIZE else 2
     sprites = []
-    for kind in MAP_KINDS if shown else ():
-        scale = scale_of(kind, [maps[row][kind.column] for row in shown])
-        tiles = [_longer(maps[row][kind.column], longest)[::step, ::step] for row in shown]
+    for kind in MAP_KINDS if drawn else ():
+        scale = scale_of(kind, [maps[row][kind.column] for row in drawn])
+        tiles = [_longer(maps[row][kind.column], longest)[::step, ::step] for row in drawn]
         sprites.append(_sprites(kind, tiles, grid, scale))
     return sprites, grid
 
@@ -398,7 +382,7 @@ def _sprites(
     maps: Sequence[Float],
     grid: Grid,
     scale: tuple[float, float],
-) -> Sprites:
+) -> dict[str, Any]:
     low, high = scale
     width, height = maps[0].shape
     picture = np.full((grid.rows * height, grid.columns * width), _COLORS, dtype=np.uint8)
@@ -409,15 +393,8 @@ def _sprites(
         window = np.s_[row * height : (row + 1) * height, column * width : (column + 1) * width]
         picture[window] = shade.round().astype(np.uint8).T[::-1]
     colors = colors_of(kind.colors, _COLORS)
-    return Sprites(
-        name=kind.column,
-        title=kind.title,
-        unit=kind.unit,
-        low=f"{low:.{kind.digits}f}",
-        high=f"{high:.{kind.digits}f}",
-        gradient=gradient_of(colors),
-        address=_palette_png(picture, colors),
-    )
+    gradient, address = gradient_of(colors), _palette_png(picture, colors)
+    return {"kind": kind, "scale": scale, "gradient": gradient, "address": address}
 
 
 def _palette_png(picture: NDArray[np.uint8], colors: NDArray[np.str_]) -> str:

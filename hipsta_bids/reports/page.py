@@ -10,9 +10,11 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from hipsta_bids import __version__
+from hipsta_bids.io.files import MISSING
 from hipsta_bids.reports.cells import FILTERS
 from hipsta_bids.reports.display import ORIENTATION
 from hipsta_bids.settings import Settings
@@ -37,20 +39,9 @@ class Section(Generic[_Topic]):
     """Returns what the template shows; ``None`` leaves the section out."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Content:
-    """A section that is ready for its template."""
-
-    key: str
-    title: str
-    template: str
-    values: Mapping[str, Any]
-    """With ``problem``, a phrase, where it could not be built."""
-
-
 def build_sections(
     sections: Iterable[Section[_Topic]], topic: _Topic, prefix: str
-) -> list[Content]:
+) -> list[SimpleNamespace]:
     """Build sections; one that fails is noted in the page and in the log, and harms no other."""
     built = []
     for section in sections:
@@ -62,7 +53,9 @@ def build_sections(
         if values is not None:
             template = section.template if "problem" not in values else "problem.html"
             key = f"{prefix}-{section.key}"
-            built.append(Content(key=key, title=section.title, template=template, values=values))
+            built.append(
+                SimpleNamespace(key=key, title=section.title, template=template, values=values)
+            )
     return built
 
 
@@ -152,14 +145,20 @@ class Usual:
     percent: bool = False
 
     def text(self, value: float) -> str:
-        """Format a value with its unit."""
+        """Write a value with its unit."""
+        if math.isnan(value):
+            return MISSING
         if self.percent:
             return f"{value:.1%}"
         return f"{value:.3g}{f' {self.unit}' if self.unit else ''}"
 
+    def excludes(self, value: float) -> bool:
+        """Test whether a value is known and outside of the usual range."""
+        return value < self.low or value > self.high
+
     @property
     def range(self) -> str:
-        """Format the usual range."""
+        """Write the usual range."""
         low, high = math.isfinite(self.low), math.isfinite(self.high)
         if low and high:
             return f"{self.text(self.low)} to {self.text(self.high)}"
@@ -184,8 +183,8 @@ def usual_ranges(
             stage, setting = row[end].removeprefix("-").split(".")
             value = scale * (usual[stage] | dict(settings.get(stage) or {}))[setting]
             limits[end] = -value if row[end].startswith("-") else value
-        rest = {key: row[key] for key in row.keys() - {"low", "high", "relative", "whole"}}
-        ranges.append(Usual(name=name, **rest, **limits))
+        fields = {key: row[key] for key in row.keys() - {"low", "high", "relative", "whole"}}
+        ranges.append(Usual(name=name, **fields, **limits))
     return ranges
 
 

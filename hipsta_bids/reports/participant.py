@@ -46,7 +46,7 @@ def scene_of(hemisphere: Hemisphere, views: Views | None, names: Sequence[str]) 
     """Collect the scene of one hemisphere."""
     scene: dict[str, Any] = {
         "side": hemisphere.side,
-        "hemi": hemisphere.place.name.hemi,
+        "hemi": hemisphere.result.name.hemi,
         "findings": [
             {
                 "kind": min(f.kind for f in found),  # failure, flag, repair
@@ -174,22 +174,22 @@ class Series:
     def title(self) -> str:
         """Protocol and region."""
         first = self.hemispheres[0]
-        name = first.place.name
+        name = first.result.name
         return ", ".join(filter(None, (name.seg, name.region_title)))
 
     @property
     def whole(self) -> bool:
         """Whether the head is on the sheet."""
-        return self.hemispheres[0].place.name.region in EXPERIMENTAL
+        return self.hemispheres[0].result.name.region in EXPERIMENTAL
 
     @cached_property
     def views(self) -> Mapping[str, Views | None]:
         """Labels and mask by hemisphere."""
-        return {h.place.name.hemi: read_views(h, self.bids_dir) for h in self.hemispheres}
+        return {h.result.name.hemi: read_views(h, self.bids_dir) for h in self.hemispheres}
 
     def view(self, hemisphere: Hemisphere) -> Views | None:
         """Labels and mask of one hemisphere."""
-        return self.views[hemisphere.place.name.hemi]
+        return self.views[hemisphere.result.name.hemi]
 
 
 def _key_numbers(series: Series) -> Mapping[str, Any] | None:
@@ -197,8 +197,12 @@ def _key_numbers(series: Series) -> Mapping[str, Any] | None:
     measured = series.measured
     if not measured:
         return None
-    rows = [_number_row(measure, series) for measure in (*MEASURES, *_subfield_measures(series))]
-    counts = [len(series.cohort.values(h.place.name, MEASURES[0].name)) for h in measured]
+    measures = (*MEASURES, *_subfield_measures(series))
+    rows = [
+        (measure, [_value_in_cohort(h, measure, series.cohort) for h in measured])
+        for measure in measures
+    ]
+    counts = [len(series.cohort.values(h.result.name, MEASURES[0].name)) for h in measured]
     return {
         "sides": [h.side for h in measured],
         "rows": rows,
@@ -223,37 +227,30 @@ def _subfield_measures(series: Series) -> list[Measure]:
     return measures
 
 
-def _number_row(measure: Measure, series: Series) -> Mapping[str, Any]:
-    """One number of both hemispheres, with its position in the range of the cohort."""
-    values = [h.summary.get(measure.name, np.nan) for h in series.measured]
-    cohort = [series.cohort.values(h.place.name, measure.name) for h in series.measured]
-    return {
-        "title": measure.title,
-        "unit": measure.unit,
-        "cells": ["n/a" if np.isnan(v) else f"{v:.{measure.digits}f}" for v in values],
-        "strips": [
-            _strip(value, others, measure)
-            for value, others in zip(values, cohort, strict=True)
-            if len(others) >= SMALLEST_COHORT and np.isfinite(value)
-        ],
-    }
+def _value_in_cohort(
+    hemisphere: Hemisphere, measure: Measure, cohort: Cohort
+) -> tuple[float, Mapping[str, Any] | None]:
+    """Look up a number, with its position in the range of the cohort."""
+    value = hemisphere.summary.get(measure.name, np.nan)
+    values = cohort.values(hemisphere.result.name, measure.name)
+    comparable = len(values) >= SMALLEST_COHORT and np.isfinite(value)
+    return value, _strip(value, values, measure.digits) if comparable else None
 
 
-def _strip(value: float, others: Float, measure: Measure) -> Mapping[str, Any]:
+def _strip(value: float, values: Float, digits: int) -> Mapping[str, Any]:
     """Positions of one value and all of the cohort between 0 and 100."""
-    low, high = float(others.min()), float(others.max())
-    median = float(np.median(others))
-    digits = measure.digits
-    share = float(np.mean(others <= value))
+    low, high = float(values.min()), float(values.max())
+    median = float(np.median(values))
+    share = float(np.mean(values <= value))
 
     def scaled(v: float) -> float:
         return round(100 * (v - low) / max(high - low, 1e-9), 1)
 
     return {
-        "dots": [scaled(float(v)) for v in others],
+        "dots": [scaled(float(v)) for v in values],
         "value": scaled(value),
         "median": scaled(median),
-        "words": f"{value:.{digits}f}; cohort of {len(others)}: {low:.{digits}f} to"
+        "words": f"{value:.{digits}f}; cohort of {len(values)}: {low:.{digits}f} to"
         f" {high:.{digits}f}, median {median:.{digits}f}; {share:.0%} are not larger",
     }
 
@@ -266,27 +263,14 @@ def _quality_numbers(series: Series) -> Mapping[str, Any] | None:
     thickness = float(np.nanmean([h.summary.get("thickness_mean", np.nan) for h in measured]))
     rows = []
     lengths = np.array([number(h.metrics, "body_length_mm") for h in measured])
-    others = lengths[::-1] if len(lengths) > 1 else np.full(1, np.nan)
+    opposite = lengths[::-1] if len(lengths) > 1 else np.full(1, np.nan)
     for usual in usual_ranges(thickness, series.cohort.settings, whole=series.whole):
         values = [number(h.metrics, usual.name) for h in measured]
         if usual.name == "length_difference_mm":
-            values = (lengths - others).tolist()
+            values = (lengths - opposite).tolist()
         if np.isnan(values).all():
             continue
-        rows.append(
-            {
-                "title": usual.title,
-                "meaning": usual.meaning,
-                "range": usual.range,
-                "cells": [
-                    {
-                        "text": "n/a" if np.isnan(v) else usual.text(v),
-                        "unusual": not (np.isnan(v) or usual.low <= v <= usual.high),
-                    }
-                    for v in values
-                ],
-            }
-        )
+        rows.append((usual, values))
     facts = [
         (title, [", ".join(str(h.metrics.get(key, "n/a")) for key in keys) for h in measured])
         for title, *keys in _FACTS
@@ -301,7 +285,7 @@ def participant_page(
     """Make the page about one visit; without ``bids_dir`` it shows no anatomical images."""
     kinds: dict[tuple[str, str], list[Hemisphere]] = {}
     for hemisphere in find_results(root, subject, session):
-        name = hemisphere.place.name
+        name = hemisphere.result.name
         kinds.setdefault((name.seg, name.region), []).append(hemisphere)
     if not kinds:
         return None
@@ -316,9 +300,9 @@ def participant_page(
         for n, one in enumerate(series, start=1)
     ]
     visit = f"sub-{subject}" + (f", ses-{session}" if session else "")
-    every = [hemisphere for one in series for hemisphere in one.hemispheres]
-    versions = sorted({str(h.record.get("version")) for h in every})
-    hashes = sorted({str(h.record.get("settings_hash")) for h in every})
+    hemispheres = [hemisphere for one in series for hemisphere in one.hemispheres]
+    versions = sorted({str(h.record.get("version")) for h in hemispheres})
+    hashes = sorted({str(h.record.get("settings_hash")) for h in hemispheres})
     return render(
         "participant.html",
         title=visit,
@@ -326,7 +310,7 @@ def participant_page(
         anatomy=any(view and view.anatomy for one in series for view in one.views.values()),
         versions=versions,
         hashes=hashes,
-        measured=max((_time_of(h, cohort) for h in every), default=""),
+        measured=max((_time_of(h, cohort) for h in hemispheres), default=""),
     )
 
 
@@ -334,7 +318,7 @@ def _time_of(hemisphere: Hemisphere, cohort: Cohort) -> str:
     origin = cohort.origin(hemisphere)
     if origin is not None:
         return origin.time
-    written = hemisphere.place.path("qc").stat().st_mtime
+    written = hemisphere.result.path("qc").stat().st_mtime
     return f"{datetime.fromtimestamp(written, UTC):%Y-%m-%d %H:%M} UTC"
 
 
@@ -351,7 +335,7 @@ def _points(series: Series) -> Mapping[str, Any] | None:
         points = _points_of(hemisphere)
         if view is None or not points:
             continue
-        shown = [
+        panels = [
             {
                 "findings": findings,
                 "urgent": any(finding.kind != "repair" for finding in findings),
@@ -359,8 +343,8 @@ def _points(series: Series) -> Mapping[str, Any] | None:
             }
             for point, findings in list(points.items())[:_POINTS_SHOWN]
         ]
-        more = list(points.values())[_POINTS_SHOWN:]
-        groups.append({"side": hemisphere.side, "points": shown, "more": more})
+        remaining = list(points.values())[_POINTS_SHOWN:]
+        groups.append({"side": hemisphere.side, "points": panels, "more": remaining})
     return {"groups": groups, "legend": _legend(series)} if groups else None
 
 
@@ -368,33 +352,27 @@ def _input(series: Series) -> Mapping[str, Any]:
     groups = []
     for hemisphere in series.hemispheres:
         view = series.view(hemisphere)
-        path = input_path(hemisphere)
         panels = slice_panels(hemisphere, view) if view else []
         groups.append(
             {
-                "side": hemisphere.side,
-                "file": path.name if path else "not known",
-                "why": hemisphere.record.get("chosen_because") or "",
-                "voxel": " by ".join(f"{edge:.2g}" for edge in view.voxel) if view else None,
-                "missing": view.missing if view else "neither labels nor mask are available",
-                "empty": view is not None and not panels,
+                "hemisphere": hemisphere,
+                "path": input_path(hemisphere),
+                "view": view,
                 "panels": panels,
-                "anatomy": view.anatomy.path.name if view and view.anatomy else None,
-                "unused": view.unused if view else None,
                 "stack": stack_of(view) if panels and view else None,
             }
         )
     return {"groups": groups, "legend": _legend(series), "whole": series.whole}
 
 
-def _legend(series: Series) -> list[Mapping[str, str]]:
-    """Names and colors of the labels, each name once."""
-    names: dict[str, str] = {}
+def _legend(series: Series) -> Mapping[str, str]:
+    """Colors of the labels by their names."""
+    colors: dict[str, str] = {}
     for hemisphere in series.hemispheres:
         view = series.view(hemisphere)
-        shown = [label.name for label in view.names.values()] if view else []
-        names |= palette(hemisphere.protocol, list(dict.fromkeys(shown)))
-    return [{"name": name, "color": color} for name, color in names.items()]
+        names = [label.name for label in view.names.values()] if view else []
+        colors |= palette(hemisphere.protocol, list(dict.fromkeys(names)))
+    return colors
 
 
 def _sheets(series: Series) -> Mapping[str, Any] | None:
@@ -416,9 +394,9 @@ def _sheets(series: Series) -> Mapping[str, Any] | None:
 def _uncertainty(hemisphere: Hemisphere) -> str:
     """Say how certain the maps of a hemisphere are."""
     metrics = hemisphere.metrics
-    used = metrics["uncertainty_copies"] - metrics["uncertainty_failed"]
+    copies = metrics["uncertainty_copies"] - metrics["uncertainty_failed"]
     return (
-        f"{hemisphere.side}: SD of thickness over {used} perturbed copies of the labels"
+        f"{hemisphere.side}: SD of thickness over {copies} perturbed copies of the labels"
         f" {metrics['uncertainty_thickness_mm']:.2f} mm at a point (median), and"
         f" {metrics['uncertainty_mean_mm']:.3f} mm of the mean thickness"
     )
@@ -441,12 +419,9 @@ def _sections(series: Series) -> Mapping[str, Any] | None:
     scale = scale_of(THICKNESS, [h.sheet.columns["thickness"] for h in measured])
     colors = colors_of(THICKNESS.colors)
     return {
-        "groups": [{"side": h.side, "panels": section_panels(h, colors, scale)} for h in measured],
-        "scale": {
-            "low": f"{scale[0]:.2f}",
-            "high": f"{scale[1]:.2f}",
-            "gradient": gradient_of(colors),
-        },
+        "groups": [(h.side, section_panels(h, colors, scale)) for h in measured],
+        "scale": scale,
+        "gradient": gradient_of(colors),
     }
 
 
@@ -454,45 +429,33 @@ def _profiles(series: Series) -> Mapping[str, Any] | None:
     measured = series.measured
     if not measured:
         return None
-    others = {kind.column: _cohort_profiles(series, kind.column) for kind in MAP_KINDS}
-    pictures = [draw_profiles(kind, measured, others[kind.column]) for kind in MAP_KINDS]
-    return {"pictures": pictures, "others": bool(others["thickness"])}
+    profiles = {kind.column: _cohort_profiles(series, kind.column) for kind in MAP_KINDS}
+    pictures = [draw_profiles(kind, measured, profiles[kind.column]) for kind in MAP_KINDS]
+    return {"pictures": pictures, "others": bool(profiles["thickness"])}
 
 
 def _cohort_profiles(series: Series, column: str) -> dict[str, Float]:
     """Mean profiles along x of all hemispheres of the same kind."""
-    found = {}
+    profiles = {}
     for hemisphere in series.measured:
-        like = series.cohort.profiles(hemisphere.place.name, column)
+        like = series.cohort.profiles(hemisphere.result.name, column)
         if len(like) >= SMALLEST_COHORT:
-            found[hemisphere.place.name.hemi] = like
-    return found
+            profiles[hemisphere.result.name.hemi] = like
+    return profiles
 
 
 def _correct(series: Series) -> Mapping[str, Any] | None:
     """How to correct what was measured; nothing if all is well."""
-    wanted = [h for h in series.hemispheres if h.status != Status.OK]
-    return correction_of(wanted) if wanted else None
+    doubtful = [h for h in series.hemispheres if h.status != Status.OK]
+    return correction_of(doubtful) if doubtful else None
 
 
 def _origin(series: Series) -> Mapping[str, Any]:
-    rows = []
-    for hemisphere in series.hemispheres:
-        record, origin = hemisphere.record, series.cohort.origin(hemisphere)
-        rows.append(
-            {
-                "side": hemisphere.side,
-                "inputs": [str(entry.get("file")) for entry in record.get("inputs") or []],
-                "edited": [str(entry.get("file")) for entry in record.get("edited") or []],
-                "version": record.get("version"),
-                "settings": record.get("settings_hash"),
-                "input_hash": record.get("input_hash") or "not known",
-                "time": _time_of(hemisphere, series.cohort),
-                "command": origin.command if origin and origin.command else None,
-                "passed_over": record.get("passed_over") or [],
-            }
-        )
-    return {"rows": rows}
+    return {
+        "rows": [
+            (h, series.cohort.origin(h), _time_of(h, series.cohort)) for h in series.hemispheres
+        ]
+    }
 
 
 #: From top to bottom: key, which is also the template's name, title, and what builds it.

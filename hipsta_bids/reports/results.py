@@ -48,7 +48,7 @@ _MARGIN, _BEYOND = 5.0, 8.0
 #: Share of the body's voxels that an anatomical image has to cover.
 _COVERED = 0.99
 #: mm by which corners of two images may differ if they have the same grid: headers are rounded.
-_SAME = 0.05
+_ROUNDING = 0.05
 #: Percentiles of the anatomical image that are black and white.
 _GRAYS = (1.0, 99.5)
 _HALF = 0.5
@@ -107,8 +107,8 @@ class SheetTable:
     @property
     def shown_rows(self) -> NDArray[np.intp]:
         """Rows that are worth a picture: on a sheet with a head those of which half has values."""
-        enough = self.valid.mean(axis=0) >= _HALF
-        return np.flatnonzero(enough | (self.ends is None))
+        covered = self.valid.mean(axis=0) >= _HALF
+        return np.flatnonzero(covered | (self.ends is None))
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -121,7 +121,7 @@ class SheetTable:
 class Hemisphere:
     """All files of one hemisphere, read when first used."""
 
-    place: ResultPlace
+    result: ResultPlace
     record: Mapping[str, Any]
     """The quality record."""
 
@@ -138,13 +138,13 @@ class Hemisphere:
     @property
     def side(self) -> str:
         """``left`` or ``right``."""
-        return SIDES[self.place.name.hemi]
+        return SIDES[self.result.name.hemi]
 
     @property
     def metrics(self) -> Mapping[str, Any]:
         """Numbers of the quality record; empty for failed hemispheres."""
-        found: Mapping[str, Any] = self.record.get("metrics") or {}
-        return found
+        metrics: Mapping[str, Any] = self.record.get("metrics") or {}
+        return metrics
 
     @property
     def protocol(self) -> Protocol | None:
@@ -176,20 +176,20 @@ class Hemisphere:
         ]
         repairs = [_finding("repair", str(r)) for r in self.record.get("repairs") or []]
         # A large repair is also a flag.
-        said = tuple(finding.message for finding in flags)
-        new = (r for r in repairs if not any(m.startswith(r.message.split(";")[0]) for m in said))
+        texts = [finding.message for finding in flags]
+        new = (r for r in repairs if not any(m.startswith(r.message.split(";")[0]) for m in texts))
         return (*flags, *new)
 
     @cached_property
     def summary(self) -> Mapping[str, float]:
         """One number per column of the summary; empty for failed hemispheres."""
-        return read_summary(self.place) if self.measured else {}
+        return read_summary(self.result) if self.measured else {}
 
     @cached_property
     def profile(self) -> Mapping[str, Float]:
         """(Nx,) means over y by column; empty where the table cannot be read."""
         try:
-            rows = files.read_tsv(self.place.path("profile"))
+            rows = files.read_tsv(self.result.path("profile"))
         except InputError:
             return {}
         rows = [row for row in rows if row.pop("axis", None) == "x"]
@@ -202,17 +202,17 @@ class Hemisphere:
     def sheet(self) -> SheetTable:
         """Its sheet."""
         words = ("subfield", "valid", "repaired")
-        columns = read_sheet(self.place.path("sheet"), words=words)
+        columns = read_sheet(self.result.path("sheet"), words=words)
         subfield, valid, repaired = (columns.pop(name) for name in words)
-        if "uncertainty_copies" in self.metrics and self.place.path("uncertainty").exists():
-            columns |= read_sheet(self.place.path("uncertainty"))
+        if "uncertainty_copies" in self.metrics and self.result.path("uncertainty").exists():
+            columns |= read_sheet(self.result.path("uncertainty"))
         return SheetTable(
             columns=columns,
             subfield=subfield.astype(np.str_),
             valid=valid == "true",
             repaired=repaired == "true",
-            points={name: _surface_points(self.place, name, valid.shape) for name in SURFACES},
-            ends=body_ends(self.place.name.region, valid.shape[1]),
+            points={name: _surface_points(self.result, name, valid.shape) for name in SURFACES},
+            ends=body_ends(self.result.name.region, valid.shape[1]),
         )
 
 
@@ -220,13 +220,13 @@ def find_results(
     root: Path, subject: str | None = None, session: str | None = None
 ) -> Iterator[Hemisphere]:
     """Find the hemispheres of an output dataset."""
-    for place in list_results(root, subject, session):
+    for result in list_results(root, subject, session):
         try:
-            record = read_record(place)
+            record = read_record(result)
             Status(record.get("status", ""))
         except (InputError, ValueError):
             continue
-        yield Hemisphere(place, record)
+        yield Hemisphere(result, record)
 
 
 def _finding(kind: str, message: str) -> Finding:
@@ -235,8 +235,8 @@ def _finding(kind: str, message: str) -> Finding:
     return Finding(kind=kind, message=_FOLDERS.sub("", message), point=point)
 
 
-def _surface_points(place: ResultPlace, name: str, shape: tuple[int, ...]) -> Float:
-    path = place.path(f"{name}_surface")
+def _surface_points(result: ResultPlace, name: str, shape: tuple[int, ...]) -> Float:
+    path = result.path(f"{name}_surface")
     points = gifti.read_mesh(path).points
     if len(points) != shape[0] * shape[1]:
         raise InputError(
@@ -290,8 +290,8 @@ class Anatomy:
 def anatomy_of(path: Path, volume: ScalarVolume) -> Anatomy | None:
     """Scale an image between its percentiles; ``None`` where it has one value."""
     values = volume.values[..., 0]
-    known = values[np.isfinite(values)]
-    low, high = np.percentile(known, _GRAYS).tolist() if known.size else (0.0, 0.0)
+    finite = values[np.isfinite(values)]
+    low, high = np.percentile(finite, _GRAYS).tolist() if finite.size else (0.0, 0.0)
     if not low < high:
         return None
     shares = np.interp(np.nan_to_num(values, nan=low), (low, high), (0, 1)).astype(np.float32)
@@ -378,7 +378,7 @@ def _read_anatomy(
     if path is None:
         return None, None
     unused = None
-    for candidate in find_anatomy(path, hemisphere.place.name, bids_dir):
+    for candidate in find_anatomy(path, hemisphere.result.name, bids_dir):
         try:
             problem = _unfit(candidate, labels, points)
             if problem is None:
@@ -390,9 +390,14 @@ def _read_anatomy(
                     return anatomy, None
                 problem = "has one value everywhere round the body"
         except InputError as error:
-            problem = f"is unusable: {error.reason}"
+            problem = _unusable(candidate.path, error)
         unused = unused or f"{candidate.path.name} {problem}"
     return None, unused
+
+
+def _unusable(path: Path, error: InputError) -> str:
+    """Write why a file cannot be read, without names of folders."""
+    return "is unusable: " + _FOLDERS.sub("", str(error).removeprefix(f"{path}: "))
 
 
 def _unfit(candidate: Candidate, labels: LabelImage, points: Float) -> str | None:
@@ -400,8 +405,8 @@ def _unfit(candidate: Candidate, labels: LabelImage, points: Float) -> str | Non
     shape, affine = read_grid(candidate.path)
     ends = np.array([[0, 0, 0], labels.shape]) - 0.5
     corners = np.stack(np.meshgrid(*ends.T), axis=-1)
-    apart = apply_affine(affine, corners) - apply_affine(labels.affine, corners)
-    if not candidate.proven and (shape != labels.shape or np.abs(apart).max() > _SAME):
+    distance = apply_affine(affine, corners) - apply_affine(labels.affine, corners)
+    if not candidate.proven and (shape != labels.shape or np.abs(distance).max() > _ROUNDING):
         return "has another grid than the labels, so its space may be another"
     index = np.round(apply_affine(np.linalg.inv(affine), points))
     if np.mean(((index >= 0) & (index < shape)).all(axis=-1)) < _COVERED:
@@ -422,12 +427,12 @@ def input_path(hemisphere: Hemisphere) -> Path | None:
 def _linked(hemisphere: Hemisphere, entries: Sequence[Mapping[str, Any]]) -> Path | None:
     """Find the first file of a list in the quality record."""
     address = str(entries[0].get("file", "")) if entries else ""
-    root = hemisphere.place.root
+    root = hemisphere.result.root
     return linked_path(address, root, read_links(root))
 
 
 def _read_mask(hemisphere: Hemisphere) -> LabelImage | None:
-    path = hemisphere.place.path("body_mask")
+    path = hemisphere.result.path("body_mask")
     image = read_labels(path, _MARGIN) if path.exists() else None
     return image if image is not None and image.data.size else None
 
@@ -442,7 +447,7 @@ def _read_labels(
     try:
         return read_labels(path, _MARGIN, mask.box if mask is not None else None), None
     except InputError as error:
-        reason = "is not there any more" if not path.exists() else f"is unusable: {error.reason}"
+        reason = "is not there any more" if not path.exists() else _unusable(path, error)
         return None, f"{path.name} {reason}"
 
 
@@ -465,14 +470,14 @@ def _names(hemisphere: Hemisphere, data: NDArray[np.generic] | None) -> dict[int
             code: LabelName(name=name, color=color)
             for code, (name, color) in zip(codes, colors.items(), strict=True)
         }
-    known = {label.code: label for label in protocol.labels}
-    offset = protocol.shift(hemisphere.place.name.hemi)
+    labels = {label.code: label for label in protocol.labels}
+    offset = protocol.shift(hemisphere.result.name.hemi)
     # Files of one hemisphere may have the same codes on both sides.
-    shift = offset if any(code - offset in known for code in codes) else 0
+    shift = offset if any(code - offset in labels for code in codes) else 0
     return {
         code: LabelName(name=label.abbreviation or label.name, color=label.color)
         for code in codes
-        if (label := known.get(code - shift)) is not None
+        if (label := labels.get(code - shift)) is not None
     }
 
 
@@ -480,10 +485,10 @@ def _box(interest: NDArray[np.bool_], voxel: Float) -> tuple[slice, ...]:
     """Smallest box of voxels that holds what is of interest, with a margin."""
     box = []
     for axis in range(interest.ndim):
-        others = tuple(other for other in range(interest.ndim) if other != axis)
-        where = np.flatnonzero(interest.any(axis=others))
+        axes = tuple(other for other in range(interest.ndim) if other != axis)
+        filled = np.flatnonzero(interest.any(axis=axes))
         margin = int(np.ceil(_MARGIN / voxel[axis]))
-        first, last = (where[0], where[-1]) if len(where) else (0, interest.shape[axis] - 1)
+        first, last = (filled[0], filled[-1]) if len(filled) else (0, interest.shape[axis] - 1)
         box.append(slice(max(0, first - margin), last + margin + 1))
     return tuple(box)
 

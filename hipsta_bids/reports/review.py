@@ -22,8 +22,8 @@ _NIFTI = (".nii", ".nii.gz")
 
 def card_of(hemisphere: Hemisphere, cohort: Cohort, views: Views | None) -> Mapping[str, Any]:
     """Collect what the page says first about a hemisphere, and what leads on from there."""
-    key, record = hemisphere.place.name.title, hemisphere.record
-    order = [other.place.name.title for other in cohort.ranking]
+    key, record = hemisphere.result.name.title, hemisphere.record
+    order = [other.result.name.title for other in cohort.ranking]
     n = order.index(key) if key in order else None
     before = cohort.ranking[n - 1] if n else None
     after = cohort.ranking[n + 1] if n is not None and n + 1 < len(order) else None
@@ -50,11 +50,11 @@ def _link(hemisphere: Hemisphere | None, cohort: Cohort) -> tuple[str, str] | No
     """Address and words of a link to a hemisphere's part of its page."""
     if hemisphere is None:
         return None
-    name = hemisphere.place.name
+    name = hemisphere.result.name
     title = name.title
     verdict = cohort.verdicts[title].title.lower()
     words = f"sub-{name.subject}{f' ses-{name.session}' if name.session else ''} {hemisphere.side}"
-    if len({other.place.name.protocol for other in cohort.hemispheres}) > 1:
+    if len({other.result.name.protocol for other in cohort.hemispheres}) > 1:
         words += " " + " ".join(filter(None, (name.seg, name.region_title)))
     return f"{participant_report(name.subject, name.session)}#{title}", f"{words}: {verdict}"
 
@@ -64,26 +64,27 @@ def open_commands(hemisphere: Hemisphere, anatomy: Path | None = None) -> list[t
 
     In a container the folder with the labels is ``LABELS_DIR``, to be replaced.
     """
-    place = hemisphere.place
-    labels, mask = input_path(hemisphere), place.path("body_mask")
+    result = hemisphere.result
+    labels, mask = input_path(hemisphere), result.path("body_mask")
     volumes, behind = [], []
     if labels is not None and labels.exists():
         # Docker's own paths mean nothing outside; Apptainer's are those of the machine.
         hidden = container_of_process().get("Type") == "docker"
-        own = f"LABELS_DIR/{labels.name}" if hidden else _from(place.root, labels)
-        volumes.append((own, ":colormap=lut:opacity=0.5"))
+        address = f"LABELS_DIR/{labels.name}" if hidden else _from(result.root, labels)
+        volumes.append((address, ":colormap=lut:opacity=0.5"))
         if anatomy is not None and not hidden:
-            behind = [_from(place.root, anatomy)]
+            behind = [_from(result.root, anatomy)]
     if mask.exists():
-        volumes.append((_from(place.root, mask), ":colormap=heat:opacity=0.3"))
+        volumes.append((_from(result.root, mask), ":colormap=heat:opacity=0.3"))
     if not volumes:
         return []
     freeview = ["freeview", "-v", *behind, *(path + look for path, look in volumes)]
-    surfaces = {name: place.path(f"{name}_surface") for name in SURFACES}
+    surfaces = {name: result.path(f"{name}_surface") for name in SURFACES}
     if all(path.exists() for path in surfaces.values()):
         freeview.append("-f")
         freeview += [
-            f"{_from(place.root, path)}:edgecolor={_EDGES[name]}" for name, path in surfaces.items()
+            f"{_from(result.root, path)}:edgecolor={_EDGES[name]}"
+            for name, path in surfaces.items()
         ]
     point = next((f.point for f in hemisphere.findings if f.point is not None), None)
     if point is not None:
@@ -104,11 +105,11 @@ def _from(root: Path, path: Path) -> str:
 
 def correction_of(hemispheres: Sequence[Hemisphere]) -> Mapping[str, Any]:
     """Name the files to correct, where they go, and the command that measures them again."""
-    first = hemispheres[0].place.name
+    first = hemispheres[0].result.name
     choices = []
     for hemisphere in hemispheres:
-        name = hemisphere.place.name
-        mask = hemisphere.place.path("body_mask")
+        name = hemisphere.result.name
+        mask = hemisphere.result.path("body_mask")
         by_mask = mask.exists() and name.region == "body"  # of other regions labels are corrected
         path = input_path(hemisphere)
         suffix = f"{name.title}_desc-edited"

@@ -65,8 +65,8 @@ def cut(points: Float, axis: int, level: float) -> Float:
     triangles = points.reshape(-1, 3)[sheet_triangles(*points.shape[:2])]
     height = triangles[:, :, axis] - level
     above = height > 0
-    met = above.any(axis=1) & ~above.all(axis=1)
-    triangles, height, above = triangles[met], height[met], above[met]
+    crossing = above.any(axis=1) & ~above.all(axis=1)
+    triangles, height, above = triangles[crossing], height[crossing], above[crossing]
     # The corner that is alone on its side comes first.
     lone = np.where(above.sum(axis=1) == 1, above.argmax(axis=1), (~above).argmax(axis=1))
     order = (lone[:, None] + np.arange(3)) % 3
@@ -106,17 +106,17 @@ def path_data(lines: Float | Iterable[Float]) -> str:
     for n, line in enumerate(left):
         for end in (line[0], line[-1]):
             ends.setdefault(end, []).append(n)
-    used: set[int] = set()
+    joined: set[int] = set()
     paths = []
     for n, line in enumerate(left):
-        if n in used:
+        if n in joined:
             continue
-        used.add(n)
+        joined.add(n)
         path = list(line)
         for _ in range(2):  # at its end, and then at its other end
-            while more := next((m for m in ends[path[-1]] if m not in used), None):
-                used.add(more)
-                path += (left[more] if left[more][0] == path[-1] else left[more][::-1])[1:]
+            while link := next((m for m in ends[path[-1]] if m not in joined), None):
+                joined.add(link)
+                path += (left[link] if left[link][0] == path[-1] else left[link][::-1])[1:]
             path.reverse()
         paths.append(path)
     return "".join(map(_relative, paths))
@@ -225,8 +225,8 @@ def section_panels(
     ``scale`` is the thickness at both ends of the colors, mm.
     """
     sheet = hemisphere.sheet
-    shown = sheet.shown_rows
-    rows = [int(shown[round(share * (len(shown) - 1))]) for share in POSITIONS]
+    filled = sheet.shown_rows
+    rows = [int(filled[round(share * (len(filled) - 1))]) for share in POSITIONS]
     return _same_windows(
         [
             _section(sheet, row, share, colors, scale)
@@ -240,8 +240,8 @@ def _centers(hemisphere: Hemisphere, views: Views) -> list[Float]:
     if hemisphere.measured:
         sheet = hemisphere.sheet
         middle = views.to_index(sheet.points["midthickness"])
-        shown = sheet.shown_rows
-        rows = [shown[round(share * (len(shown) - 1))] for share in POSITIONS]
+        filled = sheet.shown_rows
+        rows = [filled[round(share * (len(filled) - 1))] for share in POSITIONS]
         return [np.asarray(np.nanmean(middle[:, row], axis=0)) for row in rows]
     inside = views.mask if views.mask is not None else np.isin(views.labels, list(views.names))  # type: ignore[arg-type]  # one is there
     index = np.argwhere(inside)
@@ -250,8 +250,8 @@ def _centers(hemisphere: Hemisphere, views: Views) -> list[Float]:
     low, high = index[:, 1].min(), index[:, 1].max()
     levels = [round(low + share * (high - low)) for share in POSITIONS]
     middle = index.mean(axis=0)
-    own = [index[index[:, 1] == level] for level in levels]
-    return [rows.mean(axis=0) if len(rows) else middle for rows in own]
+    sections = [index[index[:, 1] == level] for level in levels]
+    return [rows.mean(axis=0) if len(rows) else middle for rows in sections]
 
 
 def _same_windows(panels: Sequence[Panel]) -> list[Panel]:
@@ -298,13 +298,13 @@ def _slice(
         )
 
     width, height = views.shape[right] * edge[0], views.shape[up] * edge[1]
-    shown = np.array([[0.0, 0.0], [width, height]])
+    span = np.array([[0.0, 0.0], [width, height]])
     paths = {}
     point = flat(np.asarray(center))
     body = views.mask if views.mask is not None else np.isin(views.labels, list(views.names))  # type: ignore[arg-type]  # one is there
     empty = not np.take(body, level, axis=across).any()
     if empty:
-        shown = np.stack([point - _MARGIN, point + _MARGIN])
+        span = np.stack([point - _MARGIN, point + _MARGIN])
         words = f"{words}: nothing of the body in this slice".removeprefix(": ")
     if views.mask is not None:
         edges = outline(_picture(views.mask, across, level, right, up))
@@ -313,19 +313,19 @@ def _slice(
         lines = flat(index)
         paths["mask"] = path_data(lines)
         if len(lines):
-            shown = np.stack([lines.min(axis=(0, 1)), lines.max(axis=(0, 1))])
-            shown += np.array([[-_MARGIN], [_MARGIN]])
+            span = np.stack([lines.min(axis=(0, 1)), lines.max(axis=(0, 1))])
+            span += np.array([[-_MARGIN], [_MARGIN]])
     if hemisphere.measured:
         for name in SURFACES:
             index = views.to_index(hemisphere.sheet.points[name])
             paths[name] = path_data(flat(cut(index, across, level)))
         if orientation == "sagittal":
             paths["plane"] = path_data(flat(_plane_lines(hemisphere, views)))
-    where = views.affine[:3, :3] @ np.asarray(center) + views.affine[:3, 3]
+    position = views.affine[:3, :3] @ np.asarray(center) + views.affine[:3, 3]
     caption = (
-        f"{orientation}{', ' if words else ''}{words} ({'RAS'[across]} {where[across]:.1f} mm)"
+        f"{orientation}{', ' if words else ''}{words} ({'RAS'[across]} {position[across]:.1f} mm)"
     )
-    middle, size = (point, (_NEAR, _NEAR)) if mark else (shown.mean(axis=0), shown[1] - shown[0])
+    middle, size = (point, (_NEAR, _NEAR)) if mark else (span.mean(axis=0), span[1] - span[0])
     return Panel(
         window=_window(float(middle[0]), float(middle[1]), float(size[0]), float(size[1])),
         caption=caption,
@@ -402,17 +402,17 @@ def _section(
     }
     if sheet.ends is not None:  # positions without values are no measurement
         flat = {n: np.where(sheet.valid[:, row, None], p, np.nan) for n, p in flat.items()}
-    every = np.concatenate(list(flat.values()))
-    corner, far = np.nanmin(every, axis=0) - 0.7, np.nanmax(every, axis=0) + 0.7
+    joined = np.concatenate(list(flat.values()))
+    corner, far = np.nanmin(joined, axis=0) - 0.7, np.nanmax(joined, axis=0) + 0.7
     flat = {name: points - corner for name, points in flat.items()}
     thickness = sheet.columns["thickness"][:, row]
     part = "".join(f"{name}, " for name, a, b in sheet.parts if a <= row <= b)
     spread = (thickness - scale[0]) / max(scale[1] - scale[0], 1e-6)
-    chosen = np.rint(np.clip(np.nan_to_num(spread), 0, 1) * (len(colors) - 1)).astype(int)
+    line_colors = np.rint(np.clip(np.nan_to_num(spread), 0, 1) * (len(colors) - 1)).astype(int)
     ends = np.stack([flat["interior"], flat["exterior"]], axis=1)
     lines = tuple(
         (path_data([line]), str(colors[n]))
-        for line, n in zip(ends, chosen, strict=True)
+        for line, n in zip(ends, line_colors, strict=True)
         if np.isfinite(line).all()
     )
     return Panel(

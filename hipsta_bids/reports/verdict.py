@@ -37,7 +37,7 @@ LOOK = 1.0
 #: Severity of what was not measured, and the largest of what was.
 REFUSED, LARGEST = 100.0, 99.0
 
-_SAME = 0.005
+_ROUNDING = 0.005
 """mm; means that differ by less read the same."""
 
 
@@ -49,7 +49,7 @@ class Consequence:
     """Of the map that could be wrong."""
     mean: float = float("nan")
     """Mean thickness as measured, mm."""
-    other: float = float("nan")
+    smoothed: float = float("nan")
     """Mean thickness if the columns concerned were as those around them, mm."""
     without: float = float("nan")
     """Mean thickness of the other columns alone, mm."""
@@ -59,33 +59,33 @@ class Consequence:
     @property
     def weight(self) -> float:
         """Millimeters times percent of the map; 0 where one of these is not known."""
-        weight = abs(self.mean - self.other) * 100 * self.share
+        weight = abs(self.mean - self.smoothed) * 100 * self.share
         return float(weight) if np.isfinite(weight) else 0.0
 
     @property
     def text(self) -> str:
         """Both figures, for people."""
-        where = "the whole map" if self.share == 1 else f"{self.share:.1%} of the map"
+        extent = "the whole map" if self.share == 1 else f"{self.share:.1%} of the map"
         if self.harmless:
             return "Thickness and shape do not depend on it."
         if np.isnan(self.share):
             return "What it does to the mean thickness is not known."
         if self.share == 0:
             return f"No measured column lies there: the mean thickness stays {self.mean:.2f} mm."
-        if np.isnan(self.other):
-            return f"It concerns {where}; what it does to the mean thickness is not known."
-        off = self.mean - self.other
+        if np.isnan(self.smoothed):
+            return f"It concerns {extent}; what it does to the mean thickness is not known."
+        off = self.mean - self.smoothed
         compared = "expected" if self.share == 1 else "with these columns as those around them"
         means = f"{self.mean:.2f} mm as measured"
-        alone = f", {self.without:.2f} mm without them" if self.without > 0 else ""
-        if abs(off) < _SAME:
+        suffix = f", {self.without:.2f} mm without them" if self.without > 0 else ""
+        if abs(off) < _ROUNDING:
             return (
-                f"It concerns {where}; the mean thickness hardly depends on it: {means}, the same"
-                f" {compared}{alone}."
+                f"It concerns {extent}; the mean thickness hardly depends on it: {means}, the same"
+                f" {compared}{suffix}."
             )
         return (
             f"The mean thickness could be {abs(off):.2f} mm too {'large' if off > 0 else 'small'},"
-            f" and {where} wrong: {means}, {self.other:.2f} mm {compared}{alone}."
+            f" and {extent} wrong: {means}, {self.smoothed:.2f} mm {compared}{suffix}."
         )
 
 
@@ -134,8 +134,8 @@ def verdict_of(hemisphere: Hemisphere, reach: float = FLAG_REACH) -> Verdict:
             advice="",
             severity=0.0,
         )
-    found = consequences(hemisphere, reach)
-    reason, consequence = max(found, key=lambda row: row[1].weight)
+    rows = consequences(hemisphere, reach)
+    reason, consequence = max(rows, key=lambda row: row[1].weight)
     least = LOOK if hemisphere.status == Status.FLAGGED else 0.0
     severity = min(max(consequence.weight, least), LARGEST)
     look = severity >= LOOK
@@ -161,9 +161,9 @@ def consequences(hemisphere: Hemisphere, reach: float) -> list[tuple[str, Conseq
     repairs = [str(repair) for repair in hemisphere.record.get("repairs") or []]
     if repairs:
         largest = max(repairs, key=_nodes).split(";")[0]
-        several = f"{len(repairs)} repairs of the labels, the largest: {largest}"
-        what = _sentence(largest if len(repairs) == 1 else several)
-        rows.append((what, _of_columns(hemisphere, None, reach)))
+        summary = f"{len(repairs)} repairs of the labels, the largest: {largest}"
+        title = _sentence(largest if len(repairs) == 1 else summary)
+        rows.append((title, _of_columns(hemisphere, None, reach)))
     return rows or [(_sentence(hemisphere.message or "no message"), Consequence())]
 
 
@@ -184,7 +184,7 @@ def _of_flag(hemisphere: Hemisphere, finding: Finding, reach: float) -> Conseque
     if np.isnan(finding.share) and finding.point is not None:
         return _of_columns(hemisphere, finding.point, reach)
     mean = hemisphere.summary.get("thickness_mean", np.nan)
-    return Consequence(share=finding.share, mean=mean, other=mean - finding.change)
+    return Consequence(share=finding.share, mean=mean, smoothed=mean - finding.change)
 
 
 def _of_columns(
@@ -196,7 +196,7 @@ def _of_columns(
     """
     try:
         table = read_sheet(
-            hemisphere.place.path("sheet"), ["r", "a", "s", "thickness"], ["valid", "repaired"]
+            hemisphere.result.path("sheet"), ["r", "a", "s", "thickness"], ["valid", "repaired"]
         )
     except InputError:
         return Consequence()
@@ -215,7 +215,7 @@ def _of_columns(
     return Consequence(
         share=float(area[concerned].sum() / area.sum()),
         mean=_mean(thickness, area),
-        other=_mean(np.where(concerned, smooth, thickness), area),
+        smoothed=_mean(np.where(concerned, smooth, thickness), area),
         without=_mean(thickness, np.where(concerned, 0.0, area)),
     )
 

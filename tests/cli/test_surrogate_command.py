@@ -85,7 +85,7 @@ def test_a_hemisphere_that_fails_stops_no_other(bids_dir, tmp_path, capsys):
     out = tmp_path / "out"
     assert run(data, out) == ExitCode.SOME_FAILED
     said = capsys.readouterr()
-    assert "[unreadable-image]" in said.err
+    assert "cannot be read as an image" in said.err
     assert said.err.count("\n") == 1
     assert path_of(out, "surrogate", "R").exists()
     files[1].write_bytes(b"nothing")

@@ -300,7 +300,7 @@ def test_ratings_are_saved_loaded_and_taken_by_the_group_level(review, browser, 
     found = collect_sheets(GroupRequest(roots=(out,), ratings=path))
     assert found.ratings == {"use": 1, "unsure": 0, "exclude": 1, "unrated": 2}
     assert {(e.participant, e.hemi): e.reason for e in found.exclusions}["sub-02", "L"] == "rated"
-    assert [r.place.name.subject for r in found.records] == ["01", "01"]
+    assert [r.result.name.subject for r in found.records] == ["01", "01"]
     # Loaded where they are not known; one line is of nobody here.
     with path.open("a") as file:
         file.write("sub-99\tn/a\tL\tfreesurfer\tbody\tuse\tn/a\tn/a\n")

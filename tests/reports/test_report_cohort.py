@@ -20,17 +20,17 @@ from hipsta_bids.reports.results import Hemisphere, find_results
 
 def make(root, subject, values, *, hemi="L", status="ok", **record):
     """Write the two files that a cohort is read from."""
-    place = ResultPlace(
+    result = ResultPlace(
         root=root, name=HemisphereName(subject=subject, session=None, hemi=hemi, seg="P")
     )
-    place.path("qc").parent.mkdir(parents=True, exist_ok=True)
-    place.path("qc").write_text(json.dumps({"status": status, **record}))
+    result.path("qc").parent.mkdir(parents=True, exist_ok=True)
+    result.path("qc").write_text(json.dumps({"status": status, **record}))
     if status != "failed":
         names = [measure.name for measure in MEASURES]
-        place.path("summary").write_text(
+        result.path("summary").write_text(
             "\t".join(names) + "\n" + "\t".join(f"{v}" for v in values) + "\n"
         )
-    return place
+    return result
 
 
 def test_scores_are_those_of_a_normal_distribution_and_missing_values_stay():
@@ -55,21 +55,21 @@ def test_one_who_stands_apart_is_found_and_named(tmp_path):
         make(tmp_path, f"{n:02d}", values)
     cohort = read_cohort(tmp_path)
     found = distances(cohort, {})
-    farthest = max(found, key=lambda title: found[title].value)
+    farthest = max(found, key=lambda title: found[title][0])
     assert farthest == "sub-03_hemi-L_seg-P"
-    assert found[farthest].measure == MEASURES[2].title
-    assert found[farthest].value > 30  # 1.0 away where the SD is 0.01, known to a third
+    assert found[farthest][1] == MEASURES[2].title
+    assert found[farthest][0] > 30  # 1.0 away where the SD is 0.01, known to a third
 
 
 def test_a_map_that_differs_is_found_where_all_numbers_agree(tmp_path):
     rng = np.random.default_rng(2)
     maps = {}
     for n in range(SMALLEST_COMPARED):
-        place = make(tmp_path, f"{n:02d}", rng.normal(1.0, 0.01, len(MEASURES)))
-        maps[place.name.title] = rng.normal(2.0, 0.1, (5, 4))
+        result = make(tmp_path, f"{n:02d}", rng.normal(1.0, 0.01, len(MEASURES)))
+        maps[result.name.title] = rng.normal(2.0, 0.1, (5, 4))
     maps["sub-04_hemi-L_seg-P"][:2] += 1.0
     found = distances(read_cohort(tmp_path), maps)
-    assert found["sub-04_hemi-L_seg-P"].measure == "Map of thickness"
+    assert found["sub-04_hemi-L_seg-P"][1] == "Map of thickness"
 
 
 def test_few_hemispheres_are_not_compared(tmp_path):
@@ -91,7 +91,7 @@ def test_damaged_records_are_left_out(tmp_path):
     make(tmp_path, "01", np.ones(len(MEASURES)))
     make(tmp_path, "02", np.ones(len(MEASURES))).path("qc").write_text("{")
     make(tmp_path, "03", np.ones(len(MEASURES))).path("summary").unlink()
-    assert [h.place.name.subject for h in read_cohort(tmp_path).hemispheres] == ["01"]
+    assert [h.result.name.subject for h in read_cohort(tmp_path).hemispheres] == ["01"]
 
 
 def test_the_last_run_that_measured_a_hemisphere_is_its_origin(tmp_path):
@@ -136,5 +136,5 @@ def test_results_of_one_visit_are_found_in_order(tmp_path):
     for hemi in "RL":
         make(tmp_path, "02", np.ones(len(MEASURES)), hemi=hemi)
     make(tmp_path, "01", np.ones(len(MEASURES)))
-    assert [h.place.name.hemi for h in find_results(tmp_path, "02")] == ["L", "R"]
+    assert [h.result.name.hemi for h in find_results(tmp_path, "02")] == ["L", "R"]
     assert isinstance(read_cohort(tmp_path), Cohort)

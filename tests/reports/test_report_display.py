@@ -97,7 +97,7 @@ def test_colors_of_parts_are_those_of_the_body_and_unknown_names_differ():
 
 def test_maps_of_both_hemispheres_lie_alike(out, monkeypatch):
     left, right = (
-        next(h for h in find_results(out, "01") if h.place.name.hemi == side) for side in "LR"
+        next(h for h in find_results(out, "01") if h.result.name.hemi == side) for side in "LR"
     )
     values = np.arange(12.0).reshape(4, 3)
     pictures = []

@@ -78,10 +78,12 @@ def test_bodies_of_both_sides_of_quite_different_length_are_marked(lengths, mark
         cohort = SimpleNamespace(settings={})
         series = SimpleNamespace(measured=list(sides), cohort=cohort, whole=False)
         rows = _quality_numbers(series)["rows"]
-        return {row["title"]: row for row in rows}.get("Difference of these distances")
+        return {usual.title: (usual, values) for usual, values in rows}.get(
+            "Difference of these distances"
+        )
 
-    both = row(*measured)
+    usual, values = row(*measured)
     difference = lengths[0] - lengths[1]
-    assert [cell["text"] for cell in both["cells"]] == [f"{difference:g} mm", f"{-difference:g} mm"]
-    assert [cell["unusual"] for cell in both["cells"]] == [marked, marked]
+    assert [usual.text(value) for value in values] == [f"{difference:g} mm", f"{-difference:g} mm"]
+    assert [usual.excludes(value) for value in values] == [marked, marked]
     assert row(measured[0]) is None  # there is nothing to compare

@@ -12,11 +12,11 @@ from hipsta_bids.reports.verdict import RATINGS, consequences, verdict_of
 
 
 def hemisphere(root, subject, hemi):
-    return next(h for h in find_results(root, subject) if h.place.name.hemi == hemi)
+    return next(h for h in find_results(root, subject) if h.result.name.hemi == hemi)
 
 
 def changed(found, **record):
-    return Hemisphere(found.place, {**found.record, **record})
+    return Hemisphere(found.result, {**found.record, **record})
 
 
 def flag(reason, message, share, change):
@@ -41,7 +41,7 @@ def test_each_status_has_its_verdict(out):
 
 def table_of(found):
     """Read the sheet table without the package: columns by name, (Nx, Ny)."""
-    with found.place.path("sheet").open() as file:
+    with found.result.path("sheet").open() as file:
         rows = list(csv.DictReader(file, delimiter="\t"))
     shape = int(rows[-1]["x"]), int(rows[-1]["y"])
     numbers = {k: np.array([float(r[k]) for r in rows]).reshape(shape) for k in ("r", "a", "s")}
@@ -87,7 +87,7 @@ def test_what_repairs_may_do_is_computed_from_the_table(out):
     assert consequence.mean == pytest.approx(mean, abs=1e-6)
     assert consequence.mean == pytest.approx(found.summary["thickness_mean"], abs=1e-3)
     assert consequence.without == pytest.approx(without, abs=1e-6)
-    assert consequence.other == pytest.approx(other, abs=1e-5)
+    assert consequence.smoothed == pytest.approx(other, abs=1e-5)
     assert consequence.share == pytest.approx(share, abs=1e-6)
     severity = verdict_of(found).severity
     assert severity == pytest.approx(abs(mean - other) * 100 * share, abs=0.006)
@@ -165,7 +165,7 @@ def test_a_flag_without_numbers_is_measured_round_its_point(out):
 def test_a_table_that_is_gone_costs_the_numbers_only(out, tmp_path):
     copy = shutil.copytree(out, tmp_path / "copy")
     found = hemisphere(copy, "01", "R")
-    found.place.path("sheet").unlink()
+    found.result.path("sheet").unlink()
     verdict = verdict_of(found)
     assert verdict.title == "Use"
     assert verdict.consequence == "What it does to the mean thickness is not known."
@@ -180,7 +180,7 @@ def test_commands_open_the_files_from_the_output_folder(out):
     files = [word.split(":")[0] for word in words if ":" in word]
     assert len(files) == 5
     assert all((out / name).exists() for name in files)
-    record = json.loads(hemisphere(out, "01", "R").place.path("qc").read_text())
+    record = json.loads(hemisphere(out, "01", "R").result.path("qc").read_text())
     assert " ".join(words[words.index("-ras") + 1 :]) in record["repairs"][0]
     labels, mask = files[:2]
     assert snap == (f"mri_convert {labels} labels.nii.gz && itksnap -g labels.nii.gz -s {mask}")
