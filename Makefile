@@ -1,6 +1,8 @@
 # Set-up and checks. On a bare machine with Python >= 3.11, make and git:
 #   make demo    make the environment, make a synthetic dataset, measure it, compare with the truth
+#   make quick   tests of geometry, statistics, formats, protocols and designs
 #   make test    lint, types, layer contracts and tests, exactly as in CI
+#   make release    what takes long: validation, tutorials, faults, containers, clusters, browser
 #   make validation    measure accuracy: all suites, and docs/validation.md with their tables
 #   make docs    the documentation as a site in build/site, without network
 
@@ -21,7 +23,7 @@ BIN := $(VENV)/bin
 # Changes to either file mean that the environment is out of date.
 STAMP := $(VENV)/.made-from-lock
 
-.PHONY: help env demo test lint types layers unit validation docs format lock clean
+.PHONY: help env demo quick test release lint types layers unit validation docs format lock clean
 help:
 	@sed -n '2,/^$$/s/^# \{0,1\}//p' Makefile
 
@@ -59,8 +61,18 @@ layers: $(STAMP)
 	"$(BIN)/lint-imports" --no-cache
 
 # A thread each: the two processes would wait for each other's.
+PYTEST = OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 "$(BIN)/python" -m pytest -n 2 --dist loadfile
+QUICK = classify clusters combat glm grammar mixed model multiplicity permutation power registration retest
 unit: $(STAMP)
-	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 "$(BIN)/python" -m pytest -n 2 --dist loadfile
+	$(PYTEST) --ignore tests/validation
+
+quick: $(STAMP)
+	$(PYTEST) tests/geometry tests/io tests/protocols $(QUICK:%=tests/group/test_%.py)
+
+release: $(STAMP) validation
+	$(PYTEST) tests/validation
+	set -e; for script in tutorials faults container cluster reports long; do \
+		PYTHON="$(BIN)/python" "tools/test-$$script"; done
 
 # All suites, on the real labels too where they are: LABELS=BIDS_DIR.
 validation: $(STAMP)
