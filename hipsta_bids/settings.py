@@ -122,8 +122,6 @@ class BoundarySettings(toml.SettingsTable):
     anisotropy: NonNegativeFloat = 8.0
     """Diffusion across sharper ones, of curvature k, is slowed by exp(-anisotropy (k -
     sharp_bend)), mm."""
-    max_distance: NonNegativeFloat = 1.0
-    """The two rules may differ by this much, mm; beyond it the rims are taken."""
 
 
 class SheetSettings(toml.SettingsTable):
@@ -138,6 +136,8 @@ class SheetSettings(toml.SettingsTable):
     """Nodes from posterior to anterior."""
     z_nodes: toml.Odd = 9
     """Nodes from interior to exterior, odd so that the middle one is the mid-surface."""
+    x_coordinate: Literal["midsurface", "volume"] = "midsurface"
+    """What x is: harmonic on the mid-surface, or in the volume (Diers et al. 2023)."""
     x_extent: toml.PositiveFraction = 0.9
     """The grid spans plus and minus this along x."""
     y_extent: toml.PositiveFraction = 1.0
@@ -226,8 +226,8 @@ class CheckSettings(toml.SettingsTable):
     """Flag a gap of more voxels than this (from the population, coarse or fine)."""
     flag_loose_part: NonNegativeFloat = 0.15
     """Flag a second piece of voxels, connected by faces, above this share of the sheet."""
-    flag_rim_distance: NonNegativeFloat = 1.25
-    """Flag if rim paths and boundary curves differ by more than this, multiples of thickness."""
+    flag_doubt: NonNegativeFloat = 0.3
+    """Flag if other operators lead to a medial or lateral boundary this far away, mm."""
 
 
 class MapSettings(toml.SettingsTable):

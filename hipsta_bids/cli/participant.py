@@ -194,6 +194,12 @@ def _add_processing(parser: Parser) -> None:
         choices=REGIONS,
     )
     add(
+        "--x-coordinate",
+        "NAME",
+        "midsurface (default: harmonic on the mid-surface) or volume (Diers et al. 2023)",
+        choices=("midsurface", "volume"),
+    )
+    add(
         "--ends",
         "FILE.tsv",
         "ends of the body placed by hand: columns participant_id, hemi, end, r, a, s (and session,"
@@ -333,9 +339,10 @@ def _run(options: "Namespace", arguments: Sequence[str]) -> ExitCode:
         raise UsageError("collect is about all parts; leave --shard out")
     if options.reports_only:
         return _rebuild_reports(options)
-    settings = load_settings(options.settings)
-    if options.region is not None:
-        settings = settings.changed(body={"region": options.region})
+    settings = load_settings(options.settings).changed(
+        body={"region": options.region} if options.region else {},
+        sheet={"x_coordinate": options.x_coordinate} if options.x_coordinate else {},
+    )
     if settings.body.region in EXPERIMENTAL:
         console.echo(f"note: region {settings.body.region} is experimental")
     request = input_request(options)

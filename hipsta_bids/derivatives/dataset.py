@@ -295,6 +295,11 @@ _FACES = (
     " cut nor closed, and thickness is the length of a line from face to face along the gradient of"
     " a harmonic function. What follows is about the body."
 )
+_X_COORDINATE = {
+    "midsurface": " The first of these was solved for again on the mid-surface, between its edges"
+    " without notches, so that it does not depend on the thickness.",
+    "volume": "",
+}
 _REGIONS = {
     "body": "",
     "extended": " For files with label-extended, the sheet goes on beyond the subiculum into the"
@@ -356,10 +361,11 @@ def citation_text(settings: Settings, protocols: Sequence[Protocol]) -> str:
             " checked topology and filled with"
             f" tetrahedra by TetGen {cite['tetgen']}. Its medial and lateral ends were located with"
             " an eigenfunction of the anisotropic Laplace-Beltrami operator, computed with LaPy"
-            f" {cite['shapedna']}{cite['brainprint']} and checked against the lines farthest from"
-            " each other inside the body; three harmonic functions between opposite"
+            f" {cite['shapedna']}{cite['brainprint']} and moved to the middle of the sheet's edges;"
+            " three harmonic functions between opposite"
             " faces gave each point a medial-to-lateral, posterior-to-anterior and"
-            " interior-to-exterior coordinate. Thickness is the length of a line from the interior"
+            f" interior-to-exterior coordinate.{_X_COORDINATE[settings.sheet.x_coordinate]}"
+            " Thickness is the length of a line from the interior"
             " to the exterior wall; its mean counts every square millimeter of the mid-surface the"
             " same (`thickness_mean`), or every node of the grid, as in the original method"
             " (`thickness_nodes`). Curvature is the mean curvature of the mid-surface."

@@ -105,9 +105,11 @@ class Body:
             depth = sign * ends.height(points, end)
             last = depth < min(_END_REACH, float(depth.max()))
             last &= number == np.bincount(number[last]).argmax()  # without an uncus beside it
-            middle = np.median(depth[last])
-            near, far = points[last & (depth <= middle)], points[last & (depth >= middle)]
-            step = near.mean(axis=0) - far.mean(axis=0)
+            # The slope of least squares of position on depth; weights fall to zero at the reach,
+            # so that no slice enters or leaves as a whole.
+            near, weight = points[last], _END_REACH - depth[last]
+            middle = np.average(depth[last], weights=weight)
+            step = -(weight * (depth[last] - middle)) @ (near - near.mean(axis=0))
             step /= max(float(np.linalg.norm(step)), 1e-9)
             # Nearly along the plane, or of a single slice, it says nothing.
             along = -sign * (step @ ends[end].normal) > _LEAST_SLOPE

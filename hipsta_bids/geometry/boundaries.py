@@ -1,61 +1,58 @@
 """Where the coordinates are fixed: medial and lateral strip, both sides and both ends of the sheet.
 
-Two rules find the curves along the sheet's medial and lateral edge: zero lines of an eigenfunction
-on the wall, and lines guided by distances inside the body (named ``rims`` in outputs and settings).
+Zero lines of an eigenfunction of the wall run along the medial and lateral edge. Around them,
+parts of the wall belong to the edges by weights that fall smoothly from 1 to 0, so that a small
+change of the labels moves the boundary by little.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import islice
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy import ndimage, sparse
+from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.body import Body
 from hipsta_bids.geometry.checks import name_place
 from hipsta_bids.geometry.fem import DIRECTION_RESIDUAL, Laplace
-from hipsta_bids.geometry.mesh import edge_graph, mean_wall_thickness, signed_volume
+from hipsta_bids.geometry.mesh import mean_wall_thickness, signed_volume
 from hipsta_bids.geometry.wall import Wall, end_to_end
 from hipsta_bids.settings import BoundarySettings
 from hipsta_bids.types import Bool, Float, Int, Surface
 
-#: Voxels around a vertex whose labels tell how lateral it is.
-LABEL_NEIGHBORS = 30
-#: One vertex in this many is looked up.
-LABEL_STRIDE = 4
-#: Share of the vertices that count as most lateral.
-LATERAL_SHARE = 0.1
-#: Steps along the axis count this much longer, so that distances run across it.
-AXIAL_STRETCH = 4.0
-#: Cost of a path per mm along an edge; depth below the edge adds its square, mm2.
-EDGE_FLOOR = 0.05
-#: Depth of the zones along the edges, multiples of 2 volume / wall area.
-EDGE_ZONE = 1.5
-#: Half widths of the bands in which curves are moved to the middle of the edges, same unit.
+#: Half widths of the bands in which curves are moved to the middle of the edges, in units of the
+#: sheet's thickness, 2 volume / wall area, as are all lengths here.
 EDGE_BANDS = (1.25, 1.0, 1.0)
-#: The zones hold at least all within this distance of the path along the edge, in the same unit.
-EDGE_ZONE_REACH = 0.75
-#: The boundary strips face away from the sheet: least cosine of the angle between the wall's
-#: normal and the direction in which the sheet would go on.
-STRIP_FACING = 0.62
-#: At first they hold all within this distance of the curves, multiples of 2 volume / wall area.
+#: Width over which bands fade out.
+BAND_FADE = 0.5
+#: How firmly the sides hold their values, per squared thickness.
+FIRMNESS = 30.0
+#: The boundary strips face away from the sheet: cosine of the angle between the wall's normal and
+#: the direction in which the sheet would go on, where half of a vertex belongs to the strip, and
+#: the width over which that changes.
+STRIP_FACING, FACING_FADE = 0.62, 0.4
+#: At first they hold all within this distance of the curves.
 FIRST_STRIP = 0.55
-#: They hold at least all within this distance of their middle lines, in the same unit.
-LEAST_STRIP = 0.25
-#: The direction of the sheet is found after one, two and three steps of this length from the
-#: edge, in the same unit.
-STRIP_STEP = 0.5
-#: Number of tetrahedra over which that direction is averaged.
-STRIP_NEIGHBORS = 40
-#: One tetrahedron in this many is looked up.
-STRIP_STRIDE = 4
-#: Number of points of the edge over which it is averaged then.
-EDGE_NEIGHBORS = 15
-#: They hold nothing farther than this from the curves, in the same unit; one value per round.
+#: They hold at least all within this distance of their middle lines; width of that change.
+LEAST_STRIP, LEAST_FADE = 0.25, 0.2
+#: They hold nothing farther than this from the curves, one value per round; width of that change.
 #: Later rounds start from the middle lines of the strips of the round before.
-STRIP_REACH = (0.9, 0.75)
+STRIP_REACH, REACH_FADE = (0.9, 0.75), 0.3
+#: The direction of the sheet is found after one, two and three steps of this length from the edge.
+STRIP_STEP = 0.5
+#: It is averaged over the volume with a Gaussian of this SD, mm, ...
+FLOW_SD = 0.4
+#: ... and over up to so many vertices of the strip with one of this SD, in units of thickness.
+EDGE_NEIGHBORS, EDGE_SD = 60, 0.4
+#: From this weight on a vertex belongs to a strip.
+STRIP_WEIGHT = 0.5
+#: Below it, the sides hold the middle lines; width of that change.
+HOLD_FADE = 0.15
+#: Other operators, whose zero lines show how certain the curves are: factors of sharp_bend and of
+#: anisotropy.
+TILTS = ((0.8, 1.0), (1.0, 0.625))
 #: Distances at which interior labels are looked for, mm outside the wall.
 PROBE_DISTANCES = (0.4, 0.8, 1.2)
 #: Fewer hits than this share count as no interior labels.
@@ -63,195 +60,164 @@ MIN_PROBE_SHARE = 0.02
 
 #: Medial and lateral, or the other way round.
 Pair = tuple[Float, Float]
-Paths = tuple[NDArray[np.intp], NDArray[np.intp]]
-
-_SLICES = 40  # along the body, in each of which the rim is sought
 
 
-def rim_paths(wall: Wall, laplace: Laplace, body: Body) -> tuple[Paths, Pair]:
-    """Medial and lateral path from end to end where the wall is farthest from the opposite rim.
+def ramp(values: Float) -> Float:
+    """Rise smoothly from 0 to 1 as values do."""
+    share = np.clip(values, 0.0, 1.0)
+    return np.asarray(share * share * (3 - 2 * share))
 
-    Distances run inside the volume and mostly across the long axis, as steps along it are
-    stretched. The first ones start from the sheet's most lateral labels.
 
-    Also returns how much nearer to the opposite rim each vertex of the wall lies than the rim of
-    its slice, (V,) each, mm.
+def center_curves(wall: Wall, values: Float, thickness: float) -> tuple[Pair, Float] | None:
+    """Move zero lines of a function (V,) to the middle of the sheet's edges, which may be rounded.
+
+    The function is made again, free in ever narrower bands of equal width on both sides of its
+    lines and held at its signs elsewhere: a side that bends more, or reaches farther into a band,
+    would pull the line towards itself. Bands fade out, so that a vertex that enters one moves
+    nothing by much. Returns the lines and the function.
     """
-    points, edges = laplace.points, laplace.edges
-    steps = np.diff(points[edges], axis=1)[:, 0]
-    along = steps @ body.ends.axis
-    stretch = AXIAL_STRETCH**2 - 1
-    lengths = np.sqrt(np.einsum("ij,ij->i", steps, steps) + stretch * along**2)
-    graph = edge_graph(edges, lengths, len(points))
-    start = _most_lateral(points, body)
-    paths: list[NDArray[np.intp]] = []
-    depths: list[Float] = []
-    for _ in range(3):  # medial from labels, lateral from medial, medial again from lateral
-        distance = sparse.csgraph.dijkstra(graph, indices=start, min_only=True)[wall.index]
-        depth = _below_top(distance, wall.share)
-        path = _rim_path(depth, wall)
-        start = wall.index[path].astype(np.intp)
-        paths.append(path)
-        depths.append(depth)
-    return (paths[2], paths[1]), (depths[2], depths[1])
-
-
-def guided_curves(wall: Wall, paths: Paths, depths: Pair, thickness: float) -> Pair | None:
-    """Middle lines between the two sides within zones along both paths.
-
-    Without these zones the wall falls into its two sides. The zero line of the harmonic function
-    between them, with the same curvature-aware diffusion, runs along the edges of the sheet.
-    """
-    zones = [
-        (_below_rim(depth, path, wall) < EDGE_ZONE * thickness)
-        | wall.near(wall.vertices[path], EDGE_ZONE_REACH * thickness)
-        for path, depth in zip(paths, depths, strict=True)
-    ]
-    return middle_lines(wall, zones)
-
-
-def center_curves(wall: Wall, curves: Pair, thickness: float) -> Pair:
-    """Move curves to the middle of the sheet's edges, which may be rounded.
-
-    The middle lines are found again in ever narrower bands of equal width on both sides: a side
-    that bends more, or reaches farther into a zone, pulls the line towards itself.
-    """
+    curves = end_to_end(wall, values)
     for width in EDGE_BANDS:
-        bands = [wall.near(curve, width * thickness) for curve in curves]
-        curves = middle_lines(wall, bands) or curves
-    return curves
+        if curves is None:
+            return None
+        reach = (width + BAND_FADE) * thickness
+        distance = np.minimum(*(wall.distance(curve, reach) for curve in curves)) / thickness
+        hold = ramp((distance - width) / BAND_FADE + 0.5)
+        values = _screened(wall, hold, values, thickness)
+        curves = end_to_end(wall, values)
+    return None if curves is None else (curves, values)
 
 
-def middle_lines(wall: Wall, zones: Sequence[Bool]) -> Pair | None:
-    """Zero lines of the harmonic function between the two sides, one in each of two zones."""
-    sides = wall.sides(zones[0] | zones[1])
-    if sides is None:
-        return None
-    fixed = np.flatnonzero(sides[0] | sides[1])
-    values = np.where(sides[1][fixed], 1.0, -1.0)
-    lines = end_to_end(wall, wall.evenly_aware.solve(fixed, values))
-    if lines is None:
-        return None
-    first, second = (float(zones[0][wall.nearest(line)].mean()) for line in lines)
-    return lines if first >= second else (lines[1], lines[0])
+def _screened(wall: Wall, hold: Float, values: Float, thickness: float) -> Float:
+    """Harmonic function (V,) that has the signs of values where ``hold`` (V,) is 1, drawn to them.
 
-
-def _most_lateral(points: Float, body: Body) -> NDArray[np.intp]:
-    """Vertices whose surroundings carry the most lateral labels."""
-    count = min(LABEL_NEIGHBORS, len(body.lateral))
-    asked = np.arange(0, len(points), LABEL_STRIDE)
-    mean = body.lateral[body.nearest(points[asked], count)].mean(axis=1)
-    return np.asarray(asked[mean >= np.quantile(mean, 1 - LATERAL_SHARE)])
-
-
-def _rim_path(depth: Float, wall: Wall) -> NDArray[np.intp]:
-    """Cheapest path from end to end; depth below the rim costs."""
-    cost = wall.lengths * (EDGE_FLOOR + (np.maximum(depth, 0)[wall.edges].mean(axis=1)) ** 2)
-    start, end = (
-        int(np.flatnonzero(where)[np.argmin(depth[where])])
-        for where in (wall.posterior, wall.anterior)
-    )
-    graph = edge_graph(wall.edges, cost, len(depth))
-    _, before, _ = sparse.csgraph.dijkstra(
-        graph, indices=np.array([start]), return_predecessors=True, min_only=True
-    )
-    path = [end]
-    while path[-1] != start and len(path) <= len(depth):
-        path.append(int(before[path[-1]]))
-    return np.array(path)
-
-
-def _below_top(values: Float, share: Float) -> Float:
-    """How far values (V,) lie below the largest of their slice."""
-    top = np.full(_SLICES, -np.inf)
-    np.maximum.at(top, np.minimum((share * _SLICES).astype(int), _SLICES - 1), values)
-    centers = (np.arange(_SLICES) + 0.5) / _SLICES
-    known = np.isfinite(top)
-    top = ndimage.median_filter(np.interp(centers, centers[known], top[known]), 5, mode="nearest")
-    return np.asarray(np.interp(share, centers, top) - values)
-
-
-def _below_rim(depth: Float, path: NDArray[np.intp], wall: Wall) -> Float:
-    """Depth (V,) below a rim path at the same share of the body's length, mm."""
-    order = np.argsort(wall.share[path], kind="stable")
-    return np.asarray(depth - np.interp(wall.share, wall.share[path][order], depth[path][order]))
+    The less is held, the freer it is; where 0, it is free.
+    """
+    with np.errstate(divide="ignore"):
+        weight = FIRMNESS / thickness**2 * wall.vertex_areas * hold / (1 - hold)
+    return wall.evenly_aware.screened(weight, np.sign(values))
 
 
 def facing_strips(
-    wall: Wall, laplace: Laplace, curves: Pair, thickness: float, settings: BoundarySettings
-) -> tuple[tuple[Bool, Bool], Pair]:
-    """Find the parts of the wall near two curves that face along the sheet, away from it.
+    wall: Wall, laplace: Laplace, curves: Pair, values: Float, thickness: float
+) -> tuple[Pair, Pair] | None:
+    """Weight (V,) the parts of the wall near two curves that face along the sheet, away from it.
 
-    A flat rim is such a part from corner to corner; of a round one, it is the middle. The direction
-    of the sheet at its rim is that of a harmonic function from rim to rim, continued from inside
-    the sheet, where it does not depend on where exactly the curves lie. The middle lines of the
-    strips replace the curves, and the same is done again.
+    A flat edge is such a part from corner to corner; of a round one, it is the middle. The
+    direction of the sheet at its edge is that of a harmonic function from edge to edge, continued
+    from inside the sheet, where it does not depend on where exactly the curves lie. The middle
+    lines of the strips replace the curves, and the same is done again.
+
+    Returns both weights and the middle lines; None where these do not run from end to end.
     """
-    finder = _Finder(wall, laplace, thickness, settings)
-    starts = curves
-    strips = _near(wall, curves, FIRST_STRIP * thickness)
+    normals, areas = wall.smooth_normals, wall.vertex_areas
+    weights = [1.0 * np.isfinite(wall.distance(line, FIRST_STRIP * thickness)) for line in curves]
     for reach in STRIP_REACH:
-        lines = _near(wall, curves, LEAST_STRIP * thickness)
-        limits = _near(wall, curves, reach * thickness)
-        medial, lateral = (wall.index[strip] for strip in strips)
-        values = laplace.between(medial, lateral, DIRECTION_RESIDUAL)
-        flow = laplace.gradient(values, STRIP_STRIDE)
-        strips = (
-            finder.strip(starts[0], flow, lines[0], limits[0]),
-            finder.strip(starts[1], -flow, lines[1], limits[1]),
+        medial, lateral = (wall.index[weight > STRIP_WEIGHT] for weight in weights)
+        flow = Flow(laplace, laplace.between(medial, lateral, DIRECTION_RESIDUAL))
+        for k, inward in enumerate((1.0, -1.0)):
+            distance = wall.distance(curves[k], (reach + REACH_FADE) * thickness) / thickness
+            strip = np.flatnonzero(weights[k])
+            starts = wall.vertices[strip]
+            outward = -inward * _direction_at_edge(flow, starts, inward * thickness)
+            close = np.flatnonzero(np.isfinite(distance))
+            share = (weights[k] * areas)[strip]
+            towards = _local_mean(wall.vertices[close], starts, outward, share, EDGE_SD * thickness)
+            cosine = (normals[close] * _unit(towards)).sum(axis=1)
+            facing = ramp((cosine - STRIP_FACING) / FACING_FADE + 0.5)
+            facing *= ramp((reach - distance[close]) / REACH_FADE + 0.5)
+            weight = ramp((LEAST_STRIP - distance) / LEAST_FADE + 0.5)
+            weight[close] = np.maximum(weight[close], facing)
+            weights[k] = np.where(wall.connected(weight > 0, distance <= LEAST_STRIP), weight, 0.0)
+        strength = np.maximum(*weights)
+        sides = wall.sides(strength > STRIP_WEIGHT)
+        if sides is None:
+            return None
+        # By the sign of the function, an edge would keep what stands on it on either side.
+        values = 1.0 * sides[0] - 1.0 * sides[1]
+        hold = np.abs(values) * ramp((STRIP_WEIGHT - strength) / HOLD_FADE)
+        values = _screened(wall, hold, values, thickness)
+        lines = end_to_end(wall, values)
+        if lines is None:
+            return None
+        curves = _in_order(lines, curves)
+    return (weights[0], weights[1]), curves
+
+
+def _in_order(lines: Pair, curves: Pair) -> Pair:
+    """Put lines in the order of the curves that they replace."""
+    first, second = (np.mean(cKDTree(curve).query(lines[0])[0]) for curve in curves)
+    return lines if first <= second else (lines[1], lines[0])
+
+
+def _direction_at_edge(flow: "Flow", starts: Float, inward: float) -> Float:
+    """Compute the unit direction (N, 3) of the flow at the sheet's edge.
+
+    Three steps are made into the sheet; a line through the directions found there is continued
+    to the edge, since the sheet may bend. The length of ``inward`` is the sheet's thickness, mm;
+    it is negative where the flow leads out of the sheet.
+    """
+    points, direction = starts, flow(starts)
+    steps = []
+    for _ in range(3):
+        points = points + STRIP_STEP * inward * direction
+        direction = flow(points)
+        steps.append(direction)
+    # Least squares through steps 1, 2 and 3, continued to 0.
+    return _unit((4 * steps[0] + steps[1] - 2 * steps[2]) / 3)
+
+
+def _local_mean(at: Float, points: Float, vectors: Float, weight: Float, sd: float) -> Float:
+    """Average weighted vectors (N, 3) around places (M, 3), with a Gaussian: (M, 3)."""
+    count = min(EDGE_NEIGHBORS, len(points))
+    distance, near = (np.asarray(part) for part in cKDTree(points).query(at, k=count))
+    distance, near = distance.reshape(len(at), -1), near.reshape(len(at), -1)
+    # Relative to the nearest: far from all of them, none would count.
+    share = weight[near] * np.exp(-0.5 * (distance**2 - distance[:, :1] ** 2) / sd**2)
+    return np.asarray(np.einsum("mk,mkd->md", share, vectors[near]))
+
+
+class Flow:
+    """Direction of a harmonic function in a volume, averaged over a neighborhood.
+
+    The mean is taken on a grid, so that the tetrahedra's number and place matter little.
+    """
+
+    _STEP = 0.7
+    """Of the grid, times the SD."""
+
+    def __init__(self, laplace: Laplace, values: Float) -> None:
+        corners = laplace.points[laplace.cells.T]
+        volume = np.abs(
+            np.einsum(
+                "ij,ij->i",
+                corners[1] - corners[0],
+                np.cross(corners[2] - corners[0], corners[3] - corners[0]),
+            )
         )
-        starts = (wall.vertices[strips[0]], wall.vertices[strips[1]])
-        curves = middle_lines(wall, strips) or curves
-    return strips, curves
+        flow = laplace.gradient(values)
+        centers = corners.mean(axis=0)
+        self._step = self._STEP * FLOW_SD
+        # Around the middle, so that mirror images get mirrored grids.
+        middle = 0.5 * (laplace.points.max(axis=0) + laplace.points.min(axis=0))
+        half = np.ceil(np.ptp(laplace.points, axis=0) / 2 / self._step).astype(int) + 6
+        self._low = middle - half * self._step
+        shape = 2 * half + 1
+        cell = np.rint((centers - self._low) / self._step).astype(np.intp)
+        index = np.ravel_multi_index(tuple(cell.T), tuple(shape))
+        total = [np.bincount(index, volume * part, int(np.prod(shape))) for part in flow.T]
+        self._grid = np.stack(
+            [
+                ndimage.gaussian_filter(part.reshape(shape), 1 / self._STEP, truncate=3.0)
+                for part in total
+            ]
+        )
 
-
-def _near(wall: Wall, curves: Pair, reach: float) -> tuple[Bool, Bool]:
-    return wall.near(curves[0], reach), wall.near(curves[1], reach)
-
-
-class _Finder:
-    """Finds the vertices that face away from the sheet."""
-
-    def __init__(
-        self, wall: Wall, laplace: Laplace, thickness: float, settings: BoundarySettings
-    ) -> None:
-        self._wall, self._settings = wall, settings
-        self._step = STRIP_STEP * thickness
-        links = edge_graph(wall.edges, np.ones(len(wall.edges)), len(wall.vertices))
-        self._normals = _unit((links + sparse.eye_array(len(wall.vertices))) @ wall.normals)
-        asked = laplace.cells[::STRIP_STRIDE]
-        self._centers = cKDTree(laplace.points[asked.T].mean(axis=0))
-
-    def strip(self, starts: Float, inward: Float, line: Bool, limit: Bool) -> Bool:
-        """Vertices (V,) within a limit that face away from the sheet, with a line among them."""
-        away = -self._direction_at_rim(starts, inward)
-        close = np.flatnonzero(limit)
-        count = min(EDGE_NEIGHBORS, len(starts))
-        _, nearest = cKDTree(starts).query(self._wall.vertices[close], k=count)
-        towards = _unit(away[nearest].mean(axis=1))
-        facing = line.copy()
-        cosine = (self._normals[close] * towards).sum(axis=1)
-        facing[close] |= cosine > STRIP_FACING
-        return self._wall.connected(facing, line)
-
-    def _direction_at_rim(self, starts: Float, inward: Float) -> Float:
-        """Direction (N, 3) of the sheet at its rim.
-
-        Three steps are made into the sheet; a line through the directions found there is continued
-        to the rim, since the sheet may bend.
-        """
-        points, direction = starts, self._mean(starts, inward)
-        found = []
-        for _ in range(3):
-            points = points + self._step * direction
-            direction = self._mean(points, inward)
-            found.append(direction)
-        # Least squares through steps 1, 2 and 3, continued to 0.
-        return _unit((4 * found[0] + found[1] - 2 * found[2]) / 3)
-
-    def _mean(self, points: Float, flow: Float) -> Float:
-        _, nearest = self._centers.query(points, k=STRIP_NEIGHBORS)
-        return _unit(flow[nearest].mean(axis=1))
+    def __call__(self, points: Float) -> Float:
+        """Return unit vectors (N, 3) at points (N, 3)."""
+        place = ((points - self._low) / self._step).T
+        rows = [ndimage.map_coordinates(part, place, order=1) for part in self._grid]
+        return _unit(np.stack(rows, axis=1))
 
 
 def _unit(vectors: Float) -> Float:
@@ -271,13 +237,9 @@ class Boundaries:
     medial_curve: Float
     """(N, 3) points of the boundary curve, RAS mm."""
     lateral_curve: Float
-    rule: str
-    """``eigenfunction`` (of the wall) or ``rims`` (guided by distances inside the body)."""
-    distance: float
-    """Mean distance between the curves of the two rules, the worse of the two, mm; NaN if only one
-    rule gives curves."""
-    rim_distance: float
-    """Mean distance of the curves from the rim paths, the worse of the two, mm."""
+    doubt: float
+    """Largest mean distance of the curves from those of other operators (``TILTS``), mm; NaN if one
+    of these has none."""
     side_rule: str
     """What tells interior from exterior: ``labels``, or, decided on the sheet, ``bending`` or,
     where cortex is measured, ``continuity`` with the hippocampus."""
@@ -295,25 +257,23 @@ def find_boundaries(
     """Find the boundary strips, sides and caps of the sheet; the operator is that of its volume.
 
     The zero lines of the first curvature-aware anisotropic Laplace-Beltrami eigenfunction of the
-    wall are the medial and lateral boundary (Diers et al. 2023, section 2.1.3). An independent
-    answer comes from distances inside the volume, which are largest along the sheet's edges.
+    wall are the medial and lateral boundary (Diers et al. 2023, section 2.1.3), moved to the middle
+    of the edges.
     """
-    wall = Wall(surface, body, settings)
+    wall = Wall(surface, settings)
     thickness = mean_wall_thickness(surface)
-    paths, depths = rim_paths(wall, laplace, body)
-    rims = (wall.vertices[paths[0]], wall.vertices[paths[1]])
-    guided = guided_curves(wall, paths, depths, thickness)
-    curves = end_to_end(wall, wall.bend_aware.eigenfunctions(1)[1][:, 0])
-    distance = float("nan")
-    if curves is not None and guided is not None:
-        distance = _curve_distance(curves, guided)
-    attempts = [("eigenfunction", curves), ("rims", guided)]
-    if not distance <= settings.max_distance:
-        attempts.reverse()
-    found = _separating(wall, laplace, attempts, thickness, settings)
-    if found is None:
-        raise _inseparable(rims, body)
-    rule, pair, strips, sides = found
+    values = _eigenfunction(wall, settings)
+    centered = None if values is None else center_curves(wall, values, thickness)
+    if values is None or centered is None:
+        raise GeometryError(
+            "no line runs along the medial and the lateral edge from end to end: check the labels "
+            "for folds that touch each other",
+            reason="boundaries",
+        )
+    curves, smooth = centered
+    strips, sides, pair = _strips_and_sides(wall, laplace, curves, smooth, thickness)
+    if sides is None:
+        raise _inseparable(curves, body)
     if _rank(pair[0], body) > _rank(pair[1], body):
         pair, strips = (pair[1], pair[0]), (strips[1], strips[0])
     sides, side_rule, margin = _interior_first(sides, wall, body)
@@ -327,9 +287,7 @@ def find_boundaries(
         anterior=np.flatnonzero(surface.anterior_cap).astype(np.int32),
         medial_curve=pair[0],
         lateral_curve=pair[1],
-        rule=rule,
-        distance=distance,
-        rim_distance=_curve_distance(pair, rims),
+        doubt=_doubt(wall, curves, thickness, settings),
         side_rule=side_rule,
         side_margin=margin,
         strip_width=area / (2 * body.ends.length(wall.vertices)),
@@ -340,34 +298,62 @@ def find_boundaries(
     )
 
 
-def _separating(
-    wall: Wall,
-    laplace: Laplace,
-    attempts: list[tuple[str, Pair | None]],
-    thickness: float,
-    settings: BoundarySettings,
-) -> tuple[str, Pair, tuple[Bool, Bool], tuple[Bool, Bool]] | None:
-    """Take the first pair of curves whose strips separate the wall into two sides, if any."""
-    for rule, found in attempts:
-        if found is None:
-            continue
-        pair = center_curves(wall, found, thickness)
-        plain = _near(wall, pair, FIRST_STRIP * thickness)
-        for strips, middle in (
-            facing_strips(wall, laplace, pair, thickness, settings),
-            (plain, pair),
-        ):
-            sides = wall.sides(strips[0] | strips[1])
-            if sides is not None and not (strips[0] & strips[1]).any():
-                return rule, middle, strips, sides
+def _operators(wall: Wall, settings: BoundarySettings) -> Iterator[Laplace]:
+    """Make the operator of the settings, and others for comparison."""
+    for bend, anisotropy in ((1.0, 1.0), *TILTS):
+        yield wall.operator(
+            settings.changed(
+                sharp_bend=bend * settings.sharp_bend, anisotropy=anisotropy * settings.anisotropy
+            )
+        )
+
+
+def _eigenfunction(wall: Wall, settings: BoundarySettings) -> Float | None:
+    """Return the first eigenfunction (V,) with two zero lines from end to end, of any operator."""
+    for operator in _operators(wall, settings):
+        values = operator.eigenfunctions(1)[1][:, 0]
+        if end_to_end(wall, values) is not None:
+            return values
     return None
 
 
-def _inseparable(rims: Pair, body: Body) -> GeometryError:
+def _doubt(wall: Wall, curves: Pair, thickness: float, settings: BoundarySettings) -> float:
+    """Largest mean distance of curves from those that other operators lead to, mm; NaN for none.
+
+    Curves that are certain are found from any start, to the thousandth of a millimeter.
+    """
+    distances = []
+    for operator in islice(_operators(wall, settings), 1, None):
+        moved = center_curves(wall, operator.eigenfunctions(1)[1][:, 0], thickness)
+        distances.append(float("nan") if moved is None else _curve_distance(moved[0], curves))
+    return float(np.max(distances))
+
+
+def _strips_and_sides(
+    wall: Wall, laplace: Laplace, curves: Pair, values: Float, thickness: float
+) -> tuple[tuple[Bool, Bool], tuple[Bool, Bool] | None, Pair]:
+    """Find strips along two curves and the sides that they separate, if they do.
+
+    Where strips that face along the sheet do not, those within ``FIRST_STRIP`` of the curves may.
+    """
+    plain = [np.isfinite(wall.distance(curve, FIRST_STRIP * thickness)) for curve in curves]
+    attempts = [(plain, curves)]
+    facing = facing_strips(wall, laplace, curves, values, thickness)
+    if facing is not None:
+        weights, lines = facing
+        attempts.insert(0, ([weight > STRIP_WEIGHT for weight in weights], lines))
+    for (first, second), _middle in attempts:
+        sides = None if (first & second).any() else wall.sides(first | second)
+        if sides is not None:
+            break
+    return (first, second), sides, _middle
+
+
+def _inseparable(curves: Pair, body: Body) -> GeometryError:
     """Say where the two paths come closest to each other."""
-    gap, nearest = (np.asarray(found) for found in cKDTree(rims[1]).query(rims[0]))
+    gap, nearest = (np.asarray(found) for found in cKDTree(curves[1]).query(curves[0]))
     closest = int(gap.argmin())
-    position = name_place(np.stack([rims[0][closest], rims[1][nearest[closest]]]), body)
+    position = name_place(np.stack([curves[0][closest], curves[1][nearest[closest]]]), body)
     return GeometryError(
         "the medial and lateral boundary do not separate the interior from the exterior side: "
         f"check the labels for folds that touch each other, first near {position}, where the "

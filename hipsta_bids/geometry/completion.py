@@ -43,6 +43,10 @@ CAVITY_OPENNESS = 0.25
 #: A cavity with room for a ball of this radius is too wide to be the molecular layer, mm.
 CAVITY_RADIUS = 0.9
 
+#: Neighbors that are no farther than the nearest by more than this are tied, mm: the affine of an
+#: image is stored with errors of a hundredth of that.
+TIE_SLACK = 1e-3
+
 Index = NDArray[np.intp]
 Tissues = NDArray[np.uint8]
 
@@ -71,7 +75,7 @@ def value_of_nearest(values: NDArray[np.integer], points: Float, at: Float) -> I
     """
     neighbors = cKDTree(points).query(at, k=_TIES)
     distance, index = (np.asarray(part) for part in neighbors)
-    tied = distance < distance[:, :1] + 1e-6
+    tied = distance < distance[:, :1] + TIE_SLACK
     padding = np.iinfo(np.intp).max  # also for fewer points than asked
     ranked = np.append(values.astype(np.intp), padding)[index]
     return np.asarray(np.where(tied, ranked, padding).min(axis=1))

@@ -3,13 +3,12 @@
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
-from copy import copy
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 from lapy import Solver, TetMesh, TriaMesh
-from lapy.diffgeo import compute_gradient
+from lapy.diffgeo import compute_divergence, compute_gradient
 from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse import linalg
@@ -60,13 +59,6 @@ class Laplace:
             (symmetric.data, symmetric.indices, symmetric.indptr), shape=symmetric.shape
         )
 
-    @cached_property
-    def edges(self) -> Int:
-        """(E, 2), lower vertex first, in order."""
-        first = np.arange(len(self.points), dtype=np.int32).repeat(np.diff(self.stiffness.indptr))
-        upper = self.stiffness.indices > first
-        return np.column_stack([first[upper], self.stiffness.indices[upper]])
-
     def solve(
         self, fixed: NDArray[np.integer], values: Float, residual: float = _RESIDUAL
     ) -> Float:
@@ -91,13 +83,35 @@ class Laplace:
         values = np.repeat([-1.0, 1.0], [len(first), len(second)])
         return self.solve(np.concatenate([first, second]), values, residual)
 
-    def gradient(self, values: Float, stride: int = 1) -> Float:
-        """Gradient (T, 3) of a piecewise linear function (V,) in every so many cells, per mm."""
-        part = copy(self._mesh)
-        part.t = self.cells[::stride]
-        flow: Float = compute_gradient(part, values)
+    def screened(self, weight: Float, values: Float) -> Float:
+        """Find the function (V,) of least energy plus weighted squared difference from values.
+
+        Where the weight (V,) is infinite, the function has these values.
+        """
+        result, free = np.where(np.isinf(weight), values, 0.0), np.isfinite(weight)
+        added = np.where(free, weight, 0.0)
+        right = added * values - self.stiffness @ result
+        matrix = self.stiffness[free][:, free] + sparse.diags_array(added[free])
+        with _solvable():
+            result[free] = _factor(matrix.tocsc()).solve(right[free])
+        return result
+
+    def integrate(self, field: Float) -> Float:
+        """Find the function (V,) whose gradient is nearest to a field (T, 3) on triangles.
+
+        Its first value is zero. The equation is K f = -div of the field, as LaPy defines it.
+        """
+        right = -compute_divergence(self._mesh, field)
+        free = np.ones(len(self.points), dtype=bool)
+        free[0] = False
+        with _solvable():
+            return self._rest(right, free, _RESIDUAL)
+
+    def gradient(self, values: Float) -> Float:
+        """Compute the gradient (T, 3) of a piecewise linear function (V,), per mm."""
+        flow: Float = compute_gradient(self._mesh, values)
         # LaPy 1.7 returns the negative gradient on tetrahedra; the true one rises along edges.
-        start, stop = part.t[:, 0], part.t[:, 1]
+        start, stop = self.cells[:, 0], self.cells[:, 1]
         rise = (flow * (self.points[stop] - self.points[start])).sum(axis=1)
         return flow if rise @ (values[stop] - values[start]) >= 0 else -flow
 

@@ -248,9 +248,7 @@ def between_planes(mesh: TetMesh, coordinates: Coordinates, ends: EndPlanes) -> 
     at right angles to the walls, however obliquely a plane cuts them.
     """
     x, y = np.linspace(-0.98, 0.98, 41), np.linspace(-0.998, 0.998, 121)
-    # No point has z of 2: only the level in the middle is sought.
-    levels = _invert(mesh, coordinates.values, (x, y, np.array([-2.0, 0.0, 2.0])))
-    middle = fill_points(levels[:, :, 1:2])[:, :, 0]
+    middle = middle_surface(mesh, coordinates, x, y)
     limits = []
     for height in (ends.height(middle, "posterior"), ends.height(middle, "anterior")):
         rising = np.maximum.accumulate(np.nan_to_num(height, nan=-np.inf), axis=1)
@@ -259,6 +257,13 @@ def between_planes(mesh: TetMesh, coordinates: Coordinates, ends: EndPlanes) -> 
     low, high = (np.interp(values[:, 0], x, limit) for limit in limits)
     values[:, 1] = 2 * (values[:, 1] - low) / (high - low) - 1
     return Coordinates(values=values)
+
+
+def middle_surface(mesh: TetMesh, coordinates: Coordinates, x: Float, y: Float) -> Float:
+    """Points (Nx, Ny, 3) of the mid-surface at coordinates, RAS mm."""
+    # No point has z of 2: only the level in the middle is sought.
+    levels = _invert(mesh, coordinates.values, (x, y, np.array([-2.0, 0.0, 2.0])))
+    return fill_points(levels[:, :, 1:2])[:, :, 0]
 
 
 def equal_volume_layers(sheet: Sheet) -> tuple[Sheet, Bool]:

@@ -8,9 +8,8 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.spatial import cKDTree
 
-from hipsta_bids.geometry.body import Body
+from hipsta_bids.geometry import mesh
 from hipsta_bids.geometry.fem import Laplace
-from hipsta_bids.geometry.mesh import lateral_triangles, triangle_areas, unique_edges
 from hipsta_bids.settings import BoundarySettings
 from hipsta_bids.types import Bool, Float, Int, Surface
 
@@ -56,8 +55,8 @@ class _Mesh(TriaMesh):  # type: ignore[misc]  # LaPy is untyped
 class Wall:
     """The surface without its caps, with vertices of its own numbering."""
 
-    def __init__(self, surface: Surface, body: Body, settings: BoundarySettings) -> None:
-        triangles = surface.triangles[lateral_triangles(surface)]
+    def __init__(self, surface: Surface, settings: BoundarySettings) -> None:
+        triangles = surface.triangles[mesh.lateral_triangles(surface)]
         used = np.bincount(triangles.ravel(), minlength=len(surface.vertices)) > 0
         self.index = np.flatnonzero(used).astype(np.int32)
         number = np.full(len(surface.vertices), -1, dtype=np.int32)
@@ -66,16 +65,18 @@ class Wall:
         self.triangles = number[triangles]
         self.posterior = surface.posterior_cap[self.index]
         self.anterior = surface.anterior_cap[self.index]
-        below, above = body.ends.depths(self.vertices)
-        self.share = np.clip(below / (below + above), 0, 1)
-        self.edges = unique_edges(self.triangles)
+        self.edges = mesh.unique_edges(self.triangles)
         self.lengths = np.linalg.norm(np.diff(self.vertices[self.edges], axis=1)[:, 0], axis=1)
 
         self._tree = cKDTree(self.vertices)
-        self.areas = triangle_areas(self.vertices, self.triangles)
-        self.bend_aware, self.evenly_aware = self._operators(settings)
+        self.areas = mesh.triangle_areas(self.vertices, self.triangles)
+        self.vertex_areas = mesh.vertex_areas(self.vertices, self.triangles)
+        self._mesh, self._solver = _Mesh(self.vertices, self.triangles), settings.solver
+        self._across, self._along, least, _ = self._mesh.curvature_tria(CURVATURE_SMOOTHING)
+        self._bend = -least / (LAPY_CURVATURE * float(self.lengths.mean()))
+        self.evenly_aware = self.operator(settings, LEAST_DIFFUSION)
 
-    def _operators(self, settings: BoundarySettings) -> tuple[Laplace, Laplace]:
+    def operator(self, settings: BoundarySettings, least: float = 0.0) -> Laplace:
         """Two Laplace operators with diffusion across sharp convex bends slowed down.
 
         The first without limit, so that the sharpest lines separate the wall; the second down to a
@@ -85,36 +86,35 @@ class Wall:
         divided by that and a factor (see the settings). On outward triangles it is negative where
         the surface is convex.
         """
-        mesh = _Mesh(self.vertices, self.triangles)
-        across, along, least, _ = mesh.curvature_tria(CURVATURE_SMOOTHING)
-        bend = -least / (LAPY_CURVATURE * float(self.lengths.mean()))
-        excess = np.maximum(bend - settings.sharp_bend, 0)
-        slowed = np.exp(-settings.anisotropy * excess)
-        first, second = (
-            Laplace(mesh, settings.solver, (across, along, np.stack([np.ones_like(s), s], axis=1)))
-            for s in (slowed, np.maximum(slowed, LEAST_DIFFUSION))
+        excess = np.maximum(self._bend - settings.sharp_bend, 0)
+        slowed = np.maximum(np.exp(-settings.anisotropy * excess), least)
+        speeds = np.stack([np.ones_like(slowed), slowed], axis=1)
+        return Laplace(self._mesh, self._solver, (self._across, self._along, speeds))
+
+    def distance(self, curve: Float, reach: float) -> Float:
+        """Compute distances (V,) from the nearest of a curve's points (N, 3), up to ``reach``, mm.
+
+        Infinite beyond, and where no way along the wall stays within reach, as across a gap.
+        """
+        distance = np.asarray(
+            cKDTree(curve).query(self.vertices, distance_upper_bound=reach)[0], dtype=np.float64
         )
-        return first, second
+        closest = int(self._tree.query(curve[len(curve) // 2])[1])
+        seed = np.zeros(len(distance), dtype=bool)
+        seed[closest] = True
+        return np.where(self.connected(np.isfinite(distance) | seed, seed), distance, np.inf)
+
+    @cached_property
+    def smooth_normals(self) -> Float:
+        """(V, 3) mean normals of each vertex and its neighbors, unit length."""
+        links = mesh.edge_graph(self.edges, np.ones(len(self.edges)), len(self.vertices))
+        total = (links @ self.normals) + self.normals
+        return np.asarray(total / np.maximum(np.linalg.norm(total, axis=1), 1e-12)[:, None])
 
     @cached_property
     def normals(self) -> Float:
         """(V, 3) unit outward normals, weighted by area."""
         return vertex_normals(self.vertices, self.triangles)
-
-    def near(self, curve: Float, reach: float) -> Bool:
-        """Vertices within ``reach`` mm of a curve and connected to it along the wall."""
-        close = np.zeros(len(self.vertices), dtype=bool)
-        pairs = self._tree.sparse_distance_matrix(cKDTree(curve), reach, output_type="ndarray")
-        close[pairs["i"]] = True
-        closest = int(self._tree.query(curve[len(curve) // 2])[1])
-        close[closest] = True
-        seed = np.zeros(len(close), dtype=bool)
-        seed[closest] = True
-        return self.connected(close, seed)
-
-    def nearest(self, points: Float) -> NDArray[np.intp]:
-        """Vertex nearest to each of points (N, 3), RAS mm."""
-        return np.asarray(self._tree.query(points)[1])
 
     def connected(self, part: Bool, seed: Bool) -> Bool:
         """Vertices of a part of the wall that are connected within it to one of the seeds."""

@@ -46,6 +46,7 @@ from hipsta_bids.geometry.findings import (
 from hipsta_bids.geometry.grid import check_voxel, in_plane_voxel, resample_body
 from hipsta_bids.geometry.measures import bending_angle
 from hipsta_bids.geometry.mesh import extract_surface, fill_surface, tetra_quality
+from hipsta_bids.geometry.rows import straighten_rows
 from hipsta_bids.geometry.sheet import (
     between_planes,
     check_flipped,
@@ -158,11 +159,13 @@ def find_all(evidence: Evidence) -> list[Finding]:
         ),
         (
             "boundary-doubtful",
-            boundaries.rim_distance / boundaries.sheet_thickness,
-            checks.flag_rim_distance,
-            f"the medial or lateral boundary is uncertain by {boundaries.rim_distance:.1f} mm",
+            boundaries.doubt if np.isfinite(boundaries.doubt) else np.inf,
+            checks.flag_doubt,
+            f"the medial or lateral boundary is uncertain by {boundaries.doubt:.1f} mm"
+            if np.isfinite(boundaries.doubt)
+            else "the medial or lateral boundary depends on the operator",
             "look at the edges of the sheet",
-            middle[edges < boundaries.rim_distance],
+            middle[edges < np.nan_to_num(boundaries.doubt, nan=np.inf)],
         ),
         (
             # The cortex beside the body bends the other way.
@@ -261,9 +264,7 @@ def quality_metrics(evidence: Evidence) -> dict[str, Any]:
         "tetrahedra": len(evidence.mesh.tetrahedra),
         "tetra_quality_median": float(np.median(quality)),
         "tetra_quality_p01": float(np.quantile(quality, 0.01)),
-        "boundary_rule": boundaries.rule,
-        "boundary_distance_mm": boundaries.distance,
-        "boundary_rim_distance_mm": boundaries.rim_distance,
+        "boundary_doubt_mm": boundaries.doubt,
         "boundary_strip_mm": boundaries.strip_width,
         "side_rule": boundaries.side_rule,
         "side_margin": boundaries.side_margin,
@@ -313,6 +314,8 @@ def unfold(volume: LabelVolume, hemi: str, settings: Settings, clock: Clock) -> 
         coordinates = solve_coordinates(laplace, boundaries)
         if settings.grid.beyond:
             coordinates = between_planes(mesh, coordinates, body.ends)
+        if settings.sheet.x_coordinate == "midsurface":
+            coordinates = straighten_rows(mesh, coordinates, settings.boundaries.solver)
         order = check_label_order(mesh, coordinates, body, settings.checks)
     with clock("sheet"):
         sheet = sample_sheet(mesh, coordinates, settings.sheet)

@@ -150,7 +150,6 @@ _POINTS_SHOWN = 4
 #: Rows of the quality table that hold words, and the keys of the quality record.
 _FACTS = (
     ("End planes", "posterior_end_rule", "anterior_end_rule"),
-    ("Boundaries found by", "boundary_rule"),
     ("Interior side found by", "side_rule"),
 )
 

@@ -13,7 +13,6 @@ from skimage.measure import marching_cubes
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry import fem
 from hipsta_bids.geometry.fem import Laplace, volume_laplace
-from hipsta_bids.geometry.mesh import unique_edges
 from hipsta_bids.types import TetMesh
 
 EXACT = 1e-10  # rounding in a sparse solve
@@ -109,14 +108,6 @@ def test_gradient_and_energy_of_a_linear_function_are_its_slope(seed):
     assert energy == pytest.approx(slope @ slope * np.prod(SIZE), rel=EXACT)
 
 
-def test_gradient_in_every_third_cell_is_that_of_the_whole():
-    mesh = wobbled()
-    laplace, values = volume_laplace(mesh), (mesh.vertices**2).sum(axis=1)
-    whole = laplace.gradient(values)
-    np.testing.assert_array_equal(laplace.gradient(values, 3), whole[::3])
-    np.testing.assert_array_equal(laplace.gradient(values), whole)
-
-
 @pytest.mark.parametrize("sign", [-1, 1])
 def test_gradient_is_right_whatever_the_sign_of_lapys(monkeypatch, sign):
     mesh = wobbled()
@@ -124,10 +115,6 @@ def test_gradient_is_right_whatever_the_sign_of_lapys(monkeypatch, sign):
     monkeypatch.setattr(fem, "compute_gradient", lambda *given: sign * lapys(*given))
     found = volume_laplace(mesh).gradient(mesh.vertices[:, 1])
     np.testing.assert_allclose(found, np.tile([0.0, 1.0, 0.0], (len(found), 1)), atol=EXACT)
-
-
-def test_edges_are_those_of_the_cells(arc):
-    np.testing.assert_array_equal(arc.laplace.edges, unique_edges(arc.mesh.tetrahedra))
 
 
 def box_eigenfunctions(cells, solver="two-level"):

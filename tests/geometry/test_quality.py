@@ -85,10 +85,10 @@ def test_much_repaired(evidence, fraction, wanted):
     assert reasons(replace(evidence, solid=solid)) == wanted
 
 
-@pytest.mark.parametrize(("share", "wanted"), [(1.3, ["boundary-doubtful"]), (1.2, [])])
-def test_boundary_doubtful(evidence, share, wanted):
-    gap = share * evidence.boundaries.sheet_thickness
-    boundaries = replace(evidence.boundaries, rim_distance=gap)
+@pytest.mark.parametrize("doubt", [0.29, 0.31, float("nan")])
+def test_boundary_doubtful(evidence, doubt):
+    wanted = [] if doubt < 0.3 else ["boundary-doubtful"]
+    boundaries = replace(evidence.boundaries, doubt=doubt)
     assert reasons(replace(evidence, boundaries=boundaries)) == wanted
 
 

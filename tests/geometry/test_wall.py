@@ -14,7 +14,7 @@ SETTINGS = BoundarySettings()
 
 @pytest.fixture(scope="module")
 def wall(slab):
-    return Wall(slab.surface, slab.body, SETTINGS)
+    return Wall(slab.surface, SETTINGS)
 
 
 @pytest.fixture(scope="module")
@@ -78,18 +78,12 @@ def test_caps_are_left_out(slab, wall):
     assert len(wall.vertices) - len(wall.edges) + len(wall.triangles) == 0
 
 
-def test_share_runs_from_the_posterior_to_the_anterior_end(wall, place):
-    np.testing.assert_allclose(wall.share, place[1], atol=0.03)  # planes are off by < 0.2 of 8 mm
-    np.testing.assert_allclose(wall.share[wall.posterior], 0, atol=1e-6)  # vertices are rounded
-    np.testing.assert_allclose(wall.share[wall.anterior], 1, atol=1e-6)
-
-
 def test_diffusion_is_slow_across_the_rims_only(wall, place):
     """Energy of a function that steps across a region tells how fast diffusion is there."""
     u, _, n = place
     across_rim = np.clip(n / 0.5, -1, 1)  # from side to side round the rims
     along_side = np.clip((u - 0.5) / 0.05, -1, 1)  # from rim to rim in the middle of the sides
-    for matrix in (wall.bend_aware.stiffness, wall.evenly_aware.stiffness):
+    for matrix in (wall.operator(SETTINGS).stiffness, wall.evenly_aware.stiffness):
         # Over slope squared times area: two bands of 8 mm, 1 and 1.2 mm wide.
         rim = across_rim @ (matrix @ across_rim) / (2 * 8 * 1.0 * 2.0**2)
         side = along_side @ (matrix @ along_side) / (2 * 8 * 1.2 * (1 / 0.6) ** 2)
@@ -98,9 +92,9 @@ def test_diffusion_is_slow_across_the_rims_only(wall, place):
 
 
 def test_without_anisotropy_diffusion_is_even(slab):
-    wall = Wall(slab.surface, slab.body, BoundarySettings(anisotropy=0.0))
+    wall = Wall(slab.surface, BoundarySettings(anisotropy=0.0))
     plain = Solver(TriaMesh(wall.vertices.copy(), wall.triangles.copy()), lump=True)
-    for laplace in (wall.bend_aware, wall.evenly_aware):
+    for laplace in (wall.operator(BoundarySettings(anisotropy=0.0)), wall.evenly_aware):
         # Rounding: sums of some terms, thin triangles.
         difference = abs(laplace.stiffness - plain.stiffness).max()
         assert difference < 1e-10 * abs(plain.stiffness).max()
@@ -118,10 +112,12 @@ def test_the_wall_has_the_area_of_the_phantoms(wall):
     assert wall.areas.sum() == pytest.approx(2 * (12.0 + 2.0) * 8.0, rel=0.06)  # rims are rounded
 
 
-def test_near_is_connected_along_the_wall(slab, wall, place):
+def test_distance_is_finite_where_connected_along_the_wall(slab, wall, place):
     u, _, n = place
     line = slab.phantom.body.place(0.5, np.linspace(0, 1, 41), 1.0)
-    near = wall.near(line, 2.5)  # reaches through the wall of 2 mm
+    distance = wall.distance(line, 2.5)  # reaches through the wall of 2 mm
+    near = np.isfinite(distance)
+    assert distance[near].max() <= 2.5
     assert near.any()
     assert (n[near] > 0).all()
     assert (np.abs(u[near] - 0.5) < 2.6 / 12).all()

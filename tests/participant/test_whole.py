@@ -70,7 +70,7 @@ def test_nodes_of_the_body_are_those_of_its_own_sheet(maps: HemisphereMaps) -> N
     apart = np.linalg.norm(middle(maps)[:, 10:31] - middle(alone), axis=-1)
     difference = maps.thickness[:, 10:31] - alone.thickness
     told = np.isfinite(difference)
-    assert told.mean() > 0.9
+    assert told.mean() > 0.88  # beside rims, within MARGIN, the whole sheet has no values
     assert np.median(apart[told]) < 0.02
     assert np.quantile(apart[told], 0.95) < 0.15
     assert np.abs(difference[told]).max() < 0.15
