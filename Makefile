@@ -62,12 +62,12 @@ layers: $(STAMP)
 
 # A thread each: the two processes would wait for each other's.
 PYTEST = OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 "$(BIN)/python" -m pytest -n 2 --dist loadfile
-QUICK = classify clusters combat glm grammar mixed model multiplicity permutation power registration retest
+QUICK = geometry io protocols group/design group/stats
 unit: $(STAMP)
 	$(PYTEST) --ignore tests/validation
 
 quick: $(STAMP)
-	$(PYTEST) tests/geometry tests/io tests/protocols $(QUICK:%=tests/group/test_%.py)
+	$(PYTEST) $(QUICK:%=tests/%)
 
 release: $(STAMP) validation
 	$(PYTEST) tests/validation

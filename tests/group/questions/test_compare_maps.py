@@ -36,7 +36,7 @@ from hipsta_bids.io import files
 from hipsta_bids.reports.group import group_page
 
 #: One person and templates, where the shared data are present.
-HIPPUNFOLD = Path(__file__).parents[2] / ".." / "shared" / "data" / "hippunfold"
+HIPPUNFOLD = Path(__file__).parents[3] / ".." / "shared" / "data" / "hippunfold"
 
 COUNT = sum(PLAN.sizes)
 MODEL = "group-age-sex"
