@@ -287,7 +287,7 @@ def find_boundaries(
         anterior=np.flatnonzero(surface.anterior_cap).astype(np.int32),
         medial_curve=pair[0],
         lateral_curve=pair[1],
-        doubt=_doubt(wall, curves, thickness, settings),
+        doubt=_doubt(wall, values, curves, thickness, settings),
         side_rule=side_rule,
         side_margin=margin,
         strip_width=area / (2 * body.ends.length(wall.vertices)),
@@ -317,14 +317,19 @@ def _eigenfunction(wall: Wall, settings: BoundarySettings) -> Float | None:
     return None
 
 
-def _doubt(wall: Wall, curves: Pair, thickness: float, settings: BoundarySettings) -> float:
-    """Largest mean distance of curves from those that other operators lead to, mm; NaN for none.
+def _doubt(
+    wall: Wall, values: Float, curves: Pair, thickness: float, settings: BoundarySettings
+) -> float:
+    """Find how far curves lie from those that other operators lead to, mm; NaN if to none.
+
+    That is the largest mean distance; ``values`` (V,) is the eigenfunction of the first operator.
 
     Curves that are certain are found from any start, to the thousandth of a millimeter.
     """
     distances = []
     for operator in islice(_operators(wall, settings), 1, None):
-        moved = center_curves(wall, operator.eigenfunctions(1)[1][:, 0], thickness)
+        tilted = operator.eigenfunctions(1, near=values, residual=1e-3)[1][:, 0]
+        moved = center_curves(wall, tilted, thickness)
         distances.append(float("nan") if moved is None else _curve_distance(moved[0], curves))
     return float(np.max(distances))
 

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
+from copy import copy
 from functools import cached_property
 from typing import Any
 
@@ -35,29 +36,28 @@ class Laplace:
     """
 
     def __init__(
-        self,
-        mesh: TriaMesh | TetMesh,
-        solver: str = "two-level",
-        diffusion: tuple[Float, Float, Float] | None = None,
+        self, mesh: TriaMesh | TetMesh, solver: str = "two-level", fem: Solver | None = None
     ) -> None:
-        """Make the matrices; diffusion is two directions (T, 3) and the speeds (T, 2) across them.
-
-        Anisotropic diffusion as in Andreux et al. 2014 (ECCV workshops, LNCS 8928:299-312).
-        """
+        """Make the matrices, or take those that LaPy has made."""
         self.points: Float = mesh.v
         self.cells: Int = mesh.t
         self._mesh, self._solver = mesh, solver
-        if diffusion is None:
-            self._fem = Solver(mesh, lump=True)
-        else:
-            self._fem = Solver(bare_mesh(TriaMesh, mesh.v, mesh.t), lump=True)
-            self._fem.stiffness = _directed_stiffness(mesh, *diffusion)
-        symmetric = self._fem.stiffness
-        if symmetric.shape[0] != len(self.points):
+        self._fem = Solver(mesh, lump=True) if fem is None else fem
+        if self._fem.stiffness.shape[0] != len(self.points):
             raise _unsolvable()  # the last vertex belongs to no cell
+        symmetric = self._fem.stiffness
         self.stiffness = sparse.csr_array(
             (symmetric.data, symmetric.indices, symmetric.indptr), shape=symmetric.shape
         )
+
+    def directed(self, first: Float, second: Float, speeds: Float) -> "Laplace":
+        """Return the operator whose diffusion has speeds (T, 2) across two directions (T, 3).
+
+        Anisotropic diffusion as in Andreux et al. 2014 (ECCV workshops, LNCS 8928:299-312).
+        """
+        fem = copy(self._fem)
+        fem.stiffness = _directed_stiffness(self._mesh, first, second, speeds)
+        return Laplace(self._mesh, self._solver, fem)
 
     def solve(
         self, fixed: NDArray[np.integer], values: Float, residual: float = _RESIDUAL
@@ -115,13 +115,17 @@ class Laplace:
         rise = (flow * (self.points[stop] - self.points[start])).sum(axis=1)
         return flow if rise @ (values[stop] - values[start]) >= 0 else -flow
 
-    def eigenfunctions(self, count: int) -> tuple[Float, Float]:
-        """Eigenvalues (count,) and eigenfunctions (V, count) above the constant one, in order."""
+    def eigenfunctions(
+        self, count: int, near: Float | None = None, residual: float = 1e-6
+    ) -> tuple[Float, Float]:
+        """Compute eigenvalues (count,) and eigenfunctions (V, count) above the constant, in order.
+
+        Functions ``near`` (V,) the first one save time, as does a larger ``residual``.
+        """
         size, matrix, mass = len(self.points), self._fem.stiffness, self._fem.mass
         shift = -1e-2 * float(matrix.trace() / mass.sum()) / size
-        start = np.cos(
-            np.arange(size, dtype=np.float64)
-        )  # any fixed vector: results repeat exactly
+        # Any fixed vector: results repeat exactly.
+        start = np.cos(np.arange(size, dtype=np.float64)) if near is None else near + near.std()
         with _solvable():
             if self._solver == "lapy":
                 values, functions = self._fem.eigs(count + 1, sigma=shift, v0=start)
@@ -135,7 +139,7 @@ class Laplace:
             OPinv=linalg.LinearOperator((size, size), matvec=solve, dtype=np.float64),
             v0=start,
             ncv=min(2 * count + 8, size),  # the default of 20 means twice as many solutions
-            tol=1e-6,
+            tol=residual,
         )
         order = np.argsort(values)[1:]
         return values[order], functions[:, order]

@@ -9,7 +9,7 @@ from scipy import sparse
 from scipy.spatial import cKDTree
 
 from hipsta_bids.geometry import mesh
-from hipsta_bids.geometry.fem import Laplace
+from hipsta_bids.geometry.fem import Laplace, bare_mesh
 from hipsta_bids.settings import BoundarySettings
 from hipsta_bids.types import Bool, Float, Int, Surface
 
@@ -71,16 +71,18 @@ class Wall:
         self._tree = cKDTree(self.vertices)
         self.areas = mesh.triangle_areas(self.vertices, self.triangles)
         self.vertex_areas = mesh.vertex_areas(self.vertices, self.triangles)
-        self._mesh, self._solver = _Mesh(self.vertices, self.triangles), settings.solver
-        self._across, self._along, least, _ = self._mesh.curvature_tria(CURVATURE_SMOOTHING)
+        plain = bare_mesh(TriaMesh, self.vertices, self.triangles)
+        self._laplace = Laplace(plain, settings.solver)
+        curved = _Mesh(self.vertices, self.triangles)
+        self._across, self._along, least, _ = curved.curvature_tria(CURVATURE_SMOOTHING)
         self._bend = -least / (LAPY_CURVATURE * float(self.lengths.mean()))
         self.evenly_aware = self.operator(settings, LEAST_DIFFUSION)
 
     def operator(self, settings: BoundarySettings, least: float = 0.0) -> Laplace:
-        """Two Laplace operators with diffusion across sharp convex bends slowed down.
+        """Make a Laplace operator with diffusion across sharp convex bends slowed down.
 
-        The first without limit, so that the sharpest lines separate the wall; the second down to a
-        least value, so that of two edges the sharper one does not win.
+        Without limit, the sharpest lines separate the wall; down to a ``least`` speed, of two edges
+        the sharper one does not win.
 
         LaPy's curvature is an angle per edge, so it grows with the edge length; in 1/mm it is
         divided by that and a factor (see the settings). On outward triangles it is negative where
@@ -89,7 +91,7 @@ class Wall:
         excess = np.maximum(self._bend - settings.sharp_bend, 0)
         slowed = np.maximum(np.exp(-settings.anisotropy * excess), least)
         speeds = np.stack([np.ones_like(slowed), slowed], axis=1)
-        return Laplace(self._mesh, self._solver, (self._across, self._along, speeds))
+        return self._laplace.directed(self._across, self._along, speeds)
 
     def distance(self, curve: Float, reach: float) -> Float:
         """Compute distances (V,) from the nearest of a curve's points (N, 3), up to ``reach``, mm.
