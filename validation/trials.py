@@ -9,8 +9,7 @@ import pandas as pd
 from scipy import stats
 from statsmodels.stats.multitest import multipletests
 
-from hipsta_bids.group.cohort.data import Cohort
-from hipsta_bids.group.cohort.layers import SHEET, layers
+from hipsta_bids.group.cohort.data import SHEET, Cohort, layers
 from hipsta_bids.group.design.formula import Contrast
 from hipsta_bids.group.design.model import ModelRequest, VisitTime
 from hipsta_bids.group.design.settings import GroupSettings

@@ -23,6 +23,7 @@ from hipsta_bids.geometry.digital import voxel_points
 from hipsta_bids.geometry.disk import (
     Disk,
     Edges,
+    Lines,
     at_nodes,
     find_edges,
     flipped_area,
@@ -32,11 +33,16 @@ from hipsta_bids.geometry.disk import (
     map_to_rectangle,
     proximodistal,
 )
-from hipsta_bids.geometry.faces import Faces, find_faces, whole_surface, whole_tissue
+from hipsta_bids.geometry.faces import (
+    Faces,
+    find_faces,
+    find_ridges,
+    find_touching_banks,
+    whole_surface,
+    whole_tissue,
+)
 from hipsta_bids.geometry.fem import volume_laplace
 from hipsta_bids.geometry.findings import columns_near, flag_margins, raise_flags
-from hipsta_bids.geometry.folds import find_ridges, find_touching_banks
-from hipsta_bids.geometry.lines import Lines
 from hipsta_bids.geometry.measures import column_area, labels_at, measure_thickness
 from hipsta_bids.geometry.mesh import fill_surface, tetra_quality, triangle_areas, unique_edges
 from hipsta_bids.geometry.sheet import coordinates_at, fill_points, label_sheet, sheet_levels

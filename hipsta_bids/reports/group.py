@@ -20,9 +20,8 @@ from hipsta_bids.io.files import hide_home
 from hipsta_bids.protocols import EXPERIMENTAL
 from hipsta_bids.reports import cells, group_tables
 from hipsta_bids.reports.display import DESIGN_COLORS, colors_of
-from hipsta_bids.reports.group_maps import embedded, map_scenes
+from hipsta_bids.reports.group_maps import embedded, map_scenes, norms, power, retest
 from hipsta_bids.reports.group_tables import GroupResults, read_group, records
-from hipsta_bids.reports.group_trials import norms, power, retest
 from hipsta_bids.reports.page import Section, build_sections, render
 
 _LOGGER = logging.getLogger(__name__)

@@ -11,7 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hipsta_bids.protocols import EXPERIMENTAL
-from hipsta_bids.reports.cohort import MEASURES, SMALLEST_COHORT, Cohort, Measure
+from hipsta_bids.reports.cohort import (
+    MEASURES,
+    SMALLEST_COHORT,
+    Cohort,
+    Measure,
+    card_of,
+    correction_of,
+)
 from hipsta_bids.reports.display import (
     MAP_KINDS,
     THICKNESS,
@@ -33,7 +40,6 @@ from hipsta_bids.reports.results import (
     input_path,
     read_views,
 )
-from hipsta_bids.reports.review import card_of, correction_of
 from hipsta_bids.reports.slices import point_panels, section_panels, slice_panels, stack_of
 from hipsta_bids.reports.verdict import RATINGS
 from hipsta_bids.types import Float, Status

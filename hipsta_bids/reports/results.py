@@ -23,7 +23,7 @@ from hipsta_bids.derivatives.hemisphere import (
 )
 from hipsta_bids.errors import HipstaError, InputError
 from hipsta_bids.geometry.sampling import ScalarVolume
-from hipsta_bids.inputs.anatomy import Candidate, find_anatomy
+from hipsta_bids.inputs.search import Candidate, find_anatomy
 from hipsta_bids.io import files, gifti
 from hipsta_bids.io.volumes import LabelImage, read_grid, read_labels, read_scalars
 from hipsta_bids.protocols import body_ends

@@ -3,7 +3,7 @@
 import pytest
 from input_cases import touch
 
-from hipsta_bids.inputs.anatomy import find_anatomy
+from hipsta_bids.inputs.search import find_anatomy
 from hipsta_bids.types import Hemisphere
 
 LEFT = Hemisphere(subject="01", session=None, hemi="L")

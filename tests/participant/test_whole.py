@@ -20,14 +20,13 @@ from hipsta_bids.cli.main import main
 from hipsta_bids.derivatives.names import name_of_record
 from hipsta_bids.errors import GeometryError, NothingToDoError, ProtocolError
 from hipsta_bids.geometry.disk import find_edges, level_surface, make_disk
-from hipsta_bids.geometry.folds import find_ridges
+from hipsta_bids.geometry.faces import find_ridges
 from hipsta_bids.participant.measure import measure_hemisphere
 from hipsta_bids.phantom.head import RADIUS, HeadSpec, draw_head
 from hipsta_bids.protocols.load import for_region, load_protocol
 from hipsta_bids.protocols.protocol import Tissue
-from hipsta_bids.reports.cohort import cohort_page, read_cohort
+from hipsta_bids.reports.cohort import cohort_page, correction_of, read_cohort
 from hipsta_bids.reports.participant import participant_page
-from hipsta_bids.reports.review import correction_of
 from hipsta_bids.settings import Settings
 from hipsta_bids.types import Bool, Float, GivenEnd, HemisphereMaps, LabelVolume, Sheet, TetMesh
 

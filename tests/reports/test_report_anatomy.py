@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 
 from hipsta_bids.cli import main
-from hipsta_bids.inputs.anatomy import Candidate
+from hipsta_bids.inputs.search import Candidate
 from hipsta_bids.io.volumes import read_scalars
 from hipsta_bids.reports import results
 from hipsta_bids.reports.cohort import read_cohort

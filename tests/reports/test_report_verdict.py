@@ -172,7 +172,7 @@ def test_a_table_that_is_gone_costs_the_numbers_only(out, tmp_path):
 
 
 def test_commands_open_the_files_from_the_output_folder(out):
-    from hipsta_bids.reports.review import open_commands  # noqa: PLC0415
+    from hipsta_bids.reports.cohort import open_commands  # noqa: PLC0415
 
     (_, freeview), (_, snap) = open_commands(hemisphere(out, "01", "R"))
     words = freeview.split()
@@ -191,7 +191,7 @@ def test_commands_open_the_files_from_the_output_folder(out):
 
 
 def test_commands_of_a_container_name_no_folder_of_it(out, monkeypatch):
-    from hipsta_bids.reports.review import open_commands  # noqa: PLC0415
+    from hipsta_bids.reports.cohort import open_commands  # noqa: PLC0415
 
     monkeypatch.setenv("HIPSTA_BIDS_CONTAINER_TYPE", "docker")
     (_, freeview), (_, snap) = open_commands(hemisphere(out, "01", "R"))

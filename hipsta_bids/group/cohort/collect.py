@@ -16,7 +16,7 @@ from hipsta_bids.errors import InputError, NothingToDoError
 from hipsta_bids.group.cohort.covariates import relocate
 from hipsta_bids.group.cohort.exclusions import SHOWN, Choices, QualityCondition, read_choices
 from hipsta_bids.io import files
-from hipsta_bids.io.foreign import checked_foreign
+from hipsta_bids.io.files import checked_foreign
 from hipsta_bids.protocols.toml import settings_hash
 from hipsta_bids.settings import Settings, SheetSettings
 from hipsta_bids.types import PARTICIPANT, SESSION, Status

@@ -8,8 +8,7 @@ import pandas as pd
 import pyarrow as pa
 from pyarrow import parquet as pq
 
-from hipsta_bids.group.cohort.data import Cohort
-from hipsta_bids.group.cohort.layers import SHEET
+from hipsta_bids.group.cohort.data import SHEET, Cohort
 from hipsta_bids.group.output import results
 from hipsta_bids.group.stats.arrays import Float, Int, SideMaps, blocks, some_sheets
 from hipsta_bids.io import files

@@ -23,7 +23,7 @@ from hipsta_bids.group.stats.combat import ARRAYS, SiteEffects, SiteMoments, Vis
 from hipsta_bids.group.stats.glm import FittedMaps, PointTest, PointwiseFit, RowModel
 from hipsta_bids.group.stats.inference import Discoveries, MapKey
 from hipsta_bids.group.stats.norms import NormativeScores
-from hipsta_bids.io.foreign import as_nested
+from hipsta_bids.io.files import as_nested
 from hipsta_bids.types import PARTICIPANT, SESSION
 
 #: Group of all, where there are no groups.

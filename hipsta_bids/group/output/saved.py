@@ -19,7 +19,7 @@ from hipsta_bids.group.stats.arrays import Key
 from hipsta_bids.group.stats.combat import ARRAYS, SiteEffects
 from hipsta_bids.group.stats.norms import LEVELS, NORM_ARRAYS, Norms, People
 from hipsta_bids.group.stats.warps import DEGREE, Template
-from hipsta_bids.io import files, foreign
+from hipsta_bids.io import files
 from hipsta_bids.protocols.toml import Fraction, TomlTable
 
 #: Fields of a template that are arrays, and the one that JSON has no infinity for.
@@ -50,8 +50,8 @@ class SavedEffects(TomlTable):
     """Column that volumes kept besides."""
     templates: dict[str, str]
     """Digest of the template of registration by hemisphere."""
-    maps: foreign.Nested
-    summaries: foreign.Nested
+    maps: files.Nested
+    summaries: files.Nested
     """Each is a single point."""
 
     @model_validator(mode="after")
@@ -71,7 +71,7 @@ class SavedEffects(TomlTable):
         """Effects by hemisphere and measure."""
         return self._effects(self.summaries)
 
-    def _effects(self, nested: foreign.Nested) -> dict[Key, SiteEffects]:
+    def _effects(self, nested: files.Nested) -> dict[Key, SiteEffects]:
         rows = {"slopes": {len(self.columns), len(self.columns) + (self.icv is not None)}}
         effects = {}
         for hemi, measures in nested.items():
@@ -101,7 +101,7 @@ def load_effects(path: Path) -> SavedEffects:
     ModelError if it is too large, of another format, or its parts do not fit each other.
     """
     try:
-        return foreign.read_foreign(path, SavedEffects, max_bytes=_LARGEST).model_copy(
+        return files.read_foreign(path, SavedEffects, max_bytes=_LARGEST).model_copy(
             update={"file": str(path)}
         )
     except ValueError as error:
@@ -118,54 +118,54 @@ def damaged(source: str, problem: str) -> ModelError:
 
 #: Bytes of the largest file that is read.
 _LARGEST = 1_000_000_000
-_Age = Annotated[foreign.Number, Field(ge=-1000, le=1000)]  # charts have a row for each year
+_Age = Annotated[files.Number, Field(ge=-1000, le=1000)]  # charts have a row for each year
 
 
 class NormArrays(TomlTable):
     """The arrays of :class:`Norms`; null where nothing is known."""
 
-    mean: list[foreign.FileNumbers]
-    spread: Annotated[list[foreign.FileNumbers], Field(min_length=2, max_length=2)]
-    shape: Annotated[list[foreign.FileNumbers], Field(min_length=2, max_length=2)]
-    shift: list[foreign.FileNumbers]
-    scale: list[list[Annotated[foreign.Number, Field(gt=0)] | None]]
+    mean: list[files.FileNumbers]
+    spread: Annotated[list[files.FileNumbers], Field(min_length=2, max_length=2)]
+    shape: Annotated[list[files.FileNumbers], Field(min_length=2, max_length=2)]
+    shift: list[files.FileNumbers]
+    scale: list[list[Annotated[files.Number, Field(gt=0)] | None]]
     n: list[list[Annotated[int, Field(ge=0)]]]
 
 
 class NormsFile(TomlTable):
     """Norms of a reference cohort, and what new people have to agree with; sums only."""
 
-    description: foreign.Text
+    description: files.Text
     format: Literal[1]
-    hash: foreign.Text
+    hash: files.Text
     """Of all else."""
-    version: foreign.Text
+    version: files.Text
     """Of hipsta_bids, at the group level."""
-    versions: list[foreign.Text]
+    versions: list[files.Text]
     """Of hipsta_bids, at the participant level."""
-    seg: foreign.Text
-    region: foreign.Text
-    settings_hash: foreign.Text
+    seg: files.Text
+    region: files.Text
+    settings_hash: files.Text
     """Of the settings of the participant level."""
     registration: dict[str, Any]
     """Settings of registration."""
     template: dict[str, Any] | None
     """As in ``template.json``; ``None`` without registration."""
-    x: list[foreign.Number]
-    y: list[foreign.Number]
+    x: list[files.Number]
+    y: list[files.Number]
     """Coordinates of the nodes of the sheet."""
-    age: foreign.Text
-    sex: foreign.Text
-    site: foreign.Text
+    age: files.Text
+    sex: files.Text
+    site: files.Text
     """Columns."""
     knots: Annotated[list[_Age], Field(min_length=3, max_length=50)]
     """Of the spline of age; the outer ones are the range."""
-    sexes: list[foreign.Text]
+    sexes: list[files.Text]
     """Levels; empty where sex was not known."""
-    sites: Annotated[dict[foreign.Text, Annotated[int, Field(ge=1)]], Field(min_length=1)]
+    sites: Annotated[dict[files.Text, Annotated[int, Field(ge=1)]], Field(min_length=1)]
     """Participants by site."""
     participants: Annotated[int, Field(ge=1)]
-    norms: dict[Literal["L", "R", "LR"], dict[foreign.Text, NormArrays]]
+    norms: dict[Literal["L", "R", "LR"], dict[files.Text, NormArrays]]
     """By hemisphere and measure; summary measures are single points."""
 
     @property
@@ -212,7 +212,7 @@ class NormsFile(TomlTable):
 
 def save_norms(path: Path, file: NormsFile, norms: Mapping[Key, Norms]) -> None:
     """Write norms, to be read by :func:`load_norms`."""
-    content = {**file.model_dump(), "norms": foreign.as_nested(norms, NORM_ARRAYS)}
+    content = {**file.model_dump(), "norms": files.as_nested(norms, NORM_ARRAYS)}
     files.write_json(path, {**content, "hash": _digest(content)})
 
 
@@ -227,7 +227,7 @@ def load_norms(path: Path) -> tuple[NormsFile, dict[Key, Norms]]:
     ModelError if it is too large, changed, of another format, or its parts do not fit each other.
     """
     try:
-        file = foreign.read_foreign(path, NormsFile, max_bytes=_LARGEST)
+        file = files.read_foreign(path, NormsFile, max_bytes=_LARGEST)
         return file, file.arrays()
     except (ValueError, RecursionError) as error:
         raise ModelError(
@@ -262,12 +262,12 @@ class _SavedTemplate(TomlTable):
     """A template in a file, which may be other people's and hold anything."""
 
     knots: _Rising
-    mean: list[foreign.Number]
-    components: list[list[foreign.Number]]
-    noise: Annotated[foreign.Number, Field(gt=0)]
-    scale: Annotated[foreign.Number, Field(gt=0)] | None
+    mean: list[files.Number]
+    components: list[list[files.Number]]
+    noise: Annotated[files.Number, Field(gt=0)]
+    scale: Annotated[files.Number, Field(gt=0)] | None
     align: Literal["registr", "penalized"]
-    warp_variance: Annotated[foreign.Number, Field(gt=0)] | None
+    warp_variance: Annotated[files.Number, Field(gt=0)] | None
     turns: Annotated[int, Field(ge=0, le=1000)]
     center: Annotated[_Rising, Field(min_length=2)]
 
@@ -288,7 +288,7 @@ def templates_from_json(content: Mapping[str, Any], source: str) -> dict[str, Te
     try:
         templates = {}
         for hemi, entry in content["Hemispheres"].items():
-            values = dict(foreign.checked_foreign(entry, _SavedTemplate))
+            values = dict(files.checked_foreign(entry, _SavedTemplate))
             values |= {name: np.array(values[name], dtype=np.float64) for name in _TEMPLATE_ARRAYS}
             if values[_INFINITE] is None:
                 values[_INFINITE] = np.inf

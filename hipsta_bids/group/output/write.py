@@ -17,14 +17,13 @@ import pandas as pd
 
 from hipsta_bids.derivatives.names import DATASET_FILES
 from hipsta_bids.group.cohort.collect import Exclusion
-from hipsta_bids.group.cohort.data import Cohort
-from hipsta_bids.group.cohort.layers import SHEET
+from hipsta_bids.group.cohort.data import SHEET, Cohort
 from hipsta_bids.group.design.settings import GroupSettings
 from hipsta_bids.group.output import results, tables
 from hipsta_bids.group.output.figures import Drawing, draw_figures, encode
-from hipsta_bids.group.output.joint import JointMap, draw_joint, joint_peaks, joint_points
 from hipsta_bids.group.output.methods import methods_text
 from hipsta_bids.group.output.shapes import AverageShape
+from hipsta_bids.group.output.tables import JointMap, draw_joint, joint_peaks, joint_points
 from hipsta_bids.group.stats.arrays import Float, blocks, return_memory
 from hipsta_bids.group.stats.glm import FittedMaps, PointTest
 from hipsta_bids.group.stats.inference import Discoveries, MapKey

@@ -17,11 +17,10 @@ from hipsta_bids.group.design.formula import ModelSpec
 from hipsta_bids.group.design.grammar import closed_formula
 from hipsta_bids.group.design.settings import GlmSettings, GroupSettings
 from hipsta_bids.group.output import results
-from hipsta_bids.group.output.joint import JointMap
 from hipsta_bids.group.output.saved import SavedEffects
+from hipsta_bids.group.output.tables import JointMap
 from hipsta_bids.group.questions import harmonize
-from hipsta_bids.group.questions.scores import score_cohort
-from hipsta_bids.group.questions.summaries import classify_groups, fit_summaries
+from hipsta_bids.group.questions.scores import classify_groups, fit_summaries, score_cohort
 from hipsta_bids.group.stats import arrays, inference, registration
 from hipsta_bids.group.stats.clusters import edges_of
 from hipsta_bids.group.stats.glm import FittedMaps, RowModel, fit_maps, with_mean

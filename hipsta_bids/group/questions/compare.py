@@ -7,7 +7,7 @@ from typing import Any
 
 from hipsta_bids.derivatives import dataset
 from hipsta_bids.group.cohort import collect
-from hipsta_bids.group.cohort.layers import SHEET
+from hipsta_bids.group.cohort.data import SHEET
 from hipsta_bids.group.design import model as designs
 from hipsta_bids.group.design.settings import GroupSettings
 from hipsta_bids.group.output.results import Analysis, harmonization_record

@@ -29,7 +29,7 @@ from hipsta_bids.group.stats.arrays import Float, Int
 from hipsta_bids.group.stats.glm import FittedMaps, PointTest, fit_points, with_mean
 from hipsta_bids.group.stats.meta import SiteFit
 from hipsta_bids.io import files
-from hipsta_bids.io.foreign import FileNumbers, Number, Text, read_foreign, rounded
+from hipsta_bids.io.files import FileNumbers, Number, Text, read_foreign, rounded
 from hipsta_bids.protocols.toml import TomlTable
 
 #: File of a summary, in the folder of an analysis.

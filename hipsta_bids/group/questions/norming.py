@@ -13,8 +13,7 @@ from scipy import special
 from hipsta_bids import __version__
 from hipsta_bids.derivatives import dataset
 from hipsta_bids.errors import ModelError
-from hipsta_bids.group.cohort.data import Cohort
-from hipsta_bids.group.cohort.layers import SHEET, layers
+from hipsta_bids.group.cohort.data import SHEET, Cohort, layers
 from hipsta_bids.group.design.formula import check_names, level_labels, listed, typed
 from hipsta_bids.group.design.model import BOTH, FIRST_AGE, Comparison
 from hipsta_bids.group.design.settings import GroupSettings, NormSettings

@@ -9,8 +9,7 @@ import pandas as pd
 from scipy import stats
 
 from hipsta_bids.errors import ModelError
-from hipsta_bids.group.cohort.data import Cohort, participants_with
-from hipsta_bids.group.cohort.layers import Layer
+from hipsta_bids.group.cohort.data import Cohort, Layer, participants_with
 from hipsta_bids.group.design.formula import listed, model_from_shortcut, parse_model
 from hipsta_bids.group.design.model import ModelRequest, VisitTime, build_design, default_formula
 from hipsta_bids.group.design.settings import GroupSettings

@@ -14,8 +14,7 @@ from hipsta_bids.derivatives.names import group_report
 from hipsta_bids.errors import InputError, ModelError
 from hipsta_bids.group.cohort import collect, external, read
 from hipsta_bids.group.cohort.covariates import add_icv, add_time, read_covariates
-from hipsta_bids.group.cohort.data import Cohort, Measures, choose_visits
-from hipsta_bids.group.cohort.layers import SHEET
+from hipsta_bids.group.cohort.data import SHEET, Cohort, Measures, choose_visits
 from hipsta_bids.group.design import model as designs
 from hipsta_bids.group.design.formula import check_names, listed, with_factors
 from hipsta_bids.group.design.settings import GroupSettings

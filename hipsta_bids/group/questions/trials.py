@@ -12,8 +12,7 @@ import pandas as pd
 from hipsta_bids import __version__
 from hipsta_bids.derivatives import dataset
 from hipsta_bids.derivatives.names import TRIAL_MAPS, TRIAL_TABLES
-from hipsta_bids.group.cohort.data import Cohort
-from hipsta_bids.group.cohort.layers import SHEET, SUMMARY, layers
+from hipsta_bids.group.cohort.data import SHEET, SUMMARY, Cohort, layers
 from hipsta_bids.group.design.model import Comparison
 from hipsta_bids.group.design.settings import GroupSettings
 from hipsta_bids.group.output import write
