@@ -21,6 +21,7 @@ from hipsta_bids.group.cohort.read import node_coordinates
 from hipsta_bids.inputs.labels import MARGIN, label_volume
 from hipsta_bids.io import files
 from hipsta_bids.io.gifti import sheet_triangles
+from hipsta_bids.io.meshes import write_surface
 from hipsta_bids.io.volumes import LabelImage, read_labels
 from hipsta_bids.participant.measure import measure_hemisphere
 from hipsta_bids.protocols import body_ends
@@ -98,12 +99,14 @@ class Measurement:
         codes = self.hemisphere.subfield
         return np.array([names.get(c, "") for c in codes.ravel().tolist()]).reshape(codes.shape)
 
-    def surface(self, level: str = "midthickness") -> Mesh:
-        """Return one surface of the sheet.
+    def surface(self, level: str = "midthickness", file: str | Path | None = None) -> Mesh:
+        """Return one surface of the sheet, and write it if a file is named.
 
         Parameters
         ----------
         level : {"interior", "midthickness", "exterior"}
+        file : path, optional
+            Where to write it: ``.vtk`` and ``.ply`` with all maps, ``.obj`` without.
 
         Returns
         -------
@@ -115,13 +118,18 @@ class Measurement:
         ------
         ValueError
             If no surface has this name.
+        UsageError
+            If the name of the file has another ending.
         """
         check_choice("level", level, _LEVELS)
         points = self.hemisphere.sheet.points
         nx, ny, nz = points.shape[:3]
         triangles = sheet_triangles(nx, ny, flip=is_left_handed(points))
         at = round(_LEVELS[level] * (nz - 1))
-        return Mesh(points=points[:, :, at].reshape(-1, 3), triangles=triangles.astype(np.int64))
+        mesh = Mesh(points=points[:, :, at].reshape(-1, 3), triangles=triangles.astype(np.int64))
+        if file is not None:
+            write_surface(Path(file), mesh, self.maps)
+        return mesh
 
     @cached_property
     def table(self) -> SheetTable:

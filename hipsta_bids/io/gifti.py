@@ -1,4 +1,4 @@
-"""Surfaces and maps on them as GIFTI and CIFTI-2, which Workbench and nibabel load; meshes as VTU.
+"""Surfaces and maps on them as GIFTI and CIFTI-2, which Workbench and nibabel load.
 
 Structure names are those of Connectome Workbench's ``StructureEnum``, which knows
 ``HippocampusLeft`` and ``HippocampusRight``; the metadata keys are those of the GIFTI 1.0
@@ -9,7 +9,6 @@ read.
 """
 
 import struct
-import tempfile
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -31,12 +30,12 @@ from nibabel.gifti.gifti import (
     GiftiMetaData,
 )
 from nibabel.spatialimages import HeaderDataError
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from hipsta_bids.errors import InputError
 from hipsta_bids.io import files
 from hipsta_bids.io.files import entities
-from hipsta_bids.types import Coordinates, Float, Int, Mesh, TetMesh
+from hipsta_bids.types import Float, Int, Mesh
 
 #: Ending of the names of CIFTI files with one number per vertex.
 DENSE_SCALARS = ".dscalar.nii"
@@ -55,9 +54,6 @@ _DAMAGE = (
     *(ImageFileError, HeaderDataError, Cifti2HeaderError, ExpatError, zlib.error, struct.error),
 )
 _MOST_VERTICES = 10_000_000  # of a surface that a file names but does not hold
-
-#: Names of the harmonic coordinates as point data of the tetrahedral mesh, in their order.
-COORDINATE_NAMES = ("medial_lateral", "posterior_anterior", "interior_exterior")
 
 #: Unit of maps whose file names none.
 ARBITRARY = "arbitrary"
@@ -269,6 +265,11 @@ def read_mesh(path: Path) -> Mesh:
     if any(len(arrays) != 1 for arrays in array_groups):
         raise InputError(f"{path}: is no surface (points and triangles); give a .surf.gii file")
     points, triangles = (arrays[0].data for arrays in array_groups)
+    return checked_mesh(path, points, triangles)
+
+
+def checked_mesh(path: Path, points: ArrayLike, triangles: ArrayLike) -> Mesh:
+    """Return the surface of a file, or refuse triangles of vertices that it does not have."""
     mesh = Mesh(
         points=np.asarray(points, dtype=np.float64),
         triangles=np.asarray(triangles, dtype=np.int64),
@@ -305,20 +306,3 @@ def _load(path: Path, kind: type[Image]) -> Image:
             " .tsv files"
         )
     return image
-
-
-def mesh_bytes(mesh: TetMesh, coordinates: Coordinates) -> bytes:
-    """Encode a tetrahedral mesh and its coordinates as VTU (XML with compressed binary data)."""
-    import meshio  # noqa: PLC0415  (slow to load, and seldom needed)
-
-    values = zip(COORDINATE_NAMES, coordinates.values.T, strict=True)
-    data = meshio.Mesh(
-        mesh.vertices,
-        [("tetra", mesh.tetrahedra)],
-        point_data={name: column.copy() for name, column in values},
-    )
-    # meshio writes to paths only; results are written in one way.
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "mesh.vtu"
-        meshio.write(path, data, file_format="vtu")
-        return path.read_bytes()

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import meshio
 import nibabel as nib
 import numpy as np
 import pytest
@@ -131,6 +132,12 @@ class TestMeasurement:
     def test_an_unknown_surface_is_refused(self, left):
         with pytest.raises(ValueError, match="level is 'pial'"):
             left.surface("pial")
+
+    def test_a_surface_is_written_with_its_maps(self, left, tmp_path):
+        found = left.surface("exterior", tmp_path / "left.vtk")
+        again = meshio.read(tmp_path / "left.vtk")
+        np.testing.assert_array_equal(again.points, found.points)
+        assert again.point_data.keys() == left.maps.keys()
 
 
 def write(root, subject, side, *, session=None, seg="freesurfer", fail=False):

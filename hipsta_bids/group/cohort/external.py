@@ -21,7 +21,8 @@ from hipsta_bids.inputs import ashs, freesurfer
 from hipsta_bids.inputs.maps import Found, check_pattern, fields_of, fill, find, scan
 from hipsta_bids.io import files
 from hipsta_bids.io.files import entities
-from hipsta_bids.io.gifti import DENSE_SCALARS, PointMap, cifti_sides, read_map, read_mesh
+from hipsta_bids.io.gifti import DENSE_SCALARS, PointMap, cifti_sides, read_map
+from hipsta_bids.io.meshes import read_surface
 from hipsta_bids.types import Mesh, VisitKey
 
 
@@ -194,7 +195,7 @@ def _mesh(source: ExternalFiles, hemi: str, points: int) -> Mesh | None:
     if source.request.surface is not None:
         return _named_surface(source, hemi, points)
     paths = source.files[hemi].values()
-    meshes = (read_mesh(one) for path in paths for one in _surfaces_beside(path, hemi))
+    meshes = (read_surface(one) for path in paths for one in _surfaces_beside(path, hemi))
     return next((mesh for mesh in meshes if len(mesh.points) == points), None)
 
 
@@ -206,7 +207,7 @@ def _named_surface(source: ExternalFiles, hemi: str, points: int) -> Mesh:
     )
     for name in names:
         for path in find(name, source.root) or find(name, Path()):
-            mesh = read_mesh(path)
+            mesh = read_surface(path)
             if len(mesh.points) != points:
                 raise InputError(
                     f"--maps-surface {path}: has {len(mesh.points)} vertices, the maps"
