@@ -171,5 +171,5 @@ def stand_in_job(job):
 def thread_job(job):
     """Say what a worker sees of its surroundings."""
     seen = {name: os.environ.get(name) for name in ("OMP_NUM_THREADS", "TMPDIR")}
-    Path(job.place.root, "seen.json").write_text(json.dumps(seen))
+    Path(job.result.root, "seen.json").write_text(json.dumps(seen))
     return stand_in_job(job)

@@ -172,8 +172,8 @@ def plot_surface(
     ax.set_axis_off()
     ends = {"P": np.nanmean(points[:, 0], axis=0), "A": np.nanmean(points[:, -1], axis=0)}
     beyond = (ends["A"] - ends["P"]) * _BEYOND
-    for letter, place in (("P", ends["P"] - beyond), ("A", ends["A"] + beyond)):
-        ax.text(*place, letter, ha="center", va="center", weight="bold")
+    for letter, position in (("P", ends["P"] - beyond), ("A", ends["A"] + beyond)):
+        ax.text(*position, letter, ha="center", va="center", weight="bold")
     if colorbar:
         _bar(ax, ScalarMappable(scale, kind.colors), kind)
     return ax

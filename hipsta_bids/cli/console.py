@@ -151,7 +151,7 @@ def _bar(stage: str, total: int) -> Any:  # noqa: ANN401  (tqdm's)
 
 def summary_line(outcome: "Outcome") -> str:
     """Summarize one hemisphere: name, status, mean thickness, time, and remarks."""
-    name = outcome.job.place.name
+    name = outcome.job.result.name
     parts = [name.title, str(outcome.status)]
     if outcome.thickness is not None:
         parts.append(f"mean thickness {outcome.thickness:.3f} mm (by area)")

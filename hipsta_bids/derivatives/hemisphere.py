@@ -100,12 +100,12 @@ class ResultPlace:
         return [path for name in names for path in sorted(folder.glob(name))]
 
 
-def remove_results(place: ResultPlace) -> None:
+def remove_results(result: ResultPlace) -> None:
     """Remove every file of one hemisphere, whole or half-written."""
-    files.remove([*reversed(place.paths(optional=True)), *place.extra_paths()])
-    folder = place.path("qc").parent
+    files.remove([*reversed(result.paths(optional=True)), *result.extra_paths()])
+    folder = result.path("qc").parent
     if folder.is_dir():
-        files.remove_leftovers(folder, place.name.pattern)
+        files.remove_leftovers(folder, result.name.pattern)
 
 
 def sheet_labels(protocol: Protocol) -> dict[Tissue, Label]:
@@ -123,19 +123,19 @@ def format_column(values: Float, digits: int) -> list[str]:
 
 
 def _write_table(
-    place: ResultPlace,
+    result: ResultPlace,
     key: str,
     columns: Mapping[str, Sequence[str]],
     definitions: Mapping[str, object],
 ) -> None:
     """Write a table, and the sidecar that defines its columns."""
-    files.write_tsv(place.path(key), list(columns), zip(*columns.values(), strict=True))
-    region = _WHOLE_REGION if place.name.region in EXPERIMENTAL else _MEASURED_REGION
+    files.write_tsv(result.path(key), list(columns), zip(*columns.values(), strict=True))
+    region = _WHOLE_REGION if result.name.region in EXPERIMENTAL else _MEASURED_REGION
     sidecar = {**definitions, "MeasuredRegion": region}
-    files.write_json(place.path(f"{key}_sidecar"), sidecar)
+    files.write_json(result.path(f"{key}_sidecar"), sidecar)
 
 
-def _write_sheet(place: ResultPlace, maps: HemisphereMaps, protocol: Protocol) -> None:
+def _write_sheet(result: ResultPlace, maps: HemisphereMaps, protocol: Protocol) -> None:
     """Write one row per sheet point, y fastest."""
     points = maps.sheet.points
     nx, ny, nz = points.shape[:3]
@@ -154,10 +154,10 @@ def _write_sheet(place: ResultPlace, maps: HemisphereMaps, protocol: Protocol) -
     definitions["subfield"]["Levels"] = {
         label.abbreviation: label.name for label in labels.values()
     }
-    _write_table(place, "sheet", columns, definitions)
+    _write_table(result, "sheet", columns, definitions)
 
 
-def _write_summary(place: ResultPlace, summary: Mapping[str, float]) -> None:
+def _write_summary(result: ResultPlace, summary: Mapping[str, float]) -> None:
     """Write one row of summary measures: those of the catalog, then those of subfields."""
     definitions = {row.name: _measure(row) for row in SUMMARY}
     digits = {row.name: row.digits for row in SUMMARY}
@@ -168,10 +168,10 @@ def _write_summary(place: ResultPlace, summary: Mapping[str, float]) -> None:
         )
         for name in definitions
     }
-    _write_table(place, "summary", columns, definitions)
+    _write_table(result, "summary", columns, definitions)
 
 
-def _write_profile(place: ResultPlace, maps: HemisphereMaps) -> None:
+def _write_profile(result: ResultPlace, maps: HemisphereMaps) -> None:
     """Write the means along x, then those along y."""
     parts = []
     for axis, profile in maps.profiles.items():
@@ -191,19 +191,19 @@ def _write_profile(place: ResultPlace, maps: HemisphereMaps) -> None:
     }
     wording = "{}; mean over the area of the columns measured directly"
     definitions |= {row.name: _measure(row, wording) for row in MAPS}
-    _write_table(place, "profile", columns, definitions)
+    _write_table(result, "profile", columns, definitions)
 
 
-def _write_sections(place: ResultPlace, sections: Mapping[str, Float]) -> None:
+def _write_sections(result: ResultPlace, sections: Mapping[str, Float]) -> None:
     """Write one row per cross-section, from posterior to anterior."""
     measures = _formatted(SECTIONS, sections)
     count = len(measures[SECTIONS[0].name])
     text = "number of the section, from the posterior to the anterior end"
     definitions = {"y": _definition(text, None)} | {row.name: _measure(row) for row in SECTIONS}
-    _write_table(place, "sections", {**_numbers(("y",), (count,)), **measures}, definitions)
+    _write_table(result, "sections", {**_numbers(("y",), (count,)), **measures}, definitions)
 
 
-def _write_layers(place: ResultPlace, layers: Sheet) -> None:
+def _write_layers(result: ResultPlace, layers: Sheet) -> None:
     """Write one row per point of the three-dimensional grid, layers fastest."""
     depth = layer_depth(layers)
     length = np.where(depth[:, :, -1:] > 0, depth[:, :, -1:], np.nan)
@@ -213,7 +213,7 @@ def _write_layers(place: ResultPlace, layers: Sheet) -> None:
         "relative_depth": format_column(depth / length, _MILLIMETER_DIGITS),
         **_positions(layers.points),
     }
-    _write_table(place, "layers", columns, _definitions(LAYERS))
+    _write_table(result, "layers", columns, _definitions(LAYERS))
 
 
 def _numbers(axes: Iterable[str], shape: tuple[int, ...]) -> dict[str, list[str]]:
@@ -265,7 +265,7 @@ def _subfield_definition(column: str) -> dict[str, object]:
 
 
 def write_results(
-    place: ResultPlace,
+    result: ResultPlace,
     maps: HemisphereMaps,
     protocol: Protocol,
     record: Mapping[str, Any],
@@ -274,23 +274,23 @@ def write_results(
     write_more: Callable[[], None] = lambda: None,
 ) -> None:
     """Write all files of one hemisphere; earlier ones are removed first."""
-    remove_results(place)
-    _write_sheet(place, maps, protocol)
-    _write_summary(place, maps.summary)
-    _write_profile(place, maps)
-    _write_sections(place, maps.sections)
-    for key, content in _gifti_files(maps, protocol, place.name.hemi):
-        files.write_bytes(place.path(key), content)
-    files.write_bytes(place.path("body_mask"), mask_bytes(maps.body_mask))
+    remove_results(result)
+    _write_sheet(result, maps, protocol)
+    _write_summary(result, maps.summary)
+    _write_profile(result, maps)
+    _write_sections(result, maps.sections)
+    for key, content in _gifti_files(maps, protocol, result.name.hemi):
+        files.write_bytes(result.path(key), content)
+    files.write_bytes(result.path("body_mask"), mask_bytes(maps.body_mask))
     if write_meshes:
-        _write_layers(place, maps.layers)
-        files.write_bytes(place.path("mesh"), meshes.mesh_bytes(maps.mesh, maps.coordinates))
+        _write_layers(result, maps.layers)
+        files.write_bytes(result.path("mesh"), meshes.mesh_bytes(maps.mesh, maps.coordinates))
     write_more()
-    _write_sources(place, record)
+    _write_sources(result, record)
     undefined = int(np.isnan(maps.sheet.points[:, :, [0, -1]]).any(axis=(2, 3)).sum())
     status, reason, message = verdict(maps)
     files.write_json(
-        place.path("qc"),
+        result.path("qc"),
         {
             "status": status,
             "reason": reason,
@@ -304,15 +304,15 @@ def write_results(
     )
 
 
-def _write_sources(place: ResultPlace, record: Mapping[str, Any]) -> None:
+def _write_sources(result: ResultPlace, record: Mapping[str, Any]) -> None:
     """Write beside the images that are there what they come from.
 
     What else is to be said is in the root of the dataset, but for images that few datasets have.
     """
     for row in (*OUTPUTS, *EXTRA_OUTPUTS):
-        if any(place.path(image.key).exists() for image in row.images):
+        if any(result.path(image.key).exists() for image in row.images):
             about = {} if row in SHARED else describe(row)
-            files.write_json(place.path(row.key), {**about, "Sources": sources(record)})
+            files.write_json(result.path(row.key), {**about, "Sources": sources(record)})
 
 
 def spread_name(measure: str) -> str:
@@ -321,7 +321,7 @@ def spread_name(measure: str) -> str:
 
 
 def write_spread(
-    place: ResultPlace, maps: Mapping[str, Float], summary: Mapping[str, float], copies: int
+    result: ResultPlace, maps: Mapping[str, Float], summary: Mapping[str, float], copies: int
 ) -> None:
     """Write SDs over perturbed copies: of maps (Nx, Ny), as table and GIFTI, and of the summary.
 
@@ -331,7 +331,7 @@ def write_spread(
     nodes = {spread_name(name): column for name, column in _formatted(MAPS, maps).items()}
     definitions = {spread_name(row.name): _measure(row, wording) for row in MAPS}
     _write_table(
-        place,
+        result,
         "uncertainty",
         {**_numbers(NODES, maps["thickness"].shape), **nodes},
         {**_definitions(NODES), **definitions},
@@ -345,12 +345,12 @@ def write_spread(
         digits = rows[name].digits if name in rows else _MILLIMETER_DIGITS
         definitions[spread_name(name)] = about
         columns[spread_name(name)] = format_column(np.array([value]), digits)
-    _write_table(place, "summaryuncertainty", columns, definitions)
+    _write_table(result, "summaryuncertainty", columns, definitions)
     name, unit = spread_name("thickness"), "mm"
     content = gifti.shape_bytes(
-        maps["thickness"].ravel(), hemi=place.name.hemi, name=name, unit=unit
+        maps["thickness"].ravel(), hemi=result.name.hemi, name=name, unit=unit
     )
-    files.write_bytes(place.path("thickness_sd"), content)
+    files.write_bytes(result.path("thickness_sd"), content)
 
 
 def _flag_entry(flag: Flag) -> dict[str, Any]:
@@ -366,18 +366,18 @@ def _flag_entry(flag: Flag) -> dict[str, Any]:
 
 
 def write_failure(
-    place: ResultPlace,
+    result: ResultPlace,
     error: HipstaError,
     record: Mapping[str, Any],
     body: BodyMask | None = None,
 ) -> None:
     """Leave nothing of a failed hemisphere but its quality record, and its body to be corrected."""
-    remove_results(place)
+    remove_results(result)
     if body is not None:
-        files.write_bytes(place.path("body_mask"), mask_bytes(body))
-        _write_sources(place, record)
+        files.write_bytes(result.path("body_mask"), mask_bytes(body))
+        _write_sources(result, record)
     verdict = {"status": Status.FAILED, "reason": error.reason, "message": str(error)}
-    files.write_json(place.path("qc"), verdict | dict(record))
+    files.write_json(result.path("qc"), verdict | dict(record))
 
 
 def verdict(maps: HemisphereMaps) -> tuple[Status, str | None, str | None]:
@@ -467,24 +467,24 @@ def list_results(
     return sorted(results, key=_order)
 
 
-def _order(place: ResultPlace) -> tuple[str, ...]:
-    name = place.name
+def _order(result: ResultPlace) -> tuple[str, ...]:
+    name = result.name
     return name.subject, name.session or "", name.seg, name.region, name.hemi
 
 
-def read_record(place: ResultPlace) -> dict[str, Any]:
+def read_record(result: ResultPlace) -> dict[str, Any]:
     """Read the quality record."""
-    record = files.read_json(place.path("qc"))
+    record = files.read_json(result.path("qc"))
     for name in ("inputs", "edited"):
         entries = record.get(name) or []
         if not isinstance(entries, list) or not all(isinstance(one, dict) for one in entries):
-            raise InputError(f"{place.path('qc')}: bad {name}; {_REDO}", reason="bad-json")
+            raise InputError(f"{result.path('qc')}: bad {name}; {_REDO}", reason="bad-json")
     return record
 
 
-def read_summary(place: ResultPlace) -> dict[str, float]:
+def read_summary(result: ResultPlace) -> dict[str, float]:
     """Read the row of summary measures, NaN where missing."""
-    path = place.path("summary")
+    path = result.path("summary")
     rows = files.read_tsv(path)
     try:
         (row,) = rows
@@ -571,11 +571,11 @@ def _columns_by_pandas(
     return [column.to_numpy() for column in (*columns, *(table[name].fillna("") for name in words))]
 
 
-def read_units(place: ResultPlace) -> dict[str, str]:
+def read_units(result: ResultPlace) -> dict[str, str]:
     """Read the units of maps and summary measures."""
     return {
         name: str(entry["Units"])
         for key in ("sheet_sidecar", "summary_sidecar")
-        for name, entry in files.read_json(place.path(key)).items()
+        for name, entry in files.read_json(result.path(key)).items()
         if isinstance(entry, Mapping) and "Units" in entry
     }

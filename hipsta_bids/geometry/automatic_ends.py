@@ -140,8 +140,8 @@ def _profile(volume: LabelVolume, sheet: NDArray[np.uint8], axis: Float) -> _Pro
     last = int(np.ceil((reach.max() + margin) / _STEP))
     volume_of_part = abs(float(np.linalg.det(edges))) / parts / _STEP
     area, spread = dict[str, Float](), dict[str, Float]()
-    for name, place in points.items():
-        local = place - middle
+    for name, position in points.items():
+        local = position - middle
         height = local @ axis
         flat = local - height[:, None] * axis
         at = (height[:, None] + offsets) / _STEP - first  # parts of voxels

@@ -264,14 +264,14 @@ def find_touching_banks(surface: Surface, faces: Faces) -> list[TouchingBanks]:
     links = sparse.coo_array(
         (np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(first), len(first))
     )
-    count, place = sparse.csgraph.connected_components(links, directed=False)
+    count, piece = sparse.csgraph.connected_components(links, directed=False)
     area = vertex_areas(surface.vertices, surface.triangles)[first] / 2  # both banks are counted
     banks = [
         TouchingBanks(
-            points=middle[place == number],
-            area=float(area[place == number].sum()),
+            points=middle[piece == number],
+            area=float(area[piece == number].sum()),
             # The cleft of the other face is lost: both walls that are left are of one face.
-            side="exterior" if side[first[place == number]].sum() > 0 else "interior",
+            side="exterior" if side[first[piece == number]].sum() > 0 else "interior",
         )
         for number in range(count)
     ]

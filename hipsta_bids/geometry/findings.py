@@ -30,18 +30,18 @@ def flag_margins(findings: Sequence[Finding]) -> dict[str, float]:
 def raise_flags(
     findings: Sequence[Finding],
     sheet: Sheet,
-    place: Callable[[Float], str],
+    position: Callable[[Float], str],
 ) -> list[Flag]:
     """Turn what is beyond its limit into flags that say where, and what it means for the map.
 
-    ``place`` writes the place of (N, 3) points, RAS mm.
+    ``position`` writes the place of (N, 3) points, RAS mm.
     """
     flags = []
     for finding in findings:
         if finding.raised:
             consequence = add_consequence(finding, sheet)
             location = (
-                f", near {place(finding.points)}"
+                f", near {position(finding.points)}"
                 if len(finding.points) and not finding.placed
                 else ""
             )

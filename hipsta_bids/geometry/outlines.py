@@ -124,17 +124,19 @@ def _join(
         for number in range(1, count + 1):
             if number == largest:
                 continue
-            place = np.unravel_index(np.where(pieces == number, cost, np.inf).argmin(), cost.shape)
-            start = np.array([axis[place] for axis in nearest])
-            way = pixel * _segment_distance(distance.shape, start, np.array(place))
-            broken = number in lacked and not jump[place]
+            position = np.unravel_index(
+                np.where(pieces == number, cost, np.inf).argmin(), cost.shape
+            )
+            start = np.array([axis[position] for axis in nearest])
+            way = pixel * _segment_distance(distance.shape, start, np.array(position))
+            broken = number in lacked and not jump[position]
             shares = (np.kron(image > 0, block)[way < pixel].mean() for image in beside)
             broken = broken and any(share > _VISIBLE_SHARE for share in shares)
             limit = MAX_BREAK if broken else settings.max_gap
-            if cost[place] <= limit:
-                bridges.append((float(cost[place]), number, way))
+            if cost[position] <= limit:
+                bridges.append((float(cost[position]), number, way))
             elif sizes[number] < CRUMB_AREA:
-                bridges.append((float(cost[place]), number, None))
+                bridges.append((float(cost[position]), number, None))
         if not bridges:
             break
         _, number, bridge = min(bridges, key=lambda item: item[0])

@@ -205,11 +205,11 @@ def match_lines(first: Float, second: Float, stretching: float) -> Float:
         ways = moved + stretch[number - 1][:, None]
         choices[number] = ways.argmin(axis=0)
         total = ways.min(axis=0) + cost[number]
-    place = count - 1
+    position = count - 1
     shares = np.zeros(len(first))
     for number in range(len(first) - 1, -1, -1):
-        shares[number] = place / (count - 1)
-        place -= choices[number, place]
+        shares[number] = position / (count - 1)
+        position -= choices[number, position]
     return shares
 
 
@@ -261,11 +261,11 @@ def part_turns(outline: Float, nodes: Float, pixel: float) -> None:
     """
     near = np.argwhere(np.abs(outline) < TOUCH_DISTANCE)
     row = cKDTree(nodes.reshape(-1, 2)).query(near)[1] // nodes.shape[1]
-    place = np.full(outline.shape, np.nan)
-    place[tuple(near.T)] = pixel * _along(_middle(nodes))[row]
+    position = np.full(outline.shape, np.nan)
+    position[tuple(near.T)] = pixel * _along(_middle(nodes))[row]
     between = np.zeros(outline.shape, dtype=bool)
-    between[:-1] |= np.abs(np.diff(place, axis=0)) > TURN_LENGTH
-    between[:, :-1] |= np.abs(np.diff(place, axis=1)) > TURN_LENGTH
+    between[:-1] |= np.abs(np.diff(position, axis=0)) > TURN_LENGTH
+    between[:, :-1] |= np.abs(np.diff(position, axis=1)) > TURN_LENGTH
     between &= outline < pixel
     if between.any():
         gap = pixel * ndimage.distance_transform_edt(~between)

@@ -158,7 +158,7 @@ class _Found:
         """List each entry that was not used once, sorted by path."""
         renamed_paths = {_place(folder.path) for folder in self.renamed} if self.strays else set()
         entry_of = {_place(entry.path): entry for entry in reversed(self.strays)}
-        entry_of = {place: entry for place, entry in entry_of.items() if place not in renamed_paths}
+        entry_of = {path: entry for path, entry in entry_of.items() if path not in renamed_paths}
         entry_of |= {_place(entry.path): entry for entry in reversed(self.ignored)}
         return sorted(entry_of.values(), key=lambda entry: entry.path)
 
@@ -392,11 +392,11 @@ def find_anatomy(labels: Path, hemisphere: Hemisphere, bids_dir: Path) -> Iterat
         return
     if ashs.volume_table(labels) is not None:
         folder = labels.parent
-        for place in (folder, folder.parent) if folder.name == "final" else (folder,):
-            for name in _names(place):
+        for parent in (folder, folder.parent) if folder.name == "final" else (folder,):
+            for name in _names(parent):
                 match = _ASHS.fullmatch(name)
                 if match and match["side"] in (None, _SIDES[hemisphere.hemi]):
-                    yield Candidate(path=place / name, proven=True)
+                    yield Candidate(path=parent / name, proven=True)
     visit = bids_dir / f"sub-{hemisphere.subject}"
     if hemisphere.session is not None:
         visit /= f"ses-{hemisphere.session}"

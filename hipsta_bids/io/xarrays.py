@@ -67,9 +67,9 @@ class _Later(BackendArray):
         lists = [np.atleast_1d(part) for part in indices]
         outer, inner = lists[: self.count], np.ix_(*lists[self.count :])
         result = np.full([len(part) for part in lists], self.missing, dtype=self.dtype)
-        for place in np.ndindex(*(len(part) for part in outer)):
-            index = tuple(int(part[i]) for part, i in zip(outer, place, strict=True))
+        for position in np.ndindex(*(len(part) for part in outer)):
+            index = tuple(int(part[i]) for part, i in zip(outer, position, strict=True))
             values = self.read(index)
             if values is not None:
-                result[place] = values[inner]
+                result[position] = values[inner]
         return result.reshape([part.size for part in indices if part.ndim])

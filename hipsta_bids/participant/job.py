@@ -48,7 +48,7 @@ class Job:
     """All that a worker needs to know about one hemisphere."""
 
     item: HemisphereInput
-    place: ResultPlace
+    result: ResultPlace
     settings: Settings
     settings_hash: str
     sources: tuple[tuple[str, Path], ...]
@@ -64,7 +64,7 @@ class Job:
     @property
     def title(self) -> str:
         """Name in messages."""
-        return self.place.name.title
+        return self.result.name.title
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,7 +94,7 @@ class Outcome:
 def recorded(job: Job) -> Outcome | None:
     """Read how a hemisphere ended, if it did with the same settings and version."""
     try:
-        record = read_record(job.place)
+        record = read_record(job.result)
         status = Status(record.get("status", ""))
     except (InputError, ValueError):
         return None
@@ -102,9 +102,9 @@ def recorded(job: Job) -> Outcome | None:
         record.get("version") == __version__ and record.get("settings_hash") == job.settings_hash
     )
     whole = status == Status.FAILED or (
-        all(path.exists() for path in job.place.paths(optional=job.write_meshes))
-        and is_complete(job.place, record)
-        and has_spread(job.place, record, job.copies)
+        all(path.exists() for path in job.result.paths(optional=job.write_meshes))
+        and is_complete(job.result, record)
+        and has_spread(job.result, record, job.copies)
     )
     if not (is_current and whole):
         return None
@@ -270,7 +270,7 @@ def run_job(job: Job) -> Outcome:
     If another run is doing the same, its results are awaited and taken.
     """
     try:
-        with locked(job.place.root, job.title):
+        with locked(job.result.root, job.title):
             return finished(job) or _measure(job)
     except OutputError as error:
         return fail(job, error)
@@ -308,15 +308,15 @@ def _measure(job: Job) -> Outcome:
                 record["notes"] = [*record["notes"], *spread.notes]
         with clock("write"):
             hemisphere.write_results(
-                job.place,
+                job.result,
                 maps,
                 for_region(job.item.protocol, job.settings.body.region),
                 record,
                 write_meshes=job.write_meshes,
-                write_more=lambda: _write_more(job.place, maps, mapped, spread),
+                write_more=lambda: _write_more(job.result, maps, mapped, spread),
             )
     except Exception as error:  # noqa: BLE001  (one hemisphere's bug must not end the others)
-        explained = _explain(error, job.place.root)
+        explained = _explain(error, job.result.root)
         trace = traceback.format_exc() if explained.reason == INTERNAL else None
         body = None
         if volume is not None and isinstance(error, GeometryError):
@@ -335,31 +335,31 @@ def _measure(job: Job) -> Outcome:
 
 
 def _write_more(
-    place: ResultPlace, maps: HemisphereMaps, mapped: Mapped, spread: "Uncertainty | None"
+    result: ResultPlace, maps: HemisphereMaps, mapped: Mapped, spread: "Uncertainty | None"
 ) -> None:
     """Write what options asked for."""
-    write_signals(place, maps, mapped)
+    write_signals(result, maps, mapped)
     for name in maps.maps.keys() & {"distortion", "proximodistal"}:
         from hipsta_bids.io import gifti  # noqa: PLC0415  (workers only)
 
         values = maps.maps[name].ravel()
-        content = gifti.shape_bytes(values, hemi=place.name.hemi, name=name, unit="1")
-        files.write_bytes(place.path(name), content)
+        content = gifti.shape_bytes(values, hemi=result.name.hemi, name=name, unit="1")
+        files.write_bytes(result.path(name), content)
     if spread is not None and spread.known:
         measured = spread.copies - spread.failed
         finite = {name: np.isfinite(values) for name, values in maps.maps.items()}
         sd = {name: np.where(finite[name], sds, np.nan) for name, sds in spread.maps.items()}
-        hemisphere.write_spread(place, sd, spread.summary, measured)
+        hemisphere.write_spread(result, sd, spread.summary, measured)
 
 
-def has_spread(place: ResultPlace, record: Mapping[str, Any], copies: int) -> bool:
+def has_spread(result: ResultPlace, record: Mapping[str, Any], copies: int) -> bool:
     """Return whether the files of a record's uncertainty exist, and are of as many copies."""
     metrics = record.get("metrics") or {}
     measured_copies = metrics.get("uncertainty_copies", 0)
     if not measured_copies or metrics.get("uncertainty_thickness_mm") is None:
         return measured_copies == copies or not copies
     keys = ("uncertainty", "summaryuncertainty", "thickness_sd")
-    return copies in {0, measured_copies} and all(place.path(key).exists() for key in keys)
+    return copies in {0, measured_copies} and all(result.path(key).exists() for key in keys)
 
 
 def fail(
@@ -374,7 +374,7 @@ def fail(
     """Record that a hemisphere failed, and remove what it had."""
     record = base_record(job) if record is None else record
     try:
-        hemisphere.write_failure(job.place, error, record, body)
+        hemisphere.write_failure(job.result, error, record, body)
     except OutputError as worse:
         if not isinstance(error, OutputError):
             error = worse

@@ -34,13 +34,16 @@ def _column_names(name: str, count: int) -> list[str]:
 
 
 def write_map(
-    place: ResultPlace, source: MapSource, sampled: sampling.SampledMap, about: Mapping[str, object]
+    result: ResultPlace,
+    source: MapSource,
+    sampled: sampling.SampledMap,
+    about: Mapping[str, object],
 ) -> None:
     """Write one map: table, sidecar and GIFTI."""
     count = sampled.values.shape[2]
     names = _column_names(source.name, count)
     digits = 7 if source.interpolation == "linear" else 15
-    write_nodes(place.path("map_table", source.name), names, sampled.values, digits)
+    write_nodes(result.path("map_table", source.name), names, sampled.values, digits)
     definitions: dict[str, object] = {
         "x": {"Description": "node number along x, 1 at the medial end (subiculum)"},
         "y": {"Description": "node number along y, 1 at the posterior end"},
@@ -48,11 +51,11 @@ def write_map(
     for number, name in enumerate(names, start=1):
         text = f"volume {number} of the source" if count > 1 else "value of the source"
         definitions[name] = {"Description": f"{text}, in its own unit"}
-    files.write_json(place.path("map_sidecar", source.name), dict(about) | definitions)
+    files.write_json(result.path("map_sidecar", source.name), dict(about) | definitions)
     key = "map_shape" if count == 1 else "map_series"
     flat = sampled.values.reshape(-1, count)
     files.write_bytes(
-        place.path(key, source.name), gifti.maps_bytes(flat, hemi=place.name.hemi, names=names)
+        result.path(key, source.name), gifti.maps_bytes(flat, hemi=result.name.hemi, names=names)
     )
 
 
@@ -70,7 +73,7 @@ def _cells(values: Float, digits: int = 7) -> list[str]:
 
 
 def _write_regions(
-    place: ResultPlace, regions: sampling.Regions, statistics: sampling.RegionStatistics
+    result: ResultPlace, regions: sampling.Regions, statistics: sampling.RegionStatistics
 ) -> None:
     """Write one row per region, and the sidecar."""
     definitions: dict[str, dict[str, object]] = {
@@ -99,8 +102,8 @@ def _write_regions(
                 columns[key] = hemisphere.format_column(column, _REGION_DIGITS)
             else:
                 columns[key] = _cells(column)
-    files.write_tsv(place.path("roi"), list(columns), zip(*columns.values(), strict=True))
-    files.write_json(place.path("roi_sidecar"), definitions)
+    files.write_tsv(result.path("roi"), list(columns), zip(*columns.values(), strict=True))
+    files.write_json(result.path("roi_sidecar"), definitions)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -195,27 +198,27 @@ def _sample(
     return replace(sampled, values=np.where(measured, sampled.values, np.nan))
 
 
-def write_signals(place: ResultPlace, maps: HemisphereMaps, mapped: Mapped) -> None:
+def write_signals(result: ResultPlace, maps: HemisphereMaps, mapped: Mapped) -> None:
     """Write the tables and GIFTI files of what was sampled."""
     numbers: dict[str, Float] = {name: maps.maps[name] for name in _SHAPE_UNITS}
     labels: dict[str, Float] = {}
     entries = {entry["name"]: entry for entry in mapped.record.get("maps", ())}
     for source, sampled in mapped.maps:
         about = {key.capitalize(): value for key, value in entries[source.name].items()}
-        write_map(place, source, sampled, about)
+        write_map(result, source, sampled, about)
         columns = _column_names(source.name, sampled.values.shape[2])
         kind = numbers if source.interpolation == "linear" else labels
         kind |= {name: sampled.values[:, :, k] for k, name in enumerate(columns)}
     if mapped.regions is not None:
         statistics = sampling.summarize_regions(mapped.regions, maps.sheet, numbers, labels)
-        _write_regions(place, mapped.regions, statistics)
+        _write_regions(result, mapped.regions, statistics)
 
 
-def is_complete(place: ResultPlace, record: Mapping[str, Any]) -> bool:
+def is_complete(result: ResultPlace, record: Mapping[str, Any]) -> bool:
     """Return whether the files of maps and regions that a record names exist."""
     maps = [entry for entry in record.get("maps") or () if "outside" in entry]
-    paths = [place.path("map_table", entry["name"]) for entry in maps]
+    paths = [result.path("map_table", entry["name"]) for entry in maps]
     usable = not any(f.get("reason") == "roi-unusable" for f in record.get("flags") or ())
     if record.get("regions") and usable:
-        paths.append(place.path("roi"))
+        paths.append(result.path("roi"))
     return all(path.exists() for path in paths)

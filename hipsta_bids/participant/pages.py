@@ -87,7 +87,7 @@ class Problem:
 
 def visits_of(root: Path) -> list[VisitKey]:
     """List the visits of which there is a record."""
-    names = (place.name for place in list_results(root))
+    names = (result.name for result in list_results(root))
     return list(dict.fromkeys((name.subject, name.session) for name in names))
 
 

@@ -143,7 +143,7 @@ def status_row(outcome: Outcome) -> dict[str, str]:
         **{f"{STAGE_PREFIX}{stage}": spent for stage, spent in outcome.stages.items()},
     }
     return {
-        **identity(outcome.job.place.name),
+        **identity(outcome.job.result.name),
         "status": str(outcome.status),
         "reason": outcome.reason or files.MISSING,
         "message": outcome.message or files.MISSING,
@@ -367,7 +367,7 @@ def _run(
 
 def _find_copies(jobs: Sequence[Job], out_dir: Path) -> Iterator[str]:
     """Mark hemispheres with the same labels in the table, and describe those of this run."""
-    names_of_jobs = {job.place.name for job in jobs}
+    names_of_jobs = {job.result.name for job in jobs}
     for names in mark_copies(out_dir):
         if names_of_jobs.intersection(names):
             line = describe_copies(names)
@@ -402,7 +402,7 @@ def _prepare(
     return [
         Job(
             item=item,
-            place=ResultPlace(
+            result=ResultPlace(
                 root=out_dir,
                 name=HemisphereName(
                     subject=item.subject,
@@ -430,7 +430,7 @@ def _pages_after(
     """Make pages when a block ends, if they are wanted; that of all if this is no part."""
     if not options.reports:
         return contextlib.nullcontext(Pages())
-    visits = [(job.place.name.subject, job.place.name.session) for job in jobs]
+    visits = [(job.result.name.subject, job.result.name.session) for job in jobs]
     plan = PagePlan(
         root=out_dir,
         n_workers=n_workers(options, len(visits)),
@@ -495,10 +495,10 @@ def _measured(
 
 def _remove_unfinished(job: Job) -> None:
     """Remove what was being written: it has no quality record yet."""
-    if job.place.path("sheet").exists() and not job.place.path("qc").exists():
-        with locked(job.place.root, job.title):
-            if not job.place.path("qc").exists():  # another run may have been at it
-                hemisphere.remove_results(job.place)
+    if job.result.path("sheet").exists() and not job.result.path("qc").exists():
+        with locked(job.result.root, job.title):
+            if not job.result.path("qc").exists():  # another run may have been at it
+                hemisphere.remove_results(job.result)
 
 
 def _lost(job: Job, loss: WorkerLost, options: RunOptions) -> Outcome:
@@ -515,5 +515,5 @@ def _lost(job: Job, loss: WorkerLost, options: RunOptions) -> Outcome:
             reason="worker-died",
         )
     # Another run may have been at it, and for that one it may have gone well.
-    with locked(job.place.root, job.title):
+    with locked(job.result.root, job.title):
         return finished(job) or fail(job, error, seconds=loss.seconds)

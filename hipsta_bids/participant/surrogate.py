@@ -59,11 +59,11 @@ def crosscheck(
         name = HemisphereName(
             subject=item.subject, session=item.session, hemi=item.hemi, seg=item.protocol.name
         )
-        place = ResultPlace(root=out_dir, name=name)
-        files.remove([place.path("surrogate"), place.path("surrogate_sidecar")])
-        title = f"{place.name.stem}_seg-{place.name.seg}"
+        result = ResultPlace(root=out_dir, name=name)
+        files.remove([result.path("surrogate"), result.path("surrogate_sidecar")])
+        title = f"{result.name.stem}_seg-{result.name.seg}"
         try:
-            for line in _measure(item, place, settings):
+            for line in _measure(item, result, settings):
                 echo(f"{title}  {line}")
         except OutputError:
             raise
@@ -76,10 +76,10 @@ def crosscheck(
     return ExitCode.BAD_DATA if bad and len(errors) == len(items) else ExitCode.SOME_FAILED
 
 
-def _measure(item: HemisphereInput, place: ResultPlace, settings: Settings) -> list[str]:
+def _measure(item: HemisphereInput, result: ResultPlace, settings: Settings) -> list[str]:
     """Measure one hemisphere, write its table, and return a line per slice."""
     body = extract_body(read_label_volume(item), settings.body.changed(region="body"))
-    sheet = _read_sheet(place)
+    sheet = _read_sheet(result)
     rows: list[list[str]] = []
     lines = []
     for position in settings.surrogate.positions:
@@ -92,20 +92,20 @@ def _measure(item: HemisphereInput, place: ResultPlace, settings: Settings) -> l
             rows += _rows(profile, mesh)
             if profile.sampling == "proportional":
                 lines.append(_line(profile, mesh))
-    files.write_tsv(place.path("surrogate"), list(COLUMNS), rows)
+    files.write_tsv(result.path("surrogate"), list(COLUMNS), rows)
     described = {
         name: {"Description": text} | ({"Units": unit} if unit else {})
         for name, (text, unit) in COLUMNS.items()
     }
-    files.write_json(place.path("surrogate_sidecar"), described)
+    files.write_json(result.path("surrogate_sidecar"), described)
     return lines
 
 
-def _read_sheet(place: ResultPlace) -> tuple[Float, Float] | None:
+def _read_sheet(result: ResultPlace) -> tuple[Float, Float] | None:
     """Read points (M, 3), RAS mm, and thickness (M,), mm, that the participant level measured."""
     with suppress(InputError):
         names = ("r", "a", "s", "thickness")
-        *axes, thickness = (v.ravel() for v in read_sheet(place.path("sheet"), names).values())
+        *axes, thickness = (v.ravel() for v in read_sheet(result.path("sheet"), names).values())
         return np.stack(axes, axis=-1), thickness
     return None
 

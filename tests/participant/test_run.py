@@ -62,7 +62,7 @@ def test_one_good_hemisphere_gives_a_complete_dataset(tmp_path):
         "CITATION.md",
         "status.tsv",
         "status.json",
-        *(path.name for path in result.outcomes[0].job.place.paths(optional=False)),
+        *(path.name for path in result.outcomes[0].job.result.paths(optional=False)),
     }
     (row,) = read_status(out)
     assert list(row)[: len(COLUMNS)] == list(COLUMNS)
@@ -79,7 +79,7 @@ def test_one_good_hemisphere_gives_a_complete_dataset(tmp_path):
 def test_quality_record_says_what_came_in(tmp_path):
     item = make_input(tmp_path / "in")
     result = run([item], tmp_path / "out")
-    record = json.loads(result.outcomes[0].job.place.path("qc").read_text())
+    record = json.loads(result.outcomes[0].job.result.path("qc").read_text())
     assert record["inputs"] == [
         {"file": "bids:tests:sub-01_L.txt", "sha256": files.sha256_of(item.files[0])}
     ]
@@ -138,7 +138,7 @@ def test_every_kind_of_failure_stays_alone(tmp_path):
     messages = {row["subject"]: row["message"] for row in read_status(out)}
     assert "SIGSEGV" in messages["sub-02"]
     for outcome in result.outcomes:
-        place = outcome.job.place
+        place = outcome.job.result
         there = {row.key for row in OUTPUTS if place.path(row.key).exists()}
         full = {row.key for row in OUTPUTS if not row.optional}
         assert there == ({"qc"} if outcome.status == Status.FAILED else full)
@@ -180,7 +180,7 @@ def with_edit(item, folder, text="corrected", kind="mask"):
 def test_edits_that_appear_change_or_vanish_are_seen(tmp_path):
     out = tmp_path / "out"
     plain = make_input(tmp_path / "in")
-    place = run([plain], out).outcomes[0].job.place
+    place = run([plain], out).outcomes[0].job.result
 
     def is_skipped(item):
         return run([item], out).outcomes[0].skipped
@@ -210,7 +210,7 @@ def test_an_edit_that_cannot_be_read_fails_and_is_named(tmp_path):
     (row,) = read_status(tmp_path / "out")
     assert (row["status"], row["edited"]) == ("failed", "mask")
     assert "desc-edited_mask.nii.gz" in row["message"]
-    record = json.loads(result.outcomes[0].job.place.path("qc").read_text())
+    record = json.loads(result.outcomes[0].job.result.path("qc").read_text())
     assert [edit["what"] for edit in record["edited"]] == ["mask"]
 
 
@@ -218,7 +218,7 @@ def test_an_edit_that_cannot_be_read_fails_and_is_named(tmp_path):
 def test_what_changed_is_redone(tmp_path, change):
     out = tmp_path / "out"
     item = make_input(tmp_path / "in")
-    place = run([item], out).outcomes[0].job.place
+    place = run([item], out).outcomes[0].job.result
     options = {}
     if change == "input":
         item.files[0].write_text("repaired")
@@ -250,7 +250,7 @@ def test_failed_hemispheres_are_tried_again(tmp_path):
 def test_maps_go_when_the_new_input_fails(tmp_path):
     out = tmp_path / "out"
     item = make_input(tmp_path / "in")
-    place = run([item], out).outcomes[0].job.place
+    place = run([item], out).outcomes[0].job.result
     item.files[0].write_text("bad-input")
     run([item], out)
     assert [path for path in place.paths(optional=True) if path.exists()] == [place.path("qc")]
@@ -315,7 +315,7 @@ def test_full_disk_ends_the_run_but_harms_nothing_else(tmp_path, monkeypatch):
         ("sub-02", "L"): ("failed", "disk-full"),
         ("sub-03", "L"): ("failed", "not-finished"),
     }
-    good, bad = (outcome.job.place for outcome in result.outcomes)
+    good, bad = (outcome.job.result for outcome in result.outcomes)
     assert all(path.exists() for path in good.paths(optional=False))
     assert [path for path in bad.paths(optional=True) if path.exists()] == [bad.path("qc")]
 

@@ -60,7 +60,7 @@ class GroupRequest:
 class SheetRecord:
     """One complete hemisphere."""
 
-    place: hemisphere.ResultPlace
+    result: hemisphere.ResultPlace
     settings_hash: str
     version: str
     source: str
@@ -150,7 +150,7 @@ def collect_sheets(request: GroupRequest, *, may_lack: bool = False) -> Collecti
     return Collection(
         records=tuple(records),
         exclusions=tuple(left_out),
-        grid=grid_of(records[0].place.root),
+        grid=grid_of(records[0].result.root),
         settings_hash=digest,
         versions=tuple(sorted({record.version for record in records})),
         ratings=choices.counts((result.name, _digest(result)) for result in places),
@@ -175,7 +175,7 @@ def _several_versions(records: Sequence[SheetRecord]) -> tuple[str, ...]:
     if len(counts) < 2:  # noqa: PLR2004 -- one is as it should be
         return ()
     usual = counts.most_common(1)[0][0]
-    stems = [record.place.name.stem for record in records if record.version != usual]
+    stems = [record.result.name.stem for record in records if record.version != usual]
     ending = f" and {len(stems) - SHOWN} more" if len(stems) > SHOWN else ""
     found = ", ".join(f"{version} ({n})" for version, n in sorted(counts.items()))
     text = (
@@ -279,7 +279,7 @@ def _judge(
     else:
         inputs = record.get("inputs") or [{}]
         return SheetRecord(
-            place=result,
+            result=result,
             settings_hash=intern(str(record.get("settings_hash"))),
             version=intern(str(record.get("version"))),
             source=relocate(str(inputs[0].get("file", "")), request.segmentations),
@@ -318,7 +318,7 @@ def _refuse_unfinished(request: GroupRequest, seg: str, choices: Choices) -> Non
 def _one_settings(records: Sequence[SheetRecord]) -> str:
     counts = Counter(record.settings_hash for record in records)
     if len(counts) > 1:
-        examples = {record.settings_hash: record.place for record in reversed(records)}
+        examples = {record.settings_hash: record.result for record in reversed(records)}
         parts = [
             f"{n} with {digest[:8]} (as {examples[digest].name.stem} in {examples[digest].root})"
             for digest, n in counts.most_common()

@@ -487,12 +487,12 @@ def add_volumes(
 
 
 def _beside(records: Sequence[SheetRecord]) -> Iterator[VolumeTable]:
-    paths = locate_sources([r.source for r in records], [r.place.root for r in records])
+    paths = locate_sources([r.source for r in records], [r.result.root for r in records])
     for record, path in zip(records, paths, strict=True):
         found = None if path is None else table_beside(path)
         if found is not None:
             name, table = found
-            own = record.place.name
+            own = record.result.name
             visit = visit_name(own.subject, own.session)
             yield VolumeTable(name=name, visit=visit, path=table, hemi=own.hemi)
 

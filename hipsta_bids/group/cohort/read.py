@@ -83,14 +83,14 @@ def _sampled(records: Sequence[SheetRecord]) -> list[str]:
     """Names of the sampled maps of the first hemisphere."""
     if not records:
         return []
-    pattern = records[0].place.path("map_table", "*")
+    pattern = records[0].result.path("map_table", "*")
     start, _, end = pattern.name.partition("*")
     paths = pattern.parent.glob(pattern.name)
     return sorted(path.name.removeprefix(start).removesuffix(end) for path in paths)
 
 
 def _summary_names(records: Sequence[SheetRecord]) -> tuple[str, ...]:
-    return tuple(hemisphere.read_summary(records[0].place)) if records else ()
+    return tuple(hemisphere.read_summary(records[0].result)) if records else ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,7 +125,7 @@ def read_sheets(
     """
     if error_window:
         _check_errors(records, maps)
-    region = records[0].place.name.region if records else "body"
+    region = records[0].result.name.region if records else "body"
     x, y = node_coordinates(grid, region)
     shape = len(x), len(y)
     visits = visits_of(records) if visits is None else visits
@@ -134,15 +134,15 @@ def read_sheets(
     sides = {}
     damaged: list[Exclusion] = []
     for hemi in "LR":
-        records_of_side = [record for record in records if record.place.name.hemi == hemi]
-        rows = [row_of[r.place.name.subject, r.place.name.session] for r in records_of_side]
+        records_of_side = [record for record in records if record.result.name.hemi == hemi]
+        rows = [row_of[r.result.name.subject, r.result.name.session] for r in records_of_side]
         if records_of_side:
             side = _read_side(records_of_side, np.array(rows, dtype=np.int64), shape, names)
             columns = {str(name): one.to_numpy() for name, one in side.summary.items()}
             doubtful = {name: one for name, one in columns.items() if why_impossible(name, one)}
             problems = [_damage(side, i, doubtful, max_gap) for i in range(len(records_of_side))]
             impossible = [
-                Exclusion.of_sheet(record.place.name, "damaged-map", text)
+                Exclusion.of_sheet(record.result.name, "damaged-map", text)
                 for record, text in zip(records_of_side, problems, strict=True)
                 if text
             ]
@@ -174,10 +174,10 @@ def read_sheets(
         sides=sides,
         x=x,
         y=y,
-        units=(hemisphere.read_units(records[0].place) if records else {})
+        units=(hemisphere.read_units(records[0].result) if records else {})
         | {n: ARBITRARY for n in names if n not in SHEET_MAPS},
         sources={
-            visit_name(r.place.name.subject, r.place.name.session): (r.source, r.place.root)
+            visit_name(r.result.name.subject, r.result.name.session): (r.source, r.result.root)
             for r in reversed(records)
         },
         damaged=tuple(damaged),
@@ -212,7 +212,7 @@ def _check_errors(records: Sequence[SheetRecord], maps: Sequence[str]) -> None:
             f"--weights uncertainty: there are no SDs of {', '.join(unsupported)}; leave these maps"
             " out by --measures, or the weights"
         )
-    lacking = [r.place.name.stem for r in records if not r.place.path("uncertainty").is_file()]
+    lacking = [r.result.name.stem for r in records if not r.result.path("uncertainty").is_file()]
     if lacking:
         names = ", ".join(lacking[:_MOST_NAMES]) + (" ..." if len(lacking) > _MOST_NAMES else "")
         raise InputError(
@@ -228,7 +228,7 @@ def _read_errors(
     """(sheets, x, y) SD of each map, from squares averaged over ``window`` nodes on both axes."""
     columns = [hemisphere.spread_name(name) for name in maps]
     tables = [
-        hemisphere.read_sheet(r.place.path("uncertainty"), columns, shape=shape) for r in records
+        hemisphere.read_sheet(r.result.path("uncertainty"), columns, shape=shape) for r in records
     ]
     errors = {}
     for name in maps:
@@ -245,7 +245,7 @@ def _read_errors(
 
 def visits_of(records: Sequence[SheetRecord]) -> list[VisitKey]:
     """List subjects and sessions that have sheets, each once."""
-    return list(dict.fromkeys((r.place.name.subject, r.place.name.session) for r in records))
+    return list(dict.fromkeys((r.result.name.subject, r.result.name.session) for r in records))
 
 
 def node_coordinates(grid: SheetSettings, region: str) -> tuple[Float, Float]:
@@ -272,7 +272,7 @@ def _read_side(
     subfield = np.empty((len(records), *shape), dtype=np.int8)
     codes: dict[str, int] = {}
     for i, record in enumerate(records):
-        columns = hemisphere.read_sheet(record.place.path("sheet"), measured, ["subfield"], shape)
+        columns = hemisphere.read_sheet(record.result.path("sheet"), measured, ["subfield"], shape)
         for name in sampled:
             path = _sampled_table(record, name)
             if path.is_file():
@@ -283,7 +283,7 @@ def _read_side(
     summary = pd.concat(
         [
             pd.DataFrame(
-                [hemisphere.read_summary(record.place) for record in records[part]],
+                [hemisphere.read_summary(record.result) for record in records[part]],
                 dtype=np.float64,
             )
             for part in blocks(len(records), _ROWS)
@@ -295,7 +295,7 @@ def _read_side(
 
 def _sampled_table(record: SheetRecord, name: str) -> Path:
     """Table of the sampled map of a column: ``bold_3`` is the third of ``bold``."""
-    return record.place.path("map_table", name.partition("_")[0])
+    return record.result.path("map_table", name.partition("_")[0])
 
 
 def _encode(words: np.ndarray[Any, Any], codes: dict[str, int]) -> np.ndarray[Any, Any]:

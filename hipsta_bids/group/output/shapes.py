@@ -133,7 +133,7 @@ def average_shapes(
     records: Sequence[SheetRecord], cohort: Cohort, analysis: Analysis, settings: ShapeSettings
 ) -> dict[str, AverageShape]:
     """Average the surfaces of each hemisphere, of the first visit of each participant."""
-    names = [(record.place.name, record.place) for record in records]
+    names = [(record.result.name, record.result) for record in records]
     result_of = {(visit_name(one.subject, one.session), one.hemi): result for one, result in names}
     shapes = {}
     for hemi, side in analysis.sides.items() if records else ():

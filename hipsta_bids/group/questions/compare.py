@@ -140,7 +140,7 @@ def _summary(
         site=options.export_summary or options.bids_dir.resolve().name,
         inputs={
             "versions": list(collection.versions),
-            "seg": collection.records[0].place.name.seg if collection.records else "none",
+            "seg": collection.records[0].result.name.seg if collection.records else "none",
             "region": options.sheets.region,
             "settings_hash": collection.settings_hash,
         },

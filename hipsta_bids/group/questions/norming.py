@@ -244,7 +244,7 @@ def _write(study: studies.Study, scoring: _Made, notes: Iterable[str]) -> studie
 def _protocol(inputs: studies.GroupInputs) -> tuple[str, str]:
     """Segmentation protocol and region of the sheets, if there are sheets."""
     records = inputs.found.records
-    return (records[0].place.name.seg, records[0].place.name.region) if records else ("none",) * 2
+    return (records[0].result.name.seg, records[0].result.name.region) if records else ("none",) * 2
 
 
 def _planned(study: studies.Study) -> tuple[NormsFile, normative.People]:

@@ -147,7 +147,7 @@ def write_folder(
                 "datasets": [str(root.resolve()) for root in options.sheets.roots],
                 "settings_hash": collection.settings_hash,
                 "versions": collection.versions,
-                "seg": collection.records[0].place.name.seg if collection.records else None,
+                "seg": collection.records[0].result.name.seg if collection.records else None,
                 "region": region,
                 "maps": dict(options.maps),
                 "volumes": dict(options.volumes),
