@@ -36,9 +36,11 @@ def write_surface(path: Path, mesh: Mesh, maps: Mapping[str, Float]) -> None:
     """
     if path.suffix not in ENDINGS:
         raise UsageError(f"{path.name}: surfaces end with {', '.join(ENDINGS)}")
-    known = np.asarray(np.isfinite(mesh.points).all(axis=1), dtype=np.bool_)
-    points = np.where(known[:, None], mesh.points, mesh.points[known].mean(axis=0))
-    faces = mesh.triangles[known[mesh.triangles].all(axis=1)]
+    present_points = np.asarray(np.isfinite(mesh.points).all(axis=1), dtype=np.bool_)
+    points = np.where(
+        present_points[:, None], mesh.points, mesh.points[present_points].mean(axis=0)
+    )
+    faces = mesh.triangles[present_points[mesh.triangles].all(axis=1)]
     data = {} if path.suffix == ".obj" else {name: np.ravel(maps[name]) for name in maps}
     files.write_bytes(path, _encode(path.suffix[1:], points, ("triangle", faces), data))
 

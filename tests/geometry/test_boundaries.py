@@ -1,6 +1,7 @@
 """Medial and lateral strips, interior and exterior side, where they are known to be."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -245,3 +246,19 @@ def test_lapys_own_solver_finds_the_same(case):
     np.testing.assert_allclose(found.medial_curve, case.boundaries.medial_curve, atol=1e-4)
     sheet = sample_sheet(case.mesh, solve_coordinates(laplace, found), SheetSettings())
     np.testing.assert_allclose(sheet.points, case.sheet.points, atol=1e-6)
+
+
+def test_held_values_weigh_by_area_and_inverse_square_of_the_thickness():
+    same = SimpleNamespace(screened=lambda weight, signs: (weight, signs))
+    wall = SimpleNamespace(vertex_areas=np.array([2.0, 2.0, 6.0]), evenly_aware=same)
+    hold, values = np.array([0.0, 0.5, 0.75]), np.array([1.0, -3.0, 2.0])
+    weight, signs = boundaries._screened(wall, hold, values, thickness=4.0)
+    wanted = boundaries.FIRMNESS / 16 * np.array([0.0, 2.0, 18.0])
+    np.testing.assert_allclose(weight, wanted, rtol=1e-12)  # rounding
+    np.testing.assert_array_equal(signs, [1, -1, 1])
+
+
+def test_local_means_are_gaussian_in_the_distance():
+    points, vectors = np.array([[1.0, 0, 0], [3.0, 0, 0]]), np.eye(3)[:2]
+    found = boundaries._local_mean(np.zeros((1, 3)), points, vectors, np.array([1.0, 2.0]), sd=2.0)
+    np.testing.assert_allclose(found, [[1.0, 2 * np.exp(-0.5 * (9 - 1) / 4), 0.0]], rtol=1e-12)

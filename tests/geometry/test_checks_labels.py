@@ -5,8 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hipsta_bids.geometry.checks import check_labels
+from hipsta_bids.geometry import checks
+from hipsta_bids.geometry.checks import check_labels, describe_uncus
 from hipsta_bids.geometry.completion import fill_slits
+from hipsta_bids.geometry.grid import cut_across
 from hipsta_bids.settings import BodySettings, CheckSettings
 
 CHECKS = CheckSettings()
@@ -68,3 +70,18 @@ def test_gaps_filled_by_other_labels_are_none(arc):
 def test_limits_are_the_settings(arc, limit):
     where, _ = voxels_near_plane(arc.body, arc.body.ends.axis, 0.45)
     assert len(reasons(damaged(arc.body, where), CheckSettings(**limit))) == 1
+
+
+def test_the_volume_of_the_uncus_is_told(arc):
+    uncus = np.tile(np.argwhere(arc.body.tissue)[:1], (400, 1))
+    (text,) = describe_uncus(replace(arc.body, uncus=uncus), CHECKS)
+    assert text.startswith(f"left out the uncus, {400 * arc.body.voxel_volume:.0f} mm3 at ")
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_slices_along_the_axis_count_by_their_distance(arc, axis):
+    affine = np.diag([0.5, 0.5, 0.5, 1.0])
+    assert checks._voxel_across(replace(arc.body, affine=affine)) == 0.5
+    affine[axis, axis] = 2.0
+    body = replace(arc.body, affine=affine)
+    assert checks._voxel_across(body) == (0.5 if cut_across(body) else 2.0)

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -149,3 +150,20 @@ def test_values_nearby_are_those_of_the_surface():
     # Between two nodes that are missing, the mean of the next four, which are equally far.
     assert compare_nearby(points[3:], surface, values, 1.2) == pytest.approx([3.0])
     assert np.isnan(compare_nearby(points, surface, np.full(30, np.nan), 1.0)).all()
+
+
+def test_the_axis_is_extended_in_steps_of_a_pixel_to_the_edge():
+    inside = np.zeros((9, 9), dtype=bool)
+    inside[4, :7] = True
+    found = surrogate._to_the_edge(
+        SimpleNamespace(inside=inside), np.array([4.0, 2.0]), np.array([0.0, 3.0])
+    )
+    np.testing.assert_array_equal(found, [[4, 3], [4, 4], [4, 5], [4, 6]])
+
+
+@pytest.mark.parametrize("labels", [(1, 2, 3), (3, 2, 1)])
+def test_labels_tell_which_end_of_the_axis_is_medial(labels):
+    body = SimpleNamespace(tissue=np.array([labels]), to_voxels=lambda points: points)
+    axis = np.array([[0.0, 0.0], [0.0, 1.0], [0.0, 2.0]])
+    found = surrogate._from_medial(body, SimpleNamespace(to_ras=lambda points: points), axis)
+    np.testing.assert_array_equal(found, axis if labels[0] == 1 else axis[::-1])

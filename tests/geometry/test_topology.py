@@ -1,6 +1,7 @@
 """Holes, bridges, islands, cavities and broken caps put into a ribbon, and repaired."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ from geometry_cases import field_of, ribbon_mask, solid_of, straight_grid
 from scipy import ndimage
 
 from hipsta_bids.errors import GeometryError
-from hipsta_bids.geometry import digital
+from hipsta_bids.geometry import digital, topology
 from hipsta_bids.geometry.digital import euler_number
 from hipsta_bids.geometry.grid import Field
 from hipsta_bids.geometry.mesh import extract_surface
@@ -345,3 +346,11 @@ def test_a_hole_beside_a_slit_between_turns_is_doubtful(apart, doubtful):
     found = solid_of(replace(field, separated=separated), TopologySettings())
     (fill,) = [repair for repair in found.repairs if repair.kind == "fill"]
     assert fill.large == doubtful
+
+
+def test_each_slit_is_an_edit_with_its_nodes():
+    slits = np.zeros((6, 3, 3), dtype=bool)
+    slits[0, 0, 0] = slits[4:, 0, 0] = True
+    field = SimpleNamespace(separated=None, slits=slits, cavities=None)
+    edits = topology._before_smoothing(field)
+    assert [(edit.kind, len(edit.nodes)) for edit in edits] == [("slit", 1), ("slit", 2)]
