@@ -1,5 +1,7 @@
 """What pages say, of a hemisphere of each kind; how they look is tested in a browser."""
 
+import contextlib
+import io
 import json
 import re
 import shutil
@@ -248,3 +250,14 @@ def test_an_error_in_reporting_is_a_line(tmp_path, monkeypatch):
 def test_pages_up_to_date_are_left_alone(out, monkeypatch):
     monkeypatch.setattr(reporting, "write_reports", lambda *_: 1 / 0)
     assert run_block(out) == []
+
+
+def test_a_hemisphere_whose_image_cannot_be_read_has_its_page(tmp_path):
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+        assert main.main(["phantom", str(tmp_path / "in"), "--n-subjects", "1"]) == 0
+        (image,) = (tmp_path / "in/derivatives/freesurfer/sub-01/mri").glob("rh.hippo*.mgz")
+        image.write_bytes(image.read_bytes()[:3000])
+        assert main.main([str(tmp_path / "in"), str(tmp_path / "out"), "participant"]) == 1
+    text = (tmp_path / "out/sub-01.html").read_text()
+    assert "cannot be read as an image" in text
+    assert "neither labels nor mask are available" in text

@@ -350,7 +350,7 @@ def _parquet_possible() -> bool:
     """Return whether pyarrow is installed; say once what is missing without it."""
     possible = find_spec("pyarrow") is not None
     if not possible:
-        _LOGGER.warning(
+        _LOGGER.info(
             "Parquet files (maps.parquet and scores of participants) are not written: install"
             " pyarrow, or hipsta_bids with it: hipsta_bids[arrow]"
         )
