@@ -117,7 +117,7 @@ def check_full_disk(work: Path, data: Path, reference: dict[str, bytes]) -> None
         echo("SKIPPED: full disk (mounting takes root)")
         return
     try:
-        out = disk / "out"
+        out = disk  # as deep as the reference: the description names the labels relative to it
         said = hipsta(data, out, "participant", code=_NO_SPACE)
         demand("no space left" in said, "full disk: exit code 73, and one line says why")
         demand_whole(out, reference, "full disk")
