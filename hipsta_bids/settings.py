@@ -226,8 +226,8 @@ class CheckSettings(toml.SettingsTable):
     """Flag a gap of more voxels than this (from the population, coarse or fine)."""
     flag_loose_part: NonNegativeFloat = 0.15
     """Flag a second piece of voxels, connected by faces, above this share of the sheet."""
-    flag_doubt: NonNegativeFloat = 0.3
-    """Flag if other operators lead to a medial or lateral boundary this far away, mm."""
+    flag_rival: NonNegativeFloat = 0.12
+    """Flag if a second choice that is as likely moves the map by more than this (RMS), mm."""
 
 
 class MapSettings(toml.SettingsTable):

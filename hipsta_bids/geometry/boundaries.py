@@ -5,9 +5,9 @@ parts of the wall belong to the edges by weights that fall smoothly from 1 to 0,
 change of the labels moves the boundary by little.
 """
 
-from collections.abc import Iterator
-from dataclasses import dataclass
-from itertools import islice
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from scipy import ndimage
@@ -50,9 +50,11 @@ EDGE_NEIGHBORS, EDGE_SD = 60, 0.4
 STRIP_WEIGHT = 0.5
 #: Below it, the sides hold the middle lines; width of that change.
 HOLD_FADE = 0.15
-#: Other operators, whose zero lines show how certain the curves are: factors of sharp_bend and of
-#: anisotropy.
-TILTS = ((0.8, 1.0), (1.0, 0.625))
+#: The operator of the settings, and others, whose zero lines show how certain the curves are:
+#: factors of sharp_bend and of anisotropy.
+TILTS = ((1.0, 1.0), (0.8, 1.0), (1.0, 0.625))
+#: Curves this near to each other on average lead to the same map, mm.
+SAME_CURVES = 0.05
 #: Distances at which interior labels are looked for, mm outside the wall.
 PROBE_DISTANCES = (0.4, 0.8, 1.2)
 #: Fewer hits than this share count as no interior labels.
@@ -237,9 +239,6 @@ class Boundaries:
     medial_curve: Float
     """(N, 3) points of the boundary curve, RAS mm."""
     lateral_curve: Float
-    doubt: float
-    """Largest mean distance of the curves from those of other operators (``TILTS``), mm; NaN if one
-    of these has none."""
     side_rule: str
     """What tells interior from exterior: ``labels``, or, decided on the sheet, ``bending`` or,
     where cortex is measured, ``continuity`` with the hippocampus."""
@@ -249,6 +248,12 @@ class Boundaries:
     """Mean width of the boundary strips, mm."""
     sheet_thickness: float
     """2 volume / area of the two sides, strips left out on either, mm."""
+    tilt: int = 0
+    """Number of the first operator in ``TILTS`` that has curves; 0 is that of the settings."""
+    doubt: float = 0.0
+    """Largest mean distance of the curves from those of the other operators, mm."""
+    rival: "Boundaries | None" = None
+    """The boundary of the operator whose curves lie farthest away; None where all are the same."""
 
 
 def find_boundaries(
@@ -258,22 +263,54 @@ def find_boundaries(
 
     The zero lines of the first curvature-aware anisotropic Laplace-Beltrami eigenfunction of the
     wall are the medial and lateral boundary (Diers et al. 2023, section 2.1.3), moved to the middle
-    of the edges.
+    of the edges. Other operators lead to the same lines where these are certain, whatever the
+    start. Where they do not, their boundary is the result's ``rival``.
     """
     wall = Wall(surface, settings)
     thickness = mean_wall_thickness(surface)
-    values = _eigenfunction(wall, settings)
-    centered = None if values is None else center_curves(wall, values, thickness)
-    if values is None or centered is None:
+    tilt, values, lines = 0, None, list[tuple[Pair, Float]]()
+    for bend, anisotropy in TILTS:
+        operator = wall.operator(
+            settings.changed(
+                sharp_bend=bend * settings.sharp_bend, anisotropy=anisotropy * settings.anisotropy
+            )
+        )
+        # A rough function leads to the same curves where these are certain.
+        accuracy = 1e-3 if lines else 1e-6
+        values = operator.eigenfunctions(1, near=values, residual=accuracy)[1][:, 0]
+        centered = center_curves(wall, values, thickness)
+        if centered is not None:
+            lines.append(centered)
+        tilt += not lines
+    if not lines:
         raise GeometryError(
             "no line runs along the medial and the lateral edge from end to end: check the labels "
             "for folds that touch each other",
             reason="boundaries",
         )
-    curves, smooth = centered
-    strips, sides, pair = _strips_and_sides(wall, laplace, curves, smooth, thickness)
+    distances = [_curve_distance(curves, lines[0][0]) for curves, _ in lines]
+    farthest = int(np.argmax(distances))
+    along = partial(_along_curves, surface, wall, laplace, body, thickness=thickness)
+    first, rival = along(lines[0]), None
+    if distances[farthest] > SAME_CURVES:
+        with suppress(GeometryError):
+            rival = along(lines[farthest])
+    return replace(first, tilt=tilt, doubt=distances[farthest], rival=rival)
+
+
+def _along_curves(
+    surface: Surface,
+    wall: Wall,
+    laplace: Laplace,
+    body: Body,
+    centered: tuple[Pair, Float],
+    *,
+    thickness: float,
+) -> Boundaries:
+    """Find strips and sides along two curves, given with the function whose zero lines they are."""
+    strips, sides, pair = _strips_and_sides(wall, laplace, *centered, thickness)
     if sides is None:
-        raise _inseparable(curves, body)
+        raise _inseparable(centered[0], body)
     if _rank(pair[0], body) > _rank(pair[1], body):
         pair, strips = (pair[1], pair[0]), (strips[1], strips[0])
     sides, side_rule, margin = _interior_first(sides, wall, body)
@@ -287,7 +324,6 @@ def find_boundaries(
         anterior=np.flatnonzero(surface.anterior_cap).astype(np.int32),
         medial_curve=pair[0],
         lateral_curve=pair[1],
-        doubt=_doubt(wall, values, curves, thickness, settings),
         side_rule=side_rule,
         side_margin=margin,
         strip_width=area / (2 * body.ends.length(wall.vertices)),
@@ -296,42 +332,6 @@ def find_boundaries(
         * signed_volume(surface.vertices, surface.triangles)
         / (float(wall.areas.sum()) - area),
     )
-
-
-def _operators(wall: Wall, settings: BoundarySettings) -> Iterator[Laplace]:
-    """Make the operator of the settings, and others for comparison."""
-    for bend, anisotropy in ((1.0, 1.0), *TILTS):
-        yield wall.operator(
-            settings.changed(
-                sharp_bend=bend * settings.sharp_bend, anisotropy=anisotropy * settings.anisotropy
-            )
-        )
-
-
-def _eigenfunction(wall: Wall, settings: BoundarySettings) -> Float | None:
-    """Return the first eigenfunction (V,) with two zero lines from end to end, of any operator."""
-    for operator in _operators(wall, settings):
-        values = operator.eigenfunctions(1)[1][:, 0]
-        if end_to_end(wall, values) is not None:
-            return values
-    return None
-
-
-def _doubt(
-    wall: Wall, values: Float, curves: Pair, thickness: float, settings: BoundarySettings
-) -> float:
-    """Find how far curves lie from those that other operators lead to, mm; NaN if to none.
-
-    That is the largest mean distance; ``values`` (V,) is the eigenfunction of the first operator.
-
-    Curves that are certain are found from any start, to the thousandth of a millimeter.
-    """
-    distances = []
-    for operator in islice(_operators(wall, settings), 1, None):
-        tilted = operator.eigenfunctions(1, near=values, residual=1e-3)[1][:, 0]
-        moved = center_curves(wall, tilted, thickness)
-        distances.append(float("nan") if moved is None else _curve_distance(moved[0], curves))
-    return float(np.max(distances))
 
 
 def _strips_and_sides(

@@ -25,6 +25,9 @@ RIDGE_COLUMNS = 9
 _INWARD = 7
 """The way into the sheet goes from an edge to this part of the columns beside it."""
 
+#: A column is moved by a second choice if its thickness differs by more, mm.
+RIVAL_OFF = 0.3
+
 _LEAST_WIDTH = 1.0
 """mm of a subfield that rows may lack: less does not move the other columns."""
 
@@ -190,3 +193,25 @@ def _wider(lengths: Float, middle: Float, reach: float) -> Float:
     before = np.where(near & (offset <= 0), lengths, -np.inf).max(axis=1)
     after = np.where(near & (offset >= 0), lengths, -np.inf).max(axis=1)
     return np.asarray(np.minimum(before, after))
+
+
+def check_rival(thickness: Float, choice: str, rival: Float, settings: CheckSettings) -> Finding:
+    """Flag a map (Nx, Ny), mm, that a second choice, as likely as the first, moves by much."""
+    difference = rival - thickness
+    moved = np.abs(difference) > RIVAL_OFF
+    rms = rms_difference(rival, thickness)
+    return Finding(
+        reason="second-choice",
+        value=rms,
+        limit=settings.flag_rival,
+        text=f"another {choice} is as likely and moves the map by {rms:.2f} mm (RMS), "
+        f"{moved.mean():.0%} of the columns by more than {RIVAL_OFF:g} mm",
+        remedy="look at the labels there",
+        share=float(moved.mean()),
+        change=float(np.nanmean(difference)),
+    )
+
+
+def rms_difference(first: Float, second: Float) -> float:
+    """Compute the root mean square of the difference of two maps, where both have values."""
+    return float(np.sqrt(np.nanmean((first - second) ** 2)))

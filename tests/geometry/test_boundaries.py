@@ -51,7 +51,19 @@ def test_curves_run_in_the_middle_of_the_rims(case):
 
 
 def test_other_operators_lead_to_the_same_curves(case):
-    assert case.boundaries.doubt < 0.05
+    assert case.boundaries.tilt == 0
+    assert case.boundaries.doubt < boundaries.SAME_CURVES
+    assert case.boundaries.rival is None
+
+
+def test_curves_of_an_operator_that_lie_elsewhere_make_a_rival(arc, monkeypatch):
+    """Without bands, curves stay where the operator puts them: on the sides, if it is isotropic."""
+    monkeypatch.setattr(boundaries, "EDGE_BANDS", ())
+    monkeypatch.setattr(boundaries, "TILTS", ((1.0, 1.0), (1.0, 0.0)))
+    found = find_boundaries(arc.surface, arc.laplace, arc.body, SETTINGS)
+    assert found.doubt > boundaries.SAME_CURVES
+    gaps = [cKDTree(rim(arc, 1)).query(b.lateral_curve)[0].mean() for b in (found, found.rival)]
+    assert gaps[0] < gaps[1]
 
 
 def test_strips_hold_the_rims(case):
