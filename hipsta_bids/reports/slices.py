@@ -130,12 +130,8 @@ def _relative(path: Sequence[tuple[int, int]]) -> str:
     return start + "l" + " ".join(f"{dx / 100:g} {dy / 100:g}" for dx, dy in moves or [(0, 0)])
 
 
-def png_address(pixels: NDArray[np.uint8]) -> str:
-    """Encode (rows, columns, 3 or 4) pixels as a data address."""
-    return _address(pixels, "png")
-
-
-def _address(pixels: NDArray[np.uint8], kind: str, **options: int) -> str:
+def image_address(pixels: NDArray[np.uint8], kind: str, **options: int) -> str:
+    """Encode (rows, columns) grays, or (rows, columns, 4) pixels, as a data address."""
     from PIL import Image  # noqa: PLC0415  (slow to load)
 
     buffer = io.BytesIO()
@@ -177,7 +173,7 @@ def stack_of(views: Views) -> dict[str, Any]:
     scene = {
         "shape": views.shape,
         "affine": np.round(views.affine[:3], 4).tolist(),
-        "colors": [label.color for label in views.names.values()],
+        "colors": [color for _, color in views.names.values()],
         "body": views.mask is not None,
         "stack": _packed(stack),
         "pale": _PALE,
@@ -214,7 +210,7 @@ def _with_anatomy(panel: Panel, views: Views) -> Panel:
     index[..., up] = views.shape[up] - 0.5 - y[:, None] / views.voxel[up]
     index[..., across] = panel.at["level"]
     grays = views.anatomy.grays(apply_affine(views.affine, index))
-    return replace(panel, anatomy=_address(grays, "jpeg", quality=_QUALITY))
+    return replace(panel, anatomy=image_address(grays, "jpeg", quality=_QUALITY))
 
 
 def section_panels(
@@ -373,12 +369,9 @@ def _label_image(views: Views, across: int, level: int, right: int, up: int) -> 
         return None
     plane = _picture(views.labels, across, level, right, up)
     pixels = np.zeros((*plane.shape, 4), dtype=np.uint8)
-    for code, name in views.names.items():
-        pixels[plane == code] = (
-            *(int(name.color[i : i + 2], 16) for i in (1, 3, 5)),
-            round(255 * _PALE),
-        )
-    return png_address(pixels.transpose(1, 0, 2)[::-1])
+    for code, (_, color) in views.names.items():
+        pixels[plane == code] = (*bytes.fromhex(color[1:]), round(255 * _PALE))
+    return image_address(pixels.transpose(1, 0, 2)[::-1], "png")
 
 
 def _section(
