@@ -23,7 +23,7 @@ from hipsta_bids.cli.parser import (
     positive_int,
     subject_label,
 )
-from hipsta_bids.errors import ExitCode, NothingToDoError, UsageError, did_you_mean
+from hipsta_bids.errors import ExitCode, NothingToDoError, OutputError, UsageError, did_you_mean
 from hipsta_bids.participant.cluster import Cluster, Shard, check_cluster, parse_shard
 from hipsta_bids.participant.pool import pin_threads, processors
 from hipsta_bids.protocols import EXPERIMENTAL
@@ -431,21 +431,13 @@ def _rebuild_reports(options: "Namespace") -> ExitCode:
     check_writable(root)
     progress = console.Progress(-1 if options.quiet else options.verbose)
     with log_file(root, options.verbose) as log, progress:
-        problems = list(
-            write_reports(
-                PagePlan(
-                    root=root,
-                    n_workers=options.n_procs,
-                    log=log,
-                    bids_dir=None if options.no_anatomy else options.bids_dir,
-                ),
-                visits,
-            )
-        )
+        bids_dir = None if options.no_anatomy else options.bids_dir
+        plan = PagePlan(root=root, n_workers=options.n_procs, log=log, bids_dir=bids_dir)
+        problems = list(write_reports(plan, visits))
     for problem in problems:
-        console.warn(f"report: {problem.message}")
+        console.warn(f"report: {problem}")
     console.echo(f"reports of {len(visits)} visits: {root / DATASET_FILES['report']}")
-    if any(problem.fatal for problem in problems):
+    if any(isinstance(problem, OutputError) for problem in problems):
         return ExitCode.NOT_WRITABLE
     return ExitCode.INTERNAL if problems else ExitCode.OK
 

@@ -291,11 +291,14 @@ def _measure(job: Job) -> Outcome:
             record |= {"input_hash": hashed} | entries
             volume = read_label_volume(job.item, job.settings.body.region)
         maps = measure_hemisphere(volume, job.item.hemi, job.settings, clock)
-        mapped = Mapped()
+        mapped: list[Mapped] = []
+        regions = None
         if job.item.maps or job.item.regions:
             with clock("maps"):
-                maps, mapped = add_signals(job.item, maps, job.settings.maps, dict(job.sources))
-                record |= mapped.record
+                maps, mapped, regions, entries = add_signals(
+                    job.item, maps, job.settings.maps, dict(job.sources)
+                )
+                record |= entries
         spread = None
         if job.copies:
             from hipsta_bids.participant import uncertainty  # noqa: PLC0415  (heavy)
@@ -307,13 +310,20 @@ def _measure(job: Job) -> Outcome:
                 maps = replace(maps, qc={**maps.qc, **spread.metrics})
                 record["notes"] = [*record["notes"], *spread.notes]
         with clock("write"):
+            region = for_region(job.item.protocol, job.settings.body.region)
+
+            def write_more() -> None:
+                """Write what options asked for."""
+                write_signals(job.result, maps, mapped, regions)
+                _write_more(job.result, maps, spread)
+
             hemisphere.write_results(
                 job.result,
                 maps,
-                for_region(job.item.protocol, job.settings.body.region),
+                region,
                 record,
                 write_meshes=job.write_meshes,
-                write_more=lambda: _write_more(job.result, maps, mapped, spread),
+                write_more=write_more,
             )
     except Exception as error:  # noqa: BLE001  (one hemisphere's bug must not end the others)
         explained = _explain(error, job.result.root)
@@ -334,11 +344,8 @@ def _measure(job: Job) -> Outcome:
     )
 
 
-def _write_more(
-    result: ResultPlace, maps: HemisphereMaps, mapped: Mapped, spread: "Uncertainty | None"
-) -> None:
-    """Write what options asked for."""
-    write_signals(result, maps, mapped)
+def _write_more(result: ResultPlace, maps: HemisphereMaps, spread: "Uncertainty | None") -> None:
+    """Write maps of sheets with a head, and SDs."""
     for name in maps.maps.keys() & {"distortion", "proximodistal"}:
         from hipsta_bids.io import gifti  # noqa: PLC0415  (workers only)
 
