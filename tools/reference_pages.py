@@ -110,9 +110,10 @@ _DATASET_FILES = {
 
 def outputs_page() -> str:
     """Write the page of files and columns."""
-    place = [(name, unit, words) for name, (words, unit) in (NODES | POSITION).items()]
-    state = [(name, unit, words) for name, (words, unit) in STATE.items()]
-    layers = [(name, unit, words) for name, (words, unit) in LAYERS.items()]
+    place, state, layers = (
+        [(name, about[1] if about[1:] else None, about[0]) for name, about in columns.items()]
+        for columns in (NODES | POSITION, STATE, LAYERS)
+    )
     columns = ("column", "unit", "what it is")
     parts = [
         "# Outputs",

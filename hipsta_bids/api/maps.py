@@ -40,8 +40,8 @@ if TYPE_CHECKING:
 _LEVELS = {"interior": 0.0, "midthickness": 0.5, "exterior": 1.0}
 #: What is no column of the sheet's table: definition and unit.
 _EXTRA_VARIABLES = {
-    "position": ("position, scanner RAS", "mm"),
-    "depth": ("distance from the interior wall along the column", "mm"),
+    "position": ["position, scanner RAS", "mm"],
+    "depth": ["distance from the interior wall along the column", "mm"],
 }
 _NODES = {
     "x": {"long_name": "medial to lateral", "units": "1"},
@@ -187,8 +187,7 @@ def attributes(name: str) -> dict[str, str]:
     for row in MAPS:
         if row.name == name:
             return {"units": row.unit, "long_name": row.definition, "source": row.source}
-    words, unit = (_EXTRA_VARIABLES | STATE)[name]
-    return {"long_name": words, **({"units": unit} if unit else {})}
+    return dict(zip(("long_name", "units"), (_EXTRA_VARIABLES | STATE)[name], strict=False))
 
 
 def node_axes(grid: SheetSettings, region: str) -> dict[str, Any]:

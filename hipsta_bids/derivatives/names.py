@@ -5,8 +5,10 @@ has no rule for is listed in ``.bidsignore``, with the reason, from the table be
 """
 
 import re
+import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
+from importlib.resources import files as files_of
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -299,30 +301,11 @@ TRIAL_MAPS: dict[str, tuple[str, str, str]] = {
 #: Folder and page of a meta-analysis, in an output folder of its own.
 META, META_REPORT = "meta", "meta.html"
 
-#: Lines of ``.bidsignore``, and why BIDS has no name for what each hides. The validator (3.0)
-#: passes over what is in a folder with a final slash, but not over the folder; and a wildcard
-#: before another one ends at the first character that follows it in the pattern. So folders have
-#: no slash, and patterns one wildcard and perhaps one at the end.
-IGNORED: dict[str, str] = {
-    f"/{DATASET_FILES['settings']}": "Settings of the program; BIDS has no file for them.",
-    f"/{DATASET_FILES['citation']}": "Text for a methods section; CITATION.cff cites a dataset.",
-    "/status.*": "How each hemisphere ended; BIDS has no table of a program's runs.",
-    "/*.html": "Pages to look at; BIDS leaves reports to the program.",
-    f"/{DATASET_FILES['group']}": "Results over participants; BIDS has names for single ones only.",
-    "*_morph.*": "Morphometry; a proposal (BEP011), not yet in BIDS.",
-    "*thickness.*": "Thickness and midthickness surfaces, with sidecars; likewise (BEP011).",
-    "*curv.*": "Curvature on surfaces, with sidecars; likewise (BEP011).",
-    "*interior.*": "Interior surfaces, with sidecars; BIDS has no surfaces yet.",
-    "*exterior.*": "Exterior surfaces, with sidecars; likewise.",
-    "*_map.*": "Other volumes sampled on the sheet; BIDS has no suffix for any quantity.",
-    "*_mesh.vtu": "Tetrahedral meshes; BIDS has no volume meshes.",
-    "*_metrics.json": "Quality of one hemisphere; BIDS has no quality metrics of derivatives.",
-    "*desc-body_mask.*": "Masks per hemisphere; in BIDS, masks of voxels have no hemi and seg.",
-    "*_label-extended_dseg.*": "Subfields and cortex; in BIDS, labels on surfaces have no label.",
-    "*_label-entorhinal_dseg.*": "The cortex alone; likewise.",
-    "*_label-headbody_dseg.*": "Head and body; likewise.",
-    "*_label-whole_dseg.*": "Head, body and tail; likewise.",
-}
+#: What files of the dataset as a whole say.
+TEXTS = tomllib.loads((files_of("hipsta_bids.derivatives") / "texts.toml").read_text("utf-8"))
+
+#: Lines of ``.bidsignore``, and why BIDS has no name for what each hides.
+IGNORED: dict[str, str] = TEXTS["ignored"]
 
 _IGNORE_HEAD = """\
 # For the BIDS validator: what is in this dataset, but has no name in BIDS 1.11."""

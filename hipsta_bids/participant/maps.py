@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from hipsta_bids.derivatives import hemisphere
-from hipsta_bids.derivatives.dataset import source_address
+from hipsta_bids.derivatives.dataset import TABLES, describe_columns, source_address
 from hipsta_bids.derivatives.hemisphere import ResultPlace
 from hipsta_bids.errors import InputError
 from hipsta_bids.geometry import sampling
@@ -44,10 +44,7 @@ def write_map(
     names = _column_names(source.name, count)
     digits = 7 if source.interpolation == "linear" else 15
     write_nodes(result.path("map_table", source.name), names, sampled.values, digits)
-    definitions: dict[str, object] = {
-        "x": {"Description": "node number along x, 1 at the medial end (subiculum)"},
-        "y": {"Description": "node number along y, 1 at the posterior end"},
-    }
+    definitions = describe_columns(hemisphere.NODES)
     for number, name in enumerate(names, start=1):
         text = f"volume {number} of the source" if count > 1 else "value of the source"
         definitions[name] = {"Description": f"{text}, in its own unit"}
@@ -76,12 +73,7 @@ def _write_regions(
     result: ResultPlace, regions: sampling.Regions, statistics: sampling.RegionStatistics
 ) -> None:
     """Write one row per region, and the sidecar."""
-    definitions: dict[str, dict[str, object]] = {
-        "region": {"Description": "region, as the user named it"},
-        "n_points": {"Description": "sheet points in the region"},
-        "n_valid": {"Description": "... whose columns were measured directly"},
-        "area": {"Description": "area of the mid-surface round these points", "Units": "mm^2"},
-    }
+    definitions = describe_columns(TABLES["roi"])
     columns: dict[str, list[str]] = {
         "region": list(regions.names),
         "n_points": _cells(statistics.n_points),
