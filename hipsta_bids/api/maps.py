@@ -20,8 +20,7 @@ from hipsta_bids.group.cohort.collect import grid_of
 from hipsta_bids.group.cohort.read import node_coordinates
 from hipsta_bids.inputs.labels import MARGIN, label_volume
 from hipsta_bids.io import files
-from hipsta_bids.io.gifti import sheet_triangles
-from hipsta_bids.io.meshes import write_surface
+from hipsta_bids.io.gifti import sheet_triangles, write_surface
 from hipsta_bids.io.volumes import LabelImage, read_labels
 from hipsta_bids.participant.measure import measure_hemisphere
 from hipsta_bids.protocols import body_ends

@@ -29,7 +29,7 @@ from hipsta_bids.derivatives.names import (
 from hipsta_bids.errors import HipstaError, InputError
 from hipsta_bids.geometry.catalog import MAPS, PER_SUBFIELD, SECTIONS, SUMMARY, Column
 from hipsta_bids.geometry.sheet import is_left_handed, layer_depth
-from hipsta_bids.io import files, gifti, meshes
+from hipsta_bids.io import files, gifti
 from hipsta_bids.io.volumes import mask_bytes
 from hipsta_bids.protocols import EXPERIMENTAL
 from hipsta_bids.protocols.protocol import Label, Part, Protocol, Tissue
@@ -254,7 +254,7 @@ def write_results(
     files.write_bytes(result.path("body_mask"), mask_bytes(maps.body_mask))
     if write_meshes:
         _write_layers(result, maps.layers)
-        files.write_bytes(result.path("mesh"), meshes.mesh_bytes(maps.mesh, maps.coordinates))
+        files.write_bytes(result.path("mesh"), gifti.mesh_bytes(maps.mesh, maps.coordinates))
     write_more()
     _write_sources(result, record)
     undefined = int(np.isnan(maps.sheet.points[:, :, [0, -1]]).any(axis=(2, 3)).sum())
