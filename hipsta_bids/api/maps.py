@@ -28,7 +28,7 @@ from hipsta_bids.protocols.load import for_region, load_protocol
 from hipsta_bids.protocols.protocol import Protocol
 from hipsta_bids.reports.results import SIDES, Hemisphere, SheetTable, find_results
 from hipsta_bids.settings import Settings, SheetSettings, load_settings
-from hipsta_bids.types import Flag, Float, HemisphereMaps, LabelVolume, Mesh, Sheet
+from hipsta_bids.types import Flag, Float, HemisphereMaps, LabelVolume, Mesh
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -163,7 +163,9 @@ class Measurement:
             row.name: (grid, self.maps[row.name], attributes(row.name)) for row in MAPS
         }
         variables |= {name: (grid, values, attributes(name)) for name, values in state.items()}
-        variables |= _three_dimensional(layers)
+        layered = ("x", "y", "layer")
+        variables["position"] = (*layered, "ras"), layers.points, attributes("position")
+        variables["depth"] = layered, layer_depth(layers), attributes("depth")
         coordinates = {
             **node_axes(self.settings.sheet, self.settings.body.region),
             "layer": (["layer"], np.linspace(0, 1, nz), {"long_name": "interior to exterior"}),
@@ -171,14 +173,6 @@ class Measurement:
         }
         about = {"side": self.side, "protocol": self.protocol.name, "status": self.status}
         return make_dataset(variables, coordinates, about)
-
-
-def _three_dimensional(layers: Sheet) -> "dict[str, Variable]":
-    grid = ("x", "y", "layer")
-    return {
-        "position": ((*grid, "ras"), layers.points, attributes("position")),
-        "depth": (grid, layer_depth(layers), attributes("depth")),
-    }
 
 
 def attributes(name: str) -> dict[str, str]:

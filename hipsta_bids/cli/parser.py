@@ -74,37 +74,20 @@ class Parser(argparse.ArgumentParser):
         raise UsageError(f"{message}{hint} (see {self.prog} --help)")
 
 
-class _Ignored(argparse.Action):
-    """Remembers an option of other BIDS Apps that has no meaning here, and why."""
-
-    def __call__(
-        self,
-        parser: argparse.ArgumentParser,
-        namespace: argparse.Namespace,
-        values: object,
-        option_string: str | None = None,
-    ) -> None:
-        del parser, values
-        previous = dict(getattr(namespace, self.dest) or {})
-        namespace.ignored = {**previous, str(option_string): str(self.const)}
-
-
 def accept(parser: argparse.ArgumentParser, options: Mapping[str, str]) -> None:
     """Accept options that have no meaning here; ``--name VALUE`` takes a value. Not in the help.
 
-    What was given is in ``ignored`` of the namespace, with the reason.
+    What was given is in ``ignored`` of the namespace, in pairs with the reason.
     """
     for name, reason in options.items():
         flag, _, value = name.partition(" ")
-        parser.add_argument(
-            flag,
-            action=_Ignored,
-            nargs=1 if value else 0,
-            dest="ignored",
-            const=reason,
-            default={},
-            help=argparse.SUPPRESS,
+        pair = flag, reason
+        kind: dict[str, Any] = (
+            {"action": "append", "type": lambda _, pair=pair: pair}
+            if value
+            else {"action": "append_const", "const": pair}
         )
+        parser.add_argument(flag, dest="ignored", default=[], help=argparse.SUPPRESS, **kind)
 
 
 @cache

@@ -43,15 +43,6 @@ COLLECT = "collect"
 LEVELS = ("participant", COLLECT)
 REGIONS = ("body", "extended", "entorhinal", *EXPERIMENTAL)
 
-#: Options of other BIDS Apps, and why they change nothing here.
-_NO_MEANING = {
-    "--omp-nthreads N": "each hemisphere uses one processor; --n-procs says how many at a time",
-    "--low-mem": "a hemisphere takes a few hundred megabytes; --mem limits how many at a time",
-    "--clean-workdir": "nothing is left in the scratch folder",
-    "--notrack": "nothing is tracked",
-    "--fs-license-file FILE": "FreeSurfer's programs are not run",
-}
-
 _GIGABYTES = {"K": 1e-6, "M": 1e-3, "G": 1.0, "T": 1e3}
 
 
@@ -63,7 +54,7 @@ def build_parser(epilog: str | None = None) -> Parser:
     add("output_dir", type=Path)
     add("analysis_level", type=_level)
     parser.add_argument("--version", action="version", version=f"hipsta_bids {__version__}")
-    accept(parser, _NO_MEANING)
+    accept(parser, help_texts()["without meaning"])
     add_selection(parser)
     add_segmentations(parser)
     _add_signals(parser)
@@ -192,7 +183,7 @@ def _run(options: "Namespace", arguments: Sequence[str]) -> ExitCode:
     pin_threads()
     from hipsta_bids.settings import load_settings  # noqa: PLC0415  (start-up time)
 
-    for name, reason in options.ignored.items():
+    for name, reason in dict(options.ignored).items():
         console.echo(f"note: {name} has no effect: {reason}")
     check_folders(options)
     collects = options.analysis_level == COLLECT

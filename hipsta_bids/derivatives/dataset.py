@@ -262,11 +262,6 @@ def source_address(path: Path, sources: Mapping[str, Path]) -> str:
     return str(path)
 
 
-def write_citation(root: Path, settings: Settings, protocols: Sequence[Protocol]) -> None:
-    """Write ``CITATION.md``: a methods paragraph with this run's settings, and the references."""
-    files.write_text(root / DATASET_FILES["citation"], citation_text(settings, protocols))
-
-
 #: Works that the methods of the participant level rest on.
 _CITED = ("method", "shapedna", "brainprint", "tetgen", "pybids")
 

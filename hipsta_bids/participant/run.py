@@ -395,7 +395,8 @@ def _prepare(
         digest = dataset.settle_settings(out_dir, settings)
         dataset.write_description(out_dir, sources)
         if options.shard is None or not (out_dir / DATASET_FILES["citation"]).exists():
-            dataset.write_citation(out_dir, settings, [protocols[k] for k in sorted(protocols)])
+            text = dataset.citation_text(settings, [protocols[k] for k in sorted(protocols)])
+            files.write_text(out_dir / DATASET_FILES["citation"], text)
         write_sidecar(out_dir)
         write_shared(out_dir)
     memory = options.mem_gb and options.mem_gb / n_workers(options, len(items))

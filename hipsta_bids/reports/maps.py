@@ -90,14 +90,17 @@ def _own_settings() -> Iterator[None]:
 class Picture:
     """A figure in a page."""
 
-    address: str
-    """Data address."""
+    content: bytes
+    """The drawing, SVG."""
     alt: str
     caption: str
     width: int
     """CSS pixels at which its letters have their size."""
-    content: bytes = b""
-    """The drawing, where it was made before."""
+
+    @property
+    def address(self) -> str:
+        """Data address."""
+        return "data:image/svg+xml;base64," + base64.b64encode(self.content).decode()
 
 
 def draw_map(kind: MapKind, hemispheres: Sequence[Hemisphere]) -> Picture:
@@ -169,13 +172,8 @@ def picture_of_file(path: Path, *, alt: str, caption: str) -> Picture:
     """Embed a drawing that was made before."""
     content = path.read_bytes()
     width = re.search(rb'<svg[^>]*? width="([\d.]+)pt"', content)
-    return Picture(
-        address="data:image/svg+xml;base64," + base64.b64encode(content).decode(),
-        alt=alt,
-        caption=caption,
-        width=round(float(width[1]) / 0.75) if width else 800,
-        content=content,
-    )
+    pixels = round(float(width[1]) / 0.75) if width else 800
+    return Picture(content=content, alt=alt, caption=caption, width=pixels)
 
 
 def _new_figure(rows: int, columns: int, size: tuple[float, float]) -> tuple["Figure", Any]:
@@ -194,12 +192,8 @@ def _encode(figure: "Figure", *, alt: str, caption: str) -> Picture:
     # The same results give the same bytes.
     with rc_context(_STYLE):
         figure.savefig(buffer, format="svg", metadata={"Date": None}, dpi=150)
-    return Picture(
-        address="data:image/svg+xml;base64," + base64.b64encode(buffer.getvalue()).decode(),
-        alt=alt,
-        caption=caption,
-        width=round(figure.get_figwidth() * 96),
-    )
+    width = round(figure.get_figwidth() * 96)
+    return Picture(content=buffer.getvalue(), alt=alt, caption=caption, width=width)
 
 
 def draw_sheet(

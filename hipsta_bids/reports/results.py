@@ -104,11 +104,13 @@ class SheetTable:
         """Rows of the ends of the body that lie on the sheet, not at its edge."""
         return [row for row in self.ends or () if 0 < row < self.shape[1] - 1]
 
-    @property
-    def shown_rows(self) -> NDArray[np.intp]:
-        """Rows that are worth a picture: on a sheet with a head those of which half has values."""
-        covered = self.valid.mean(axis=0) >= _HALF
-        return np.flatnonzero(covered | (self.ends is None))
+    def rows_at(self, shares: Sequence[float]) -> list[int]:
+        """Choose rows by their share of the way from posterior to anterior.
+
+        On a sheet with a head, half of a row that is worth a picture has values.
+        """
+        rows = np.flatnonzero((self.valid.mean(axis=0) >= _HALF) | (self.ends is None)).tolist()
+        return [rows[round(share * (len(rows) - 1))] for share in shares]
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -309,10 +311,16 @@ class Views:
     """Which anatomical image is not shown and why, in one phrase."""
 
     @property
+    def body(self) -> Bool:
+        """(I, J, K) the mask, or without one the labels of the protocol."""
+        if self.mask is None and self.labels is not None:
+            return np.isin(self.labels, list(self.names))
+        return np.zeros((0, 0, 0), dtype=bool) if self.mask is None else self.mask
+
+    @property
     def shape(self) -> tuple[int, int, int]:
         """Numbers of voxels."""
-        array = self.mask if self.labels is None else self.labels
-        i, j, k = array.shape if array is not None else (0, 0, 0)
+        i, j, k = self.body.shape
         return i, j, k
 
     @property

@@ -106,15 +106,7 @@ class Verdict:
 def verdict_of(hemisphere: Hemisphere, reach: float = FLAG_REACH) -> Verdict:
     """Decide from the quality record, and from the tables where it lacks a consequence.
 
-    Parameters
-    ----------
-    hemisphere : Hemisphere
-    reach : float
-        Columns within this distance of a point are concerned, mm.
-
-    Returns
-    -------
-    Verdict
+    Columns within ``reach`` of a point, mm, are concerned.
     """
     if not hemisphere.measured:
         return Verdict(
