@@ -44,6 +44,8 @@ LAYERS = NODES | TABLES["layers"]
 #: Columns of the sheet table, in order.
 SHEET_COLUMNS = (*NODES, *POSITION, *(row.name for row in MAPS), *STATE)
 
+_SUMMARY_ROWS = {row.name: row for row in SUMMARY}
+
 #: What all of these tables are about, whatever the columns.
 _MEASURED_REGION = (
     "the sheet between the two end planes of the hippocampal body; head and tail are not measured"
@@ -138,16 +140,14 @@ def _write_sheet(result: ResultPlace, maps: HemisphereMaps, protocol: Protocol) 
 
 def _write_summary(result: ResultPlace, summary: Mapping[str, float]) -> None:
     """Write one row of summary measures: those of the catalog, then those of subfields."""
-    definitions = {row.name: _measure(row) for row in SUMMARY}
-    digits = {row.name: row.digits for row in SUMMARY}
-    definitions |= {name: _subfield_definition(name) for name in summary if name not in definitions}
-    columns = {
-        name: format_column(
-            np.array([summary.get(name, np.nan)]), digits.get(name, _MILLIMETER_DIGITS)
-        )
-        for name in definitions
-    }
-    _write_table(result, "summary", columns, definitions)
+    names = dict.fromkeys((*_SUMMARY_ROWS, *summary))
+    columns = {name: _summary_cell(name, summary.get(name, np.nan)) for name in names}
+    _write_table(result, "summary", columns, {name: _summary_definition(name) for name in names})
+
+
+def _summary_cell(name: str, value: float) -> list[str]:
+    row = _SUMMARY_ROWS.get(name)
+    return format_column(np.array([value]), row.digits if row else _MILLIMETER_DIGITS)
 
 
 def _write_profile(result: ResultPlace, maps: HemisphereMaps) -> None:
@@ -225,8 +225,10 @@ def _measure(row: Column, wording: str = "{}") -> dict[str, object]:
     }
 
 
-def _subfield_definition(column: str) -> dict[str, object]:
-    """Define a per-subfield column from its prefix; the rest of its name is the subfield."""
+def _summary_definition(column: str) -> dict[str, object]:
+    """Define a summary measure; the name of a subfield's begins with that of the measure."""
+    if column in _SUMMARY_ROWS:
+        return _measure(_SUMMARY_ROWS[column])
     for row in PER_SUBFIELD:
         if column.startswith(f"{row.name}_"):
             subfield = column.removeprefix(f"{row.name}_")
@@ -306,15 +308,12 @@ def write_spread(
         {**_numbers(NODES, maps["thickness"].shape), **nodes},
         describe_columns(NODES) | definitions,
     )
-    rows = {row.name: row for row in SUMMARY}
-    definitions = {}
-    columns = {}
+    columns, definitions = {}, {}
     for name, value in summary.items():
-        about = _measure(rows[name]) if name in rows else _subfield_definition(name)
+        about = _summary_definition(name)
         about["Description"] = wording.format(about["Description"])
-        digits = rows[name].digits if name in rows else _MILLIMETER_DIGITS
         definitions[spread_name(name)] = about
-        columns[spread_name(name)] = format_column(np.array([value]), digits)
+        columns[spread_name(name)] = _summary_cell(name, value)
     _write_table(result, "summaryuncertainty", columns, definitions)
     name, unit = spread_name("thickness"), "mm"
     content = gifti.shape_bytes(

@@ -103,9 +103,15 @@ def write_reports(plan: PagePlan, visits: Iterable[VisitKey]) -> Iterator[Hipsta
 
 
 @contextlib.contextmanager
-def reports_after(plan: PagePlan, visits: Sequence[VisitKey]) -> Generator[Pages]:
-    """Make pages when the block ends, also by an error; not when the user stops the run."""
+def reports_after(plan: PagePlan | None, visits: Sequence[VisitKey]) -> Generator[Pages]:
+    """Make pages when the block ends, also by an error; not when the user stops the run.
+
+    None are made without a plan.
+    """
     pages = Pages()
+    if plan is None:
+        yield pages
+        return
     try:
         yield pages
     except Exception:

@@ -6,7 +6,6 @@ import math
 import time
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator, Sequence
-from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from os import getpid
@@ -45,7 +44,7 @@ from hipsta_bids.participant.job import (
     run_job,
     warm_up,
 )
-from hipsta_bids.participant.pages import PagePlan, Pages, reports_after
+from hipsta_bids.participant.pages import PagePlan, reports_after
 from hipsta_bids.participant.pool import WorkerLost, WorkerPlan, run_jobs
 from hipsta_bids.settings import Settings
 from hipsta_bids.types import Status
@@ -328,6 +327,7 @@ def _run(
     shard = None if options.shard is None else options.shard.name
     outcomes: list[Outcome] = []
     copies: list[str] = []
+    visits = [(job.result.name.subject, job.result.name.session) for job in jobs]
     with log_file(out_dir, options.verbosity, shard) as log:
         _LOGGER.info("hipsta_bids %s, %d hemispheres", __version__, len(jobs))
         if options.command:
@@ -335,9 +335,17 @@ def _run(
         for note in options.notes:
             _LOGGER.info("note: %s", note)
         table = StatusTable(out_dir, shard)
+        plan = PagePlan(
+            root=out_dir,
+            n_workers=n_workers(options, len(visits)),
+            log=log,
+            bids_dir=options.anatomy,
+            cohort=options.shard is None,
+            cluster=options.cluster,
+        )
         # Closed at once, whatever ends the loop, so that no worker outlives it.
         with (
-            _pages_after(jobs, out_dir, options, log) as pages,
+            reports_after(plan if options.reports else None, visits) as pages,
             contextlib.closing(table),
             contextlib.closing(outcomes_of(jobs, table, options, log)) as results,
         ):
@@ -423,24 +431,6 @@ def _prepare(
         )
         for item in items
     ]
-
-
-def _pages_after(
-    jobs: Sequence[Job], out_dir: Path, options: RunOptions, log: Path
-) -> AbstractContextManager[Pages]:
-    """Make pages when a block ends, if they are wanted; that of all if this is no part."""
-    if not options.reports:
-        return contextlib.nullcontext(Pages())
-    visits = [(job.result.name.subject, job.result.name.session) for job in jobs]
-    plan = PagePlan(
-        root=out_dir,
-        n_workers=n_workers(options, len(visits)),
-        log=log,
-        bids_dir=options.anatomy,
-        cohort=options.shard is None,
-        cluster=options.cluster,
-    )
-    return reports_after(plan, visits)
 
 
 def n_workers(options: RunOptions, n_jobs: int) -> int:
