@@ -7,7 +7,7 @@ import resource
 import sys
 import time
 import traceback
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,9 +20,9 @@ from hipsta_bids.derivatives import hemisphere
 from hipsta_bids.derivatives.dataset import source_address
 from hipsta_bids.derivatives.hemisphere import ResultPlace, read_record
 from hipsta_bids.errors import GeometryError, HipstaError, InputError, OutputError, ProtocolError
+from hipsta_bids.geometry.sampling import Regions
 from hipsta_bids.inputs.scan import HemisphereInput
 from hipsta_bids.io import files
-from hipsta_bids.io.files import locked
 from hipsta_bids.participant.maps import (
     Mapped,
     add_signals,
@@ -270,7 +270,7 @@ def run_job(job: Job) -> Outcome:
     If another run is doing the same, its results are awaited and taken.
     """
     try:
-        with locked(job.result.root, job.title):
+        with files.locked(job.result.root, job.title):
             return finished(job) or _measure(job)
     except OutputError as error:
         return fail(job, error)
@@ -310,20 +310,13 @@ def _measure(job: Job) -> Outcome:
                 maps = replace(maps, qc={**maps.qc, **spread.metrics})
                 record["notes"] = [*record["notes"], *spread.notes]
         with clock("write"):
-            region = for_region(job.item.protocol, job.settings.body.region)
-
-            def write_more() -> None:
-                """Write what options asked for."""
-                write_signals(job.result, maps, mapped, regions)
-                _write_more(job.result, maps, spread)
-
             hemisphere.write_results(
                 job.result,
                 maps,
-                region,
+                for_region(job.item.protocol, job.settings.body.region),
                 record,
                 write_meshes=job.write_meshes,
-                write_more=write_more,
+                write_more=lambda: _write_more(job.result, maps, mapped, regions, spread),
             )
     except Exception as error:  # noqa: BLE001  (one hemisphere's bug must not end the others)
         explained = _explain(error, job.result.root)
@@ -344,8 +337,15 @@ def _measure(job: Job) -> Outcome:
     )
 
 
-def _write_more(result: ResultPlace, maps: HemisphereMaps, spread: "Uncertainty | None") -> None:
-    """Write maps of sheets with a head, and SDs."""
+def _write_more(
+    result: ResultPlace,
+    maps: HemisphereMaps,
+    mapped: Sequence[Mapped],
+    regions: Regions | None,
+    spread: "Uncertainty | None",
+) -> None:
+    """Write what options asked for."""
+    write_signals(result, maps, mapped, regions)
     for name in maps.maps.keys() & {"distortion", "proximodistal"}:
         from hipsta_bids.io import gifti  # noqa: PLC0415  (workers only)
 

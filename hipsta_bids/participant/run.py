@@ -32,7 +32,6 @@ from hipsta_bids.derivatives.names import DATASET_FILES, HemisphereName, write_s
 from hipsta_bids.errors import ExitCode, HipstaError, InputError, OutputError, ProtocolError
 from hipsta_bids.inputs.scan import HemisphereInput
 from hipsta_bids.io import files
-from hipsta_bids.io.files import DATASET, locked
 from hipsta_bids.participant.cluster import Cluster, Shard, run_on_cluster
 from hipsta_bids.participant.job import (
     INTERNAL,
@@ -397,7 +396,7 @@ def _prepare(
     protocols = {protocol.name: protocol for protocol in used_protocols}
     dataset.check_own_dataset(out_dir)
     files.check_writable(out_dir)
-    with locked(out_dir, DATASET) as is_only_run:
+    with files.locked(out_dir, files.DATASET) as is_only_run:
         if is_only_run:
             files.remove_leftovers(out_dir, "*")
         digest = dataset.settle_settings(out_dir, settings)
@@ -487,7 +486,7 @@ def _measured(
 def _remove_unfinished(job: Job) -> None:
     """Remove what was being written: it has no quality record yet."""
     if job.result.path("sheet").exists() and not job.result.path("qc").exists():
-        with locked(job.result.root, job.title):
+        with files.locked(job.result.root, job.title):
             if not job.result.path("qc").exists():  # another run may have been at it
                 hemisphere.remove_results(job.result)
 
@@ -506,5 +505,5 @@ def _lost(job: Job, loss: WorkerLost, options: RunOptions) -> Outcome:
             reason="worker-died",
         )
     # Another run may have been at it, and for that one it may have gone well.
-    with locked(job.result.root, job.title):
+    with files.locked(job.result.root, job.title):
         return finished(job) or fail(job, error, seconds=loss.seconds)
