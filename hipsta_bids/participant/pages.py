@@ -134,7 +134,7 @@ def _try_all(plan: PagePlan, visits: Sequence[VisitKey], problems: list[str]) ->
     if not stale and (not plan.cohort or _is_newer(root / _COHORT, root, *_RECORDS)):
         return
     try:
-        problems += map(str, write_reports(plan, stale))
+        problems += [str(problem) for problem in write_reports(plan, stale)]
     except Exception as error:  # results are worth more than pages
         _LOGGER.exception("report")
         problems.append(f"not made ({type(error).__name__}: {error})")

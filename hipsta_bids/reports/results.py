@@ -320,7 +320,7 @@ class Views:
     @property
     def shape(self) -> tuple[int, int, int]:
         """Numbers of voxels."""
-        i, j, k = self.body.shape
+        i, j, k = (self.body if self.labels is None else self.labels).shape
         return i, j, k
 
     @property
