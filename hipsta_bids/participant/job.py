@@ -7,7 +7,7 @@ import resource
 import sys
 import time
 import traceback
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,9 +20,9 @@ from hipsta_bids.derivatives import hemisphere
 from hipsta_bids.derivatives.dataset import source_address
 from hipsta_bids.derivatives.hemisphere import ResultPlace, read_record
 from hipsta_bids.errors import GeometryError, HipstaError, InputError, OutputError, ProtocolError
+from hipsta_bids.geometry.sampling import Regions
 from hipsta_bids.inputs.scan import HemisphereInput
 from hipsta_bids.io import files
-from hipsta_bids.io.files import locked
 from hipsta_bids.participant.maps import (
     Mapped,
     add_signals,
@@ -270,7 +270,7 @@ def run_job(job: Job) -> Outcome:
     If another run is doing the same, its results are awaited and taken.
     """
     try:
-        with locked(job.result.root, job.title):
+        with files.locked(job.result.root, job.title):
             return finished(job) or _measure(job)
     except OutputError as error:
         return fail(job, error)
@@ -291,11 +291,14 @@ def _measure(job: Job) -> Outcome:
             record |= {"input_hash": hashed} | entries
             volume = read_label_volume(job.item, job.settings.body.region)
         maps = measure_hemisphere(volume, job.item.hemi, job.settings, clock)
-        mapped = Mapped()
+        mapped: list[Mapped] = []
+        regions = None
         if job.item.maps or job.item.regions:
             with clock("maps"):
-                maps, mapped = add_signals(job.item, maps, job.settings.maps, dict(job.sources))
-                record |= mapped.record
+                maps, mapped, regions, entries = add_signals(
+                    job.item, maps, job.settings.maps, dict(job.sources)
+                )
+                record |= entries
         spread = None
         if job.copies:
             from hipsta_bids.participant import uncertainty  # noqa: PLC0415  (heavy)
@@ -313,7 +316,7 @@ def _measure(job: Job) -> Outcome:
                 for_region(job.item.protocol, job.settings.body.region),
                 record,
                 write_meshes=job.write_meshes,
-                write_more=lambda: _write_more(job.result, maps, mapped, spread),
+                write_more=lambda: _write_more(job.result, maps, mapped, regions, spread),
             )
     except Exception as error:  # noqa: BLE001  (one hemisphere's bug must not end the others)
         explained = _explain(error, job.result.root)
@@ -335,10 +338,14 @@ def _measure(job: Job) -> Outcome:
 
 
 def _write_more(
-    result: ResultPlace, maps: HemisphereMaps, mapped: Mapped, spread: "Uncertainty | None"
+    result: ResultPlace,
+    maps: HemisphereMaps,
+    mapped: Sequence[Mapped],
+    regions: Regions | None,
+    spread: "Uncertainty | None",
 ) -> None:
     """Write what options asked for."""
-    write_signals(result, maps, mapped)
+    write_signals(result, maps, mapped, regions)
     for name in maps.maps.keys() & {"distortion", "proximodistal"}:
         from hipsta_bids.io import gifti  # noqa: PLC0415  (workers only)
 

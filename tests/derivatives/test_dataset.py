@@ -199,10 +199,9 @@ def test_sources_get_distinct_names(tmp_path):
     assert dataset.source_address(tmp_path / "c", names) == str(tmp_path / "c")
 
 
-def test_citation_states_settings_and_protocols(tmp_path):
+def test_citation_states_settings_and_protocols():
     settings = Settings(body=BodySettings(layer_rule="nearest-label"))
-    dataset.write_citation(tmp_path, settings, [make_scheme()])
-    text = (tmp_path / "CITATION.md").read_text()
+    text = dataset.citation_text(settings, [make_scheme()])
     assert f"hipsta_bids {__version__}" in text
     assert "the dentate gyrus and CA4 included" in text
     assert "`body.layer_rule`: nearest-label" in text

@@ -21,8 +21,7 @@ from hipsta_bids.inputs import ashs, freesurfer
 from hipsta_bids.inputs.maps import Found, check_pattern, fields_of, fill, find, scan
 from hipsta_bids.io import files
 from hipsta_bids.io.files import entities
-from hipsta_bids.io.gifti import DENSE_SCALARS, PointMap, cifti_sides, read_map
-from hipsta_bids.io.meshes import read_surface
+from hipsta_bids.io.gifti import DENSE_SCALARS, PointMap, cifti_sides, read_map, read_surface
 from hipsta_bids.types import Mesh, VisitKey
 
 
