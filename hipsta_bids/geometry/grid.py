@@ -201,7 +201,7 @@ def _motion(body: Body, end: End, inward: Float) -> tuple[Float, Float]:
     sigma = np.maximum(MOTION_SD / np.linalg.norm(body.affine[:3, :3], axis=0), 0.5)
     weight = ndimage.gaussian_filter(known, sigma)
     smooth = ndimage.gaussian_filter(known * mask, sigma) / np.maximum(weight, 1e-6)
-    slopes = np.stack(np.gradient(smooth), axis=-1).reshape(-1, 3)
+    slopes = np.stack([*np.gradient(smooth)], axis=-1).reshape(-1, 3)
     slopes = slopes @ np.linalg.inv(body.affine[:3, :3])
     used = (depth > body.ends.half_slice) & (depth < MOTION_REACH) & (slopes != 0).any(axis=1)
     slopes, depth, places = slopes[used], depth[used], places[used]
