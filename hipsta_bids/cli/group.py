@@ -2,6 +2,7 @@
 
 import argparse
 import os
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -124,8 +125,10 @@ def _add_sheets(parser: Parser) -> None:
     add("--exclude-flagged", "", "leave out hemispheres that the participant level flagged")
     add(
         "--exclude-qc",
-        "EXPRESSION",
-        "leave out by quality metrics, as 'filled_fraction > 0.01 or voxels_across < 3'",
+        "CONDITION...",
+        "leave out by quality metrics, as 'filled_fraction > 0.01' 'voxels_across < 3'; one that is"
+        " fulfilled is enough",
+        type=_condition,
     )
     add(
         "--exclude",
@@ -295,6 +298,17 @@ def _maybe_named(text: str) -> tuple[str | None, str]:
     return (name, pattern) if equals and name.isalnum() else (None, text)
 
 
+def _condition(text: str) -> tuple[str, str, float]:
+    """Read ``METRIC OPERATOR NUMBER``."""
+    number = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+    match = re.fullmatch(rf"\s*(\w+)\s*([<>]=?|[=!]=)\s*({number})\s*", text)
+    if match is None:
+        raise argparse.ArgumentTypeError(
+            f"{text[:80]!r} is not of the form 'filled_fraction > 0.01' (or >=, <, <=, ==, !=)"
+        )
+    return match[1], match[2], float(match[3])
+
+
 def _name(text: str) -> str:
     if not text.replace("-", "").replace("_", "").isalnum():
         raise argparse.ArgumentTypeError(f"{text!r} is not a name of letters, digits, - and _")
@@ -419,11 +433,9 @@ def _settings(parsed: argparse.Namespace) -> "GroupSettings":
 
 def _options(parsed: argparse.Namespace, arguments: Sequence[str]) -> "GroupOptions":
     from hipsta_bids.group.cohort.collect import GroupRequest  # noqa: PLC0415  (heavy)
-    from hipsta_bids.group.cohort.exclusions import QualityCondition  # noqa: PLC0415  (heavy)
     from hipsta_bids.group.design.model import Comparison, ModelRequest  # noqa: PLC0415  (heavy)
     from hipsta_bids.group.questions.study import GroupOptions  # noqa: PLC0415  (heavy)
 
-    condition = None if parsed.exclude_qc is None else QualityCondition(parsed.exclude_qc)
     sheets = from_namespace(
         GroupRequest,
         parsed,
@@ -431,7 +443,6 @@ def _options(parsed: argparse.Namespace, arguments: Sequence[str]) -> "GroupOpti
         subjects=tuple(parsed.participant_label),
         excluded=tuple(parsed.exclude_participant_label),
         sessions=tuple(parsed.session_label),
-        exclude_quality=condition,
         exclude_table=parsed.exclude,
     )
     model = from_namespace(

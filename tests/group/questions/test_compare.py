@@ -307,10 +307,12 @@ def test_left_out_hemispheres_are_listed_with_the_reason(tmp_path, quick):
         "--exclude",
         str(listed),
     ]
-    assert main([*arguments, "--exclude-qc", "filled_fraction > 0.05 and rule == 'labels'"]) == 0
+    conditions = ["filled_fraction > 0.05", "filled_fraction < 0"]
+    assert main([*arguments, "--exclude-qc", *conditions]) == 0
     folder = out / "group" / MODEL
     left_out = table(folder / "excluded.tsv")
     found = {(r.participant_id, r.hemi, r.reason, r.message) for r in left_out.itertuples()}
+    assert ("sub-03", "L", "quality", "filled_fraction > 0.05") in found
     assert ("sub-01", "L", "failed: too-thin", "2 voxels") in found
     assert ("sub-04", "R", "listed", "moved") in found
     assert {one[:2] for one in found if one[0] == "sub-05"} == {("sub-05", "L"), ("sub-05", "R")}
