@@ -210,7 +210,7 @@ def _add_methods(parser: Parser) -> None:
         "--align",
         "",
         "registration of curvature profiles (default: registr)",
-        choices=["registr", "penalized", "penalised", "none"],
+        choices=["registr", "none"],
     )
     add(
         "--template",
@@ -398,9 +398,8 @@ def _settings(parsed: argparse.Namespace) -> "GroupSettings":
     """Read the settings, and put those in that have an option of their own."""
     from hipsta_bids.group.design.settings import load_group_settings  # noqa: PLC0415  (start-up time)
 
-    align = parsed.align and parsed.align.replace("penalised", "penalized")
     choices = {
-        "registration": {"align": align},
+        "registration": {"align": parsed.align},
         "multiplicity": {
             "method": parsed.correction,
             "scope": parsed.fdr_scope,

@@ -49,7 +49,7 @@ def test_settings_are_printed_and_read_back(tmp_path, capsys):
 def test_options_and_settings_know_the_same_choices(option, group, name):
     (action,) = (a for a in group_parser()._actions if option in a.option_strings)
     known = get_args(type(dict(GroupSettings())[group]).model_fields[name].annotation)
-    assert set(action.choices) - {"penalised"} == set(known)
+    assert set(action.choices) == set(known)
 
 
 @pytest.mark.parametrize(

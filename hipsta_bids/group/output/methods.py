@@ -140,8 +140,6 @@ def _registration(
     if rules.align == "none":
         return "Maps were not registered to each other."
     method = f"alternating fits of a template and of monotone B-spline warps {cite('registr')}"
-    if rules.align == "penalized":
-        method += ", with a penalty on local stretch that was estimated from the data"
     shares = "; ".join(
         f"{hemi}: {side.registration.explained_before:.0%} to"
         f" {side.registration.explained_after:.0%}"
