@@ -230,13 +230,6 @@ def _add_methods(parser: Parser) -> None:
         " enough participants; with its --template",
     )
     add(
-        "--weights",
-        "",
-        "how much each map counts at a point: the same (none, the default), or by its SD as"
-        " estimated by --uncertainty of the participant level",
-        choices=["none", "uncertainty"],
-    )
-    add(
         "--correction",
         "",
         "for the number of points: false discovery rate (fdr2, the default; bh), or"
@@ -409,7 +402,6 @@ def _settings(parsed: argparse.Namespace) -> "GroupSettings":
         "model": {"age": parsed.age_model},
         "longitudinal": {"random": parsed.longitudinal},
         "harmonization": {"column": parsed.harmonize},
-        "glm": {"weights": parsed.weights},
         "classification": {
             "base": tuple(parsed.base) or None,
             "added": () if parsed.no_classification else None,

@@ -77,8 +77,10 @@ def test_conditions_can_be_given_by_several_options():
 
 @pytest.mark.parametrize(
     "text",
-    ["a", "a >", "a > b", "1 < a", "a > 1 or b < 2", "not a > 1", "a => 1", "a > 1e", "x\0"]
-    + ["open('x')", "a.b > 1", "a in [1]", "lambda: a", "1" + "+1" * 100_000],
+    [
+        *("a", "a >", "a > b", "1 < a", "a > 1 or b < 2", "not a > 1", "a => 1", "a > 1e", "x\0"),
+        *("open('x')", "a.b > 1", "a in [1]", "lambda: a", "1" + "+1" * 100_000),
+    ],
 )
 def test_other_conditions_are_refused(text):
     with pytest.raises(UsageError, match=r"--exclude-qc: .* is not of the form") as refusal:

@@ -105,10 +105,6 @@ class GlmSettings(toml.SettingsTable):
     covariance: Literal["ordinary", "hc3"] = "ordinary"
     """Of the coefficients: ``ordinary`` (equal variances) or ``hc3`` (any variances; MacKinnon and
     White 1985)."""
-    weights: Literal["none", "uncertainty"] = "none"
-    """``uncertainty``: maps count by 1 / (variance between participants + squared SD of the
-    measurement), from ``--uncertainty`` of the participant level, with HC3 standard errors; summary
-    measures are not weighted."""
     confidence: toml.OpenFraction = 0.95
     """Coverage of two-sided confidence limits, fraction."""
     min_residual_df: PositiveInt = 3

@@ -233,12 +233,6 @@ def _models(
     levels = ", ".join(f"{name} {level}" for name, level in analysis.design.references.items())
     errors = " with HC3 standard errors" if settings.glm.covariance == "hc3" else ""
     kind, subject, d = "linear model", "", "estimate over residual standard deviation"
-    if settings.glm.weights != "none":
-        errors = (
-            " by weighted least squares, with weights 1 / (variance between participants + squared"
-            f" standard deviation of the measurement), the former estimated by moments"
-            f" {cite('moments')}, and HC3 standard errors"
-        )
     if analysis.comparison.pair:
         first, second = analysis.comparison.pair
         subject = f" to the change from {first} to {second}, with the covariates of {first}"

@@ -111,7 +111,6 @@ def analyze_cohort(
     rows = make_rows(design)
     joint = bool(settings.joint.measures)
     inference.check_permutations(settings.multiplicity, settings.glm, joint=joint)
-    _check_weights(comparison, settings)
     sides = {
         hemi: register_side(cohort, hemi, groups=groups, settings=settings, templates=templates)
         for hemi in each("registration", list(cohort.sides) if measures.maps else [])
@@ -216,23 +215,6 @@ def analyze_points(
     )
 
 
-def _check_weights(comparison: designs.Comparison, settings: GroupSettings) -> None:
-    """Refuse weights where there is no rule for them."""
-    excluded_by = {
-        "--longitudinal": comparison.longitudinal,
-        "--paired": comparison.pair,
-        "--asymmetry": comparison.asymmetry,
-        "--normative": comparison.normative,
-        "permutations": settings.multiplicity.method in inference.PERMUTATIONS,
-        "--joint": settings.joint.measures,
-    }
-    wrong = [name for name, given in excluded_by.items() if given]
-    if settings.glm.weights != "none" and wrong:
-        raise ModelError(
-            f"--weights {settings.glm.weights}: not together with {', '.join(wrong)}; leave one out"
-        )
-
-
 def _fit_cohort(
     cohort: data.Cohort,
     *,
@@ -318,7 +300,7 @@ def register_side(
 def _register_maps(side: arrays.SideMaps, warps: arrays.Float, rims: bool) -> arrays.SideMaps:
     """Carry all maps of sheets; a point beside ``rims`` that came to be known of few is none."""
     is_small = len(warps) <= arrays.MOST_KEPT
-    maps, errors = (arrays.WarpedMaps(one, warps, warp_values) for one in (side.maps, side.errors))
+    maps = arrays.WarpedMaps(side.maps, warps, warp_values)
     labels = arrays.WarpedLabels(side.subfield[:], warps, warp_labels)
     registered = dict(maps) if is_small or rims else maps
     for values in registered.values() if rims else ():
@@ -326,7 +308,6 @@ def _register_maps(side: arrays.SideMaps, warps: arrays.Float, rims: bool) -> ar
     return replace(
         side,
         maps=registered,
-        errors=dict(errors) if is_small else errors,
         subfield=labels[:] if is_small else labels,
     )
 
@@ -338,8 +319,7 @@ def unequal_spread(analysis: results.Analysis, settings: GlmSettings) -> Iterato
     """
     groups, worst = analysis.groups, dict[str, tuple[float, str]]()
     named = groups is not None and groups.column in closed_formula(analysis.model.formula).names
-    ordinary = (settings.covariance, settings.weights) == ("ordinary", "none")
-    if not (named and ordinary) or analysis.comparison.longitudinal:
+    if not named or settings.covariance != "ordinary" or analysis.comparison.longitudinal:
         return
     for hemi, fitted in analysis.fitted.items():
         members = results.members_of(analysis, results.rows_of(analysis, fitted))

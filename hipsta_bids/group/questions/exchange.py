@@ -302,8 +302,8 @@ def _check_model(analysis: Analysis, settings: GroupSettings) -> None:
         problem = "of --longitudinal cannot be combined; use --paired"
     elif analysis.harmonization is not None:
         problem = "of harmonized values cannot be combined; leave --harmonize out"
-    elif settings.glm.covariance != "ordinary" or settings.glm.weights != "none":
-        problem = "with HC3 standard errors or weights cannot be combined; leave these out"
+    elif settings.glm.covariance != "ordinary":
+        problem = "with HC3 standard errors cannot be combined; leave these out"
     elif match := _OF_THE_SAMPLE.search(analysis.model.formula):
         problem = (
             f"with {match[1]}() has other columns at each site; write numbers that are the same"

@@ -293,7 +293,7 @@ def harmonize_cohort(
     sides, unknown = {}, set()
     for hemi, side in cohort.sides.items():
         visits = plan.visits.take(side.rows)
-        changed, errors = dict(side.maps), dict(side.errors)
+        changed = dict(side.maps)
         for measure in measures.maps:
             values = side.maps[measure].reshape(len(side.rows), -1)
             effects = _effects(values, visits, plan, settings, (hemi, measure))
@@ -301,9 +301,6 @@ def harmonize_cohort(
             changed[measure] = combat.harmonize(values, visits, effects[0]).reshape(
                 side.maps[measure].shape
             )
-            if measure in errors:
-                scale = effects[0].scale[visits.site].reshape(errors[measure].shape)
-                errors[measure] = errors[measure] / scale
         summary = side.summary.astype(np.float64)
         for name in summary.columns:
             values = summary[[name]].to_numpy()
@@ -319,7 +316,7 @@ def harmonize_cohort(
                 )
                 summaries[hemi, name] = effects
                 summary[name] = combat.harmonize(values, visits_of_map, effects[0])[:, 0]
-        sides[hemi] = replace(side, maps=changed, errors=errors, summary=summary)
+        sides[hemi] = replace(side, maps=changed, summary=summary)
     return Harmonization(
         plan=plan,
         cohort=replace(cohort, sides=sides),

@@ -11,7 +11,7 @@ import pandas as pd
 from hipsta_bids import __version__
 from hipsta_bids.derivatives import dataset
 from hipsta_bids.derivatives.names import group_report
-from hipsta_bids.errors import InputError, ModelError
+from hipsta_bids.errors import ModelError
 from hipsta_bids.group.cohort import collect, external, read
 from hipsta_bids.group.cohort.covariates import add_icv, add_time, read_covariates
 from hipsta_bids.group.cohort.data import SHEET, Cohort, Measures, choose_visits
@@ -30,13 +30,6 @@ from hipsta_bids.progress import each, tell
 from hipsta_bids.protocols.toml import resolve
 from hipsta_bids.reports.group import write_group_report
 from hipsta_bids.types import PARTICIPANT
-
-#: Squared SDs are averaged over this many nodes along both axes, odd: from 8 copies, each is
-#: known to a third only.
-#: Squared SDs are averaged over this many nodes along both axes, odd: from 8 copies, each is
-#: known to a third only.
-ERROR_WINDOW = 5
-
 
 #: Hemispheres that notes name.
 _MOST_NOTES = 4
@@ -236,7 +229,6 @@ def _read_maps(
     rules: GroupSettings,
 ) -> tuple[read.Measured, dict[str, Cohort], list[str]]:
     """Read the maps that are asked for, of the sheets and of other programs."""
-    error_window = 0 if rules.glm.weights == "none" else ERROR_WINDOW
     requested = [one for one in requests if one.name in measures.maps]
     files_of, visits = external.find_all(
         requested,
@@ -246,19 +238,12 @@ def _read_maps(
     )
     names = {one.name for one in requests}
     sheet_maps = [name for name in measures.maps if name not in names]
-    if error_window and requested:
-        names_of = ", ".join(one.name for one in requested)
-        raise InputError(
-            f"--weights uncertainty: there are no SDs of {names_of}; leave --maps or the"
-            " weights out"
-        )
     measured = read.read_sheets(
         collection.records,
         collection.grid,
         sheet_maps,
         visits,
         max_gap=rules.registration.max_gap,
-        error_window=error_window,
     )
     return external.add_external(measured, files_of, visits)
 
