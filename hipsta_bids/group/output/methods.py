@@ -12,7 +12,7 @@ from hipsta_bids.derivatives.dataset import references
 from hipsta_bids.group.cohort.data import Cohort
 from hipsta_bids.group.cohort.read import LEAST_SHARE
 from hipsta_bids.group.design import settings as group_settings
-from hipsta_bids.group.output.results import Analysis, RetestCohort, Scores
+from hipsta_bids.group.output.results import Analysis, Scores
 from hipsta_bids.group.output.saved import NormsFile
 from hipsta_bids.group.stats.clusters import TFCE_EXTENT, TFCE_HEIGHT
 from hipsta_bids.group.stats.exchangeability import exchange_text
@@ -515,11 +515,11 @@ def power_text(
 
 
 def retest_text(
-    retest: RetestCohort, settings: group_settings.RetestSettings, cite: Callable[[str], str]
+    sessions: int, participants: int, settings: group_settings.RetestSettings, cite: Cite
 ) -> str:
     """Word how agreement was measured."""
     return (
-        f"Agreement between {len(retest.sessions)} sessions of {len(retest.participants)}"
+        f"Agreement between {sessions} sessions of {participants}"
         " participants was estimated at each point of the maps and for each summary measure. The"
         " within-subject standard deviation is the root of the mean variance of a participant's"
         f" values {cite('bland')}; a change beyond 1.96 √2 times this is unlikely to be measurement"

@@ -24,7 +24,7 @@ from hipsta_bids.group.stats.glm import FittedMaps, PointTest, PointwiseFit, Row
 from hipsta_bids.group.stats.inference import Discoveries, MapKey
 from hipsta_bids.group.stats.norms import NormativeScores
 from hipsta_bids.io.files import as_nested
-from hipsta_bids.types import PARTICIPANT, SESSION
+from hipsta_bids.types import PARTICIPANT
 
 #: Group of all, where there are no groups.
 ALL = "all"
@@ -269,24 +269,3 @@ def effects_of(parts: Sequence[Harmonization], templates: Mapping[str, str]) -> 
 def _of_kind(kind: str, parts: Sequence[Harmonization]) -> dict[tuple[str, str], SiteEffects]:
     pairs = (pair for part in parts for pair in part.effects.items())
     return {key[1:]: effects for key, (effects, _) in pairs if key[0] == kind}
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class RetestCohort:
-    """Participants who have all sessions."""
-
-    cohort: data.Cohort
-    """Their visits."""
-    participants: tuple[str, ...]
-    sessions: tuple[str, ...]
-    left_out: Mapping[str, str]
-    """By visit, what is missing."""
-
-    def arrange(self, values: Float, rows: Int) -> Float:
-        """Arrange values of visits as (participants, sessions, points); NaN where missing."""
-        visits = self.cohort.table.iloc[rows]
-        filled = np.full((len(self.participants), len(self.sessions), values.shape[1]), np.nan)
-        participant = np.searchsorted(self.participants, visits[PARTICIPANT].astype(str))
-        session = np.searchsorted(self.sessions, visits[SESSION].astype(str))
-        filled[participant, session] = values
-        return filled

@@ -254,8 +254,12 @@ def test_the_page_is_named_unless_it_could_not_be_made(tmp_path, monkeypatch, pr
     given = study.GroupOptions(
         bids_dir=tmp_path, out_dir=tmp_path, sheets=sheets, model=ModelRequest()
     )
+    written = study.GroupResult(
+        folder=tmp_path / "group" / "kept", n_participants=2, n_excluded=0, notes=(), warnings=()
+    )
+    result = study.with_page(given, written)
     page = tmp_path / "group" / "kept.html"
-    assert study.make_page(given, "kept") == (None if problem else page, problem)
+    assert (result.page, result.problem) == (None if problem else page, problem)
 
 
 def test_flagged_hemispheres_are_told(dataset, quick, capsys):
