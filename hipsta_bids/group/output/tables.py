@@ -414,8 +414,7 @@ def joint_peaks(joint: Sequence[JointMap], neighbors: int) -> pd.DataFrame:
             joint_map.test.statistic,
         )
         edges = edges_of(joint_map.fitted.maps, neighbors)
-        for cluster in find_clusters(joint_map.found.rejected, z, frame.subfield, edges):
-            at = cluster.peak
+        for at, cluster in find_clusters(joint_map.found.rejected, z, frame.subfield, edges):
             words = [
                 f"{title} {cells.effect_name(_EFFECTS[test.kind])}"
                 f" {cells.number_text(test.effect[at])},"
@@ -432,7 +431,7 @@ def joint_peaks(joint: Sequence[JointMap], neighbors: int) -> pd.DataFrame:
                     "statistic": z[at],
                     "p": joint_map.test.p_uncorrected[at],
                     "p_corrected": joint_map.found.adjusted[at],
-                    **cluster.columns,
+                    **cluster,
                     "measures": "; ".join(words),
                 }
             )
