@@ -246,7 +246,7 @@ def _models(
         )
         d = "estimate over the standard deviation of single visits"
     corrected = _correction(settings.multiplicity, cite, analysis)
-    adjusted = any(one.formula != analysis.model.formula for one in analysis.measures)
+    adjusted = any(formula != analysis.model.formula for _, formula in analysis.measures)
     volumes = ", volumes also with intracranial volume" if adjusted else ""
     return (
         f"At each point of the sheet a {kind} `{analysis.model.formula}` was"
@@ -282,7 +282,10 @@ def _nonlinear(analysis: Analysis, settings: group_settings.GroupSettings) -> st
         return ""
     curve = "its square" if settings.model.age == "quadratic" else "a natural cubic spline"
     p = [
-        test.p for one in analysis.measures for test in one.fit.tests if test.contrast.name in names
+        test.p
+        for _, fit, _ in analysis.measures.values()
+        for test in fit.tests
+        if test.contrast.name in names
     ]
     result = control_fdr(np.concatenate(p or [np.empty(0)]), settings.multiplicity.alpha)
     return (

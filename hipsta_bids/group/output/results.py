@@ -120,19 +120,6 @@ class Scores:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class MeasureFit:
-    """One model of summary measures; the points of the fit are measures."""
-
-    hemi: str
-    """``L``, ``R``, or ``LR`` for the mean of both."""
-    measures: tuple[str, ...]
-    formula: str
-    fit: PointwiseFit
-    participants: Int
-    """(measures,) with a value; the fit counts visits."""
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
 class SideResult:
     """Sheets of one hemisphere, registered."""
 
@@ -178,7 +165,9 @@ class Analysis:
     which are too slow to do twice, and with harmonization from a file."""
     scores: Scores | None
     """Scores of participants against a reference group, if there is one."""
-    measures: Sequence[MeasureFit]
+    measures: Mapping[tuple[str, str], tuple[Sequence[str], PointwiseFit, Int]]
+    """Of summary measures, by side (``LR`` for the mean of both) and formula: names, their fits as
+    points, and participants with a value; a fit counts visits."""
     pairs: Sequence[tuple[str, str, tuple[str, str], ModelComparison]]
     """Hemisphere, added measure, control and case, and result."""
     skipped: Sequence[str]

@@ -169,17 +169,17 @@ def overview_table(discoveries: Mapping[MapKey, Discoveries]) -> pd.DataFrame:
 
 
 def _measures(cohort: Cohort, analysis: results.Analysis) -> Iterator[Columns]:
-    for fit in analysis.measures:
-        for test in fit.fit.tests:
+    for (hemi, formula), (names, fit, participants) in analysis.measures.items():
+        for test in fit.tests:
             yield {
-                "hemi": fit.hemi,
-                "measure": fit.measures,
-                "unit": [cohort.units.get(name, "1") for name in fit.measures],
-                "model": fit.formula,
+                "hemi": hemi,
+                "measure": names,
+                "unit": [cohort.units.get(name, "1") for name in names],
+                "model": formula,
                 "contrast": test.contrast.name,
                 "test": test.kind,
-                "n": fit.participants,
-                "visits": fit.fit.n,
+                "n": participants,
+                "visits": fit.n,
                 **columns.test_columns(test),
                 "p_fdr": np.nan,
                 **columns.effect_columns(test),

@@ -208,7 +208,7 @@ def analyze_points(
         fitted=fitted,
         found=discoveries,
         unregistered={},
-        measures=(),
+        measures={},
         pairs=(),
         scores=scores,
         skipped=(),
