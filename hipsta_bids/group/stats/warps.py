@@ -250,15 +250,6 @@ class WarpBasis:
         return np.where((steps > least).all(axis=1)[:, None], parameters, lifted)
 
 
-@dataclass(frozen=True)
-class _State:
-    slopes: Float
-    residuals: Float
-    along: Float
-    """Slopes of the curves there."""
-    loss: Float
-
-
 def fit_warps(
     profiles: Float, knots: Float, coefficients: Float, basis: WarpBasis, parameters: Float
 ) -> tuple[Float, Float]:
@@ -286,20 +277,19 @@ def _fit_block(
     damping = np.full(len(profiles), _DAMPING)
     for _ in range(WARP_STEPS):
         curves = coefficients[active]
-        state = _evaluate(best[active], profiles[active], knots, curves, basis)
-        jacobian = state.along[:, :, None] * state.slopes
+        loss, residuals, jacobian = _evaluate(best[active], profiles[active], knots, curves, basis)
         matrix = np.swapaxes(jacobian, 1, 2) @ jacobian
-        right = np.einsum("sdi,sd->si", jacobian, state.residuals)
+        right = np.einsum("sdi,sd->si", jacobian, residuals)
         size = np.maximum(np.trace(matrix, axis1=1, axis2=2), _LEAST_DAMPING)
         ridge = size[:, None, None] * (level + damping[active, None, None] * np.eye(len(level)))
         step = np.linalg.solve(matrix + ridge, right[:, :, None])[:, :, 0]
-        trial = _evaluate(best[active] + step, profiles[active], knots, curves, basis)
-        gained = state.loss - trial.loss
+        trial = best[active] + step
+        gained = loss - _evaluate(trial, profiles[active], knots, curves, basis)[0]
         better = gained > 0
-        best[active[better]] = (best[active] + step)[better]
+        best[active[better]] = trial[better]
         eased = np.maximum(damping[active] / _FACTOR, _LEAST_DAMPING)
         damping[active] = np.where(better, eased, damping[active] * _FACTOR)
-        is_settled = better & (gained < WARP_TOLERANCE * state.loss)
+        is_settled = better & (gained < WARP_TOLERANCE * loss)
         active = active[~is_settled & (damping[active] < _MOST_DAMPING)]
         if not len(active):
             break
@@ -308,11 +298,12 @@ def _fit_block(
 
 def _evaluate(
     parameters: Float, profiles: Float, knots: Float, coefficients: Float, basis: WarpBasis
-) -> _State:
+) -> tuple[Float, Float, Float]:
+    """Loss (subjects,), residuals (subjects, nodes), and slopes (subjects, nodes, steps)."""
     warps, slopes = basis.evaluate(parameters)
     expected, along = _along(knots, coefficients, warps)
     residuals = profiles - expected
-    return _State(slopes, residuals, along, 0.5 * np.sum(residuals**2, axis=1))
+    return 0.5 * np.sum(residuals**2, axis=1), residuals, along[:, :, None] * slopes
 
 
 def warp_values(maps: Float, warps: Float) -> Float:
