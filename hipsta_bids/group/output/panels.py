@@ -108,15 +108,15 @@ def draw_measure(
     blocks = [[row] for row in _means(cohort, analysis, sides, measure)]
     tests = {h: {m: fit.tests for m, fit in a.fits.items()} for h, a in analysis.fitted.items()}
     blocks += contrasts(tests, analysis.found, measure)
-    return draw_pages(cohort, sides, shapes, views, blocks)
+    return draw_pages(cohort, sides, blocks, shapes, views)
 
 
 def draw_pages(
     cohort: Cohort,
     sides: Mapping[str, FittedMaps],
-    shapes: Mapping[str, AverageShape],
-    views: Views,
     blocks: Sequence[list[Row]],
+    shapes: Mapping[str, AverageShape] | None = None,
+    views: Views | None = None,
 ) -> "list[Figure]":
     """Draw rows, of which those of a block are on the same figure."""
     pages: list[list[Row]] = [[]]
@@ -124,7 +124,8 @@ def draw_pages(
         if len(pages[-1]) + len(block) > _MOST_ROWS:
             pages.append([])
         pages[-1] += block
-    return [draw_rows(cohort, sides, shapes, rows, views) for rows in pages]
+    shapes, views = shapes or {}, {} if views is None else views
+    return [_draw_rows(cohort, sides, rows, shapes, views) for rows in pages]
 
 
 def _means(
@@ -183,18 +184,11 @@ def contrasts(
     contrasts of which other functions take these.
     """
     tests = {hemi: own[measure] for hemi, own in every_test.items() if measure in own}
-    sides = list(tests)
-    found = {
-        (test.contrast.name, hemi): discoveries[MapKey(measure, test.contrast.name, hemi)]
-        for hemi, own in tests.items()
-        for test in own
-    }
     signed = {
-        (test.contrast.name, hemi): signed_logarithm(
-            found[test.contrast.name, hemi].adjusted, test.statistic
-        )
+        key: signed_logarithm(discoveries[key].adjusted, test.statistic)
         for hemi, own in tests.items()
         for test in own
+        for key in [MapKey(measure, test.contrast.name, hemi)]
     }
     top = display.significance_reach(list(signed.values()))
     for index, test in enumerate(next(iter(tests.values()))):
@@ -208,8 +202,9 @@ def contrasts(
         ]
         reach = display.effect_reach(scales)
         low, colors, p_colors = display.effect_colors(test.kind)
-        survive = {hemi: found[name, hemi].rejected for hemi in sides}
-        tested = {hemi: int(np.isfinite(found[name, hemi].adjusted).sum()) for hemi in sides}
+        found = {hemi: discoveries[MapKey(measure, name, hemi)] for hemi in tests}
+        survive = {hemi: one.rejected for hemi, one in found.items()}
+        tested = {hemi: int(np.isfinite(one.adjusted).sum()) for hemi, one in found.items()}
         uniform = len(set(tested.values())) == 1
         counts = ", ".join(
             f"{int(own.sum())} {'' if uniform else f'of {tested[hemi]} '}{SIDES[hemi]}"
@@ -232,9 +227,9 @@ def contrasts(
                 title=f"Significant: {counts}",
                 label="corrected p" + (", signed" if low else ""),
                 scale={"cmap": p_colors, "vmin": low * top, "vmax": top},
-                values={hemi: signed[name, hemi] for hemi in sides},
+                values={hemi: signed[MapKey(measure, name, hemi)] for hemi in tests},
                 survive=survive,
-                level=found[name, sides[0]].alpha,
+                level=next(iter(found.values())).alpha,
             ),
         ]
 
@@ -333,18 +328,11 @@ def _axes(figure: "Figure", left: float, top: float, width: float, height: float
     return axes
 
 
-def draw_maps(
-    cohort: Cohort, points: Mapping[str, FittedMaps], rows: Sequence[Row]
-) -> "list[Figure]":
-    """Draw rows of maps of which no test was made."""
-    return [draw_rows(cohort, points, {}, rows, {})]
-
-
-def draw_rows(
+def _draw_rows(
     cohort: Cohort,
     sides: Mapping[str, FittedMaps],
-    shapes: Mapping[str, AverageShape],
     rows: Sequence[Row],
+    shapes: Mapping[str, AverageShape],
     views: Views,
 ) -> "Figure":
     """Draw rows of panels; all boxes are whole pixels, so that pictures are not resampled."""

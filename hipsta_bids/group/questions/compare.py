@@ -107,7 +107,7 @@ def _analyze(options: studies.GroupOptions, settings: GroupSettings) -> studies.
         if summary is not None:
             write_summary(folder / SUMMARY, summary)
         write_shapes(folder, shapes)
-        if analysis.sides and study.collection.records and not shapes:
+        if analysis.registered and study.collection.records and not shapes:
             notes.append("no average surfaces: those of the participant level are missing")
         notes.extend(draw(folder, study.cohorts, analyses, shapes, joint=tested))
         return _record(analysis, study.collection.ratings)
@@ -172,14 +172,11 @@ def _notes(study: studies.Study, analysis: Analysis) -> list[str]:
                 " survives, above the level; effects are widespread"
             )
     notes += fitting.unequal_spread(analysis, settings.glm)
-    for hemi, side in analysis.sides.items():
-        if not side.registration.converged:
+    for hemi, registration in analysis.registrations.items():
+        if not registration.converged:
             notes.append(f"hemisphere {hemi}: registration had not settled when it ended")
-        if side.registration.extreme.any():
-            notes.append(
-                f"hemisphere {hemi}: extreme warps: {int(side.registration.extreme.sum())}, see"
-                " warps.tsv"
-            )
+        if n_extreme := int(registration.extreme.sum()):
+            notes.append(f"hemisphere {hemi}: extreme warps: {n_extreme}, see warps.tsv")
     return notes
 
 

@@ -275,7 +275,7 @@ def summarize(
         "asymmetry": [] if analysis.comparison.pair else list(settings.asymmetry.relative),
         "change": analysis.comparison.pair is not None,
         "align": settings.registration.align,
-        "template": files.plain(templates_of(analysis.sides)),
+        "template": files.plain(templates_of(analysis.registrations)),
         "participants": len(rows),
         "groups": groups,
         "factors": factors,

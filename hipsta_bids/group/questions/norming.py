@@ -20,7 +20,7 @@ from hipsta_bids.group.design.settings import GroupSettings, NormSettings
 from hipsta_bids.group.output import write
 from hipsta_bids.group.output.figures import Drawing, deviation_rows, draw_norms, norm_rows
 from hipsta_bids.group.output.methods import norms_text
-from hipsta_bids.group.output.panels import draw_maps
+from hipsta_bids.group.output.panels import draw_pages
 from hipsta_bids.group.output.results import ScoredMaps
 from hipsta_bids.group.output.saved import NormsFile, load_norms, save_norms, templates_from_json
 from hipsta_bids.group.questions import study as studies
@@ -499,7 +499,7 @@ def _figures(scoring: _Made) -> Iterator[tuple[str, Drawing]]:
             rows = norm_rows(means, float(middle.age[0]), measure, unit)
             if scoring.adapted is not None:
                 rows = deviation_rows(scoring.scored[surface], measure)
-            yield f"{measure}_normmaps", partial(draw_maps, cohort, places, list(rows))
+            yield f"{measure}_normmaps", partial(draw_pages, cohort, places, [list(rows)])
 
 
 def _dots(scoring: _Made, lines: pd.DataFrame) -> pd.DataFrame:

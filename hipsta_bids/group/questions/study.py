@@ -138,10 +138,11 @@ class Study:
             )
             for hemi in each("registration", with_maps)
         }
-        registered = {hemi: side.registered for hemi, side in sides.items()} or cohort.sides
+        registrations = {hemi: result for hemi, (result, _) in sides.items()}
+        registered = {hemi: maps for hemi, (_, maps) in sides.items()} or cohort.sides
         cohorts = {**self.cohorts, SHEET: replace(cohort, sides=registered)}
-        tables = dict(registration_tables(cohort, sides)) if sides else {}
-        return templates_of(sides), cohorts, tables
+        tables = dict(registration_tables(cohort, registrations)) if sides else {}
+        return templates_of(registrations), cohorts, tables
 
     def write(
         self,
@@ -189,7 +190,8 @@ class Study:
         region = options.sheets.region
         name = options.model.name or (name if region == "body" else f"{name}_{region}")
         _describe_dataset(options)
-        with write.model_folder(options.out_dir, name) as folder:
+        final = options.out_dir / write.GROUP_FOLDER / name
+        with write.whole_folder(final) as folder:
             tell("tables and maps")
             record = {
                 "command": list(options.command),
@@ -212,7 +214,7 @@ class Study:
             }
             files.write_json(folder / "analysis.json", record)
         return GroupResult(
-            folder=options.out_dir / write.GROUP_FOLDER / name,
+            folder=final,
             n_participants=counts[0],
             n_excluded=counts[1],
             notes=tuple(notes),

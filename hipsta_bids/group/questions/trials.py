@@ -22,7 +22,7 @@ from hipsta_bids.group.output import write
 from hipsta_bids.group.output.columns import frame_of
 from hipsta_bids.group.output.figures import Drawing
 from hipsta_bids.group.output.methods import Citations, power_text, retest_text
-from hipsta_bids.group.output.panels import Row, draw_maps, spanned
+from hipsta_bids.group.output.panels import Row, draw_pages, spanned
 from hipsta_bids.group.output.tables import entity_label
 from hipsta_bids.group.questions import study as studies
 from hipsta_bids.group.stats import trials
@@ -492,7 +492,7 @@ def _figures(
             unit = cohorts[surface].units.get(measure, "1")
             if rows := list(make(sides, display_name(measure), unit)):
                 points = {hemi: r.points for hemi, r in sides.items() if r.points is not None}
-                yield f"{measure}_{question}", partial(draw_maps, cohorts[surface], points, rows)
+                yield f"{measure}_{question}", partial(draw_pages, cohorts[surface], points, [rows])
 
 
 def _agreement(sides: Mapping[str, Described], measure: str, unit: str) -> Iterator[Row]:

@@ -1,7 +1,7 @@
 """Registration of curvature profiles, so that a grid node means the same position in all."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -38,6 +38,10 @@ class Registration:
     """(subjects,) root mean square of warp minus identity, in grid nodes."""
     extreme: Bool
     """(subjects,) whose displacement is an outlier."""
+    by_group: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    """Columns of shifts by group; empty without groups."""
+    difference: Mapping[str, float] = field(default_factory=dict)
+    """Columns of the largest difference between the groups; empty without groups."""
 
     @property
     def shifts(self) -> Float:
