@@ -91,13 +91,10 @@ AMPLITUDES = {
     "lateral bend twice as large": (1.0, 1.0, 1.0, 2.0),
 }
 
-#: Ways to register, by alignment and whether each curve is standardized; the first is the default.
+#: Ways to register, by whether each curve is standardized; the first is the default.
 WAYS = {
-    f"{align}, {'each standardized' if own else 'as measured'}": GroupSettings().changed(
-        registration={"align": align, "standardize": own}
-    )
-    for own in (True, False)
-    for align in ("registr", "penalized")
+    f"registr, {title}": GroupSettings().changed(registration={"standardize": standardize})
+    for title, standardize in (("each standardized", True), ("as measured", False))
 }
 DEFAULT = next(iter(WAYS))
 
@@ -117,7 +114,6 @@ _CORRECTIONS = {
 }
 _METHODS = {
     "registr": "registered, registr (default)",
-    "penalized": "registered, penalized",
     "none": "not registered",
 }
 _GROUP = "group"

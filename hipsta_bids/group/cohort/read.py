@@ -2,13 +2,12 @@
 
 import difflib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from scipy.ndimage import uniform_filter
 
 from hipsta_bids.derivatives import hemisphere
 from hipsta_bids.errors import InputError
@@ -116,15 +115,12 @@ def read_sheets(
     visits: Sequence[VisitKey] | None = None,
     *,
     max_gap: float,
-    error_window: int = 0,
 ) -> Measured:
-    """Read all sheets and summaries, and the SDs of the maps if they have a window.
+    """Read all sheets and summaries.
 
     Hemispheres with empty or impossible maps or summaries are left out, as those of which a larger
     share of the curvature profile than ``max_gap`` has no value.
     """
-    if error_window:
-        _check_errors(records, maps)
     region = records[0].result.name.region if records else "body"
     x, y = node_coordinates(grid, region)
     shape = len(x), len(y)
@@ -159,9 +155,6 @@ def read_sheets(
             if region in EXPERIMENTAL:
                 for values in sides[hemi].maps.values():
                     leave_rare(values)
-        if records_of_side and error_window:
-            errors = _read_errors(records_of_side, shape, maps, error_window)
-            sides[hemi] = replace(sides[hemi], errors=errors)
     table = pd.DataFrame(
         {
             PARTICIPANT: [f"sub-{subject}" for subject, _ in visits],
@@ -203,44 +196,6 @@ def _damage(side: SideMaps, i: int, doubtful: Mapping[str, Float], max_gap: floa
     values += [(name, column[i : i + 1]) for name, column in doubtful.items()]
     problems = (why_impossible(name, one) for name, one in values)
     return next((text for text in problems if text), None)
-
-
-def _check_errors(records: Sequence[SheetRecord], maps: Sequence[str]) -> None:
-    """Refuse weights by uncertainty where an SD is missing."""
-    if unsupported := [name for name in maps if name not in SHEET_MAPS]:
-        raise InputError(
-            f"--weights uncertainty: there are no SDs of {', '.join(unsupported)}; leave these maps"
-            " out by --measures, or the weights"
-        )
-    lacking = [r.result.name.stem for r in records if not r.result.path("uncertainty").is_file()]
-    if lacking:
-        names = ", ".join(lacking[:_MOST_NAMES]) + (" ..." if len(lacking) > _MOST_NAMES else "")
-        raise InputError(
-            f"--weights uncertainty: {len(lacking)} of {len(records)} hemispheres have no SD maps"
-            f" ({names}); run the participant level again with --uncertainty 8, or leave them"
-            " out by --exclude"
-        )
-
-
-def _read_errors(
-    records: Sequence[SheetRecord], shape: tuple[int, int], maps: Sequence[str], window: int
-) -> dict[str, Float]:
-    """(sheets, x, y) SD of each map, from squares averaged over ``window`` nodes on both axes."""
-    columns = [hemisphere.spread_name(name) for name in maps]
-    tables = [
-        hemisphere.read_sheet(r.result.path("uncertainty"), columns, shape=shape) for r in records
-    ]
-    errors = {}
-    for name in maps:
-        squares = np.stack([t[hemisphere.spread_name(name)] for t in tables]) ** 2
-        finite = np.isfinite(squares)
-        total, count = (
-            uniform_filter(values, (1, window, window), mode="nearest")
-            for values in (np.where(finite, squares, 0.0), finite.astype(np.float64))
-        )
-        mean = total / np.where(finite, count, 1.0)
-        errors[name] = np.where(finite, np.sqrt(np.maximum(mean, 0.0)), np.nan)
-    return errors
 
 
 def visits_of(records: Sequence[SheetRecord]) -> list[VisitKey]:

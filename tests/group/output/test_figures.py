@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from hipsta_bids.group.design.settings import ClassificationSettings
 from hipsta_bids.group.output.figures import draw_calibration, draw_roc, draw_sections, encode
-from hipsta_bids.group.output.panels import Seen, draw_measure
+from hipsta_bids.group.output.panels import draw_measure, draw_view
 from hipsta_bids.group.output.results import Analysis
 from hipsta_bids.group.output.shapes import AverageShape
 from hipsta_bids.group.output.views import across, draw_mesh, laid_out, look
@@ -48,7 +48,7 @@ def test_half_of_a_flat_sheet_has_the_color_of_its_values():
     for triangles in (mesh.triangles, mesh.triangles[:, ::-1]):
         view = look(Mesh(points=mesh.points, triangles=triangles), ABOVE, 4.0, (60, 100))
         right_and_up = (mesh.points[:, 0] > 0) & (mesh.points[:, 1] > 0)
-        shown = Seen(view, no_lines(view)).picture(right_and_up.astype(float), GRAY, None)
+        shown = draw_view(view, no_lines(view), right_and_up.astype(float), GRAY, None)
         assert shown.shape == (60, 100, 3)
         bright = (shown[..., 0] > 150) & (shown[..., 0] < 255)
         rows, columns = np.nonzero(bright)
