@@ -24,7 +24,6 @@ POSTERIOR_TOLERANCE = 1e-6
 
 #: Values of a site at a point, below which its variance says nothing about that of other points.
 _LEAST_VISITS = 3
-_LARGEST = 1_000_000_000  # bytes of a file
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
