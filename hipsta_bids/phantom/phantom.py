@@ -244,18 +244,20 @@ class Phantom:
         border
             mm of background on every side.
         """
-        grid = make_grid(
+        shape, affine = make_grid(
             self._outline(hemi, pose),
             voxel_size=voxel_size,
             axes=axes,
             rotation=grid_rotation,
             border=border,
         )
-        labels = draw(self.body, grid, protocol, hemi=hemi, pose=pose, supersample=supersample)
-        tissue = np.array([0, *(label.tissue for label in protocol.labels)], dtype=np.uint8)
-        part = np.array([0, *(label.part for label in protocol.labels)], dtype=np.uint8)
+        labels = draw(
+            self.body, shape, affine, protocol, hemi=hemi, pose=pose, supersample=supersample
+        )
+        meanings = [(0, 0), *((label.tissue, label.part) for label in protocol.labels)]
+        tissue, part = np.array(meanings, dtype=np.uint8).T
         return LabelVolume(
-            tissue=tissue[labels], part=part[labels], affine=grid.affine, protocol=protocol
+            tissue=tissue[labels], part=part[labels], affine=affine, protocol=protocol
         )
 
     def truth(
