@@ -15,7 +15,7 @@ from hipsta_bids.errors import InputError
 from hipsta_bids.geometry.catalog import MAPS, why_impossible
 from hipsta_bids.geometry.sheet import sheet_levels
 from hipsta_bids.group.cohort.collect import Exclusion, SheetRecord
-from hipsta_bids.group.cohort.data import Measures
+from hipsta_bids.group.cohort.data import Cohort, Measures
 from hipsta_bids.group.stats.arrays import MOST_KEPT, Float, SideMaps, blocks
 from hipsta_bids.protocols import EXPERIMENTAL
 from hipsta_bids.settings import SheetSettings
@@ -93,16 +93,10 @@ def _summary_names(records: Sequence[SheetRecord]) -> tuple[str, ...]:
     return tuple(hemisphere.read_summary(records[0].result)) if records else ()
 
 
-@dataclass(frozen=True, kw_only=True)
-class Measured:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Measured(Cohort):
     """Sheets and summaries, before covariates are known."""
 
-    visits: pd.DataFrame
-    """Participant and session, one row per visit; the index has the names of visits."""
-    sides: Mapping[str, SideMaps]
-    x: Float
-    y: Float
-    units: Mapping[str, str]
     sources: Mapping[str, tuple[str, Path]]
     """Address of one segmentation, and the dataset whose record has it, of visits with sheets."""
     damaged: tuple[Exclusion, ...] = ()
@@ -170,7 +164,7 @@ def read_sheets(
         index=[visit_name(*visit) for visit in visits],
     )
     return Measured(
-        visits=table,
+        table=table,
         sides=sides,
         x=x,
         y=y,

@@ -173,7 +173,7 @@ def read_inputs(options: GroupOptions, settings: GroupSettings) -> GroupInputs:
     """Find and read sheets, other maps, volumes and covariates."""
     external.check_volumes(options.volumes)
     collection = collect.collect_sheets(options.sheets, may_lack=bool(options.maps))
-    reserved = external.taken_names(with_sheets=bool(collection.records))
+    reserved = read.SHEET_MAPS if collection.records else ()
     requests = external.map_patterns(options.maps, options.surfaces, reserved)
     requested = designs.wanted_measures(options.model, options.measures)
     measures = read.choose_measures(requested, collection.records, [one.name for one in requests])
@@ -184,7 +184,7 @@ def read_inputs(options: GroupOptions, settings: GroupSettings) -> GroupInputs:
     read.check_summaries(measures, measured.sides)
     all_visits = Cohort(
         table=with_factors(
-            read_covariates(measured.visits, options.bids_dir, options.covariates),
+            read_covariates(measured.table, options.bids_dir, options.covariates),
             settings.design,
             settings.model,
         ),
@@ -221,7 +221,7 @@ def read_inputs(options: GroupOptions, settings: GroupSettings) -> GroupInputs:
             *collection.exclusions,
             *measured.damaged,
             *collect.exclude_visits(
-                measured.visits, {visit: (reason, message) for visit, message in reasons.items()}
+                measured.table, {visit: (reason, message) for visit, message in reasons.items()}
             ),
         ),
         notes=(*collection.notes, *map_notes, *volume_notes, *_damaged(measured)),

@@ -81,12 +81,9 @@ class Norms:
         design = np.column_stack(
             [np.ones(len(people.age)), age_columns(people.age, self.knots), people.sex]
         )
-        return design @ self.mean, np.exp(self._position(people.age) @ self.spread)
-
-    def _position(self, age: Float) -> Float:
-        return np.column_stack(
-            [np.ones(len(age)), (age - self.knots[0]) / (self.knots[-1] - self.knots[0])]
-        )
+        share = (people.age - self.knots[0]) / (self.knots[-1] - self.knots[0])
+        log_sd = np.column_stack([np.ones(len(share)), share]) @ self.spread
+        return design @ self.mean, np.exp(log_sd)
 
     def score(self, values: Float, people: People) -> Float:
         """(visits, points) deviations z; their normal probability is the centile.
