@@ -16,17 +16,8 @@ from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.protocols.protocol import Part, Tissue
 from hipsta_bids.settings import BodySettings, Settings
 from hipsta_bids.types import End, Float, LabelVolume
-from validation.cases import (
-    Refusal,
-    ValidationBody,
-    left_out,
-    load_body,
-    measure_body,
-    refusal_notes,
-    rms,
-    run_cases,
-    truth_at,
-)
+from validation import cases
+from validation.cases import Refusal, ValidationBody
 from validation.population import find_bodies, is_fine
 from validation.report import Cell, Cells, Content, suite, table
 from validation.thick_slices import FULL_VOXEL, PHANTOMS, PIXEL, reslice
@@ -126,13 +117,15 @@ def run(full: bool, labels: Path | None = None) -> Iterator[Content]:
     """Find ends without labels on copies of bodies; measure bodies between oblique end planes."""
     bodies: list[ValidationBody] = [*PHANTOMS[: None if full else 1]]
     if labels:
-        fine = [body for body in find_bodies(labels) if is_fine(load_body(body, FULL_VOXEL)[0])]
+        fine = [
+            body for body in find_bodies(labels) if is_fine(cases.load_body(body, FULL_VOXEL)[0])
+        ]
         bodies += fine if full else fine[:2]
     plan = (STEPS, OFFSETS, TILTS) if full else (STEPS[-1:], OFFSETS[::2], TILTS[:1])
     copies = tuple(product(*plan))
     jobs = [Job(body=body, copies=copies) for body in bodies]
-    found = dict(zip(jobs, run_cases(find_ends, jobs, timeout=120.0), strict=True))
-    cases = [
+    found = dict(zip(jobs, cases.run_cases(find_ends, jobs, timeout=120.0), strict=True))
+    tilted = [
         Oblique(spec=spec, degrees=degrees, about=about)
         for spec in (OBLIQUE if full else OBLIQUE[:1])
         for degrees in (DEGREES if full else DEGREES[-1:])
@@ -140,14 +133,14 @@ def run(full: bool, labels: Path | None = None) -> Iterator[Content]:
     ]
     yield _copies_table(found)
     yield _places_table(found)
-    yield _oblique_table(cases, run_cases(measure_oblique, cases))
-    yield left_out(labels)
+    yield _oblique_table(tilted, cases.run_cases(measure_oblique, tilted))
+    yield cases.left_out(labels)
 
 
 def find_ends(job: Job) -> Found:
     """Find the ends of a body, and of its copies, whose head and tail labels are taken away."""
     settings = Settings().body
-    volume, _ = load_body(job.body, FULL_VOXEL)
+    volume, _ = cases.load_body(job.body, FULL_VOXEL)
     body = extract_body(volume, settings)
     points = body.inside_points()[1]
     near = {end: points[np.abs(body.ends.height(points, end)) < _NEAR] for end in ENDS}
@@ -207,8 +200,8 @@ def measure_oblique(case: Oblique) -> tuple[str, Float]:
     """Measure a phantom between oblique planes: status, and error of thickness (Nx, Ny), mm."""
     phantom = Phantom(case.spec)
     volume = phantom.label_volume(load_protocol("freesurfer"))
-    maps = measure_body(cut_obliquely(phantom, volume, case.degrees, case.about), "L")
-    truth, inside = truth_at(phantom, maps.sheet.points[:, :, maps.sheet.middle])
+    maps = cases.measure_body(cut_obliquely(phantom, volume, case.degrees, case.about), "L")
+    truth, inside = cases.truth_at(phantom, maps.sheet.points[:, :, maps.sheet.middle])
     return maps.status, np.where(inside, maps.thickness - truth.thickness, np.nan)
 
 
@@ -235,7 +228,7 @@ def _copies_table(results: Mapping[Job, Found | Refusal]) -> Iterator[Cells | st
             targets = ", ".join(f"{limit:g}" for limit in MAX_SPREAD)
             mean = {"body": f"{kind}, mean", **mean, "refused": refused, "targets": targets}
             yield {**mean, "met": met and not refused}
-    yield refusal_notes({job.name: [result] for job, result in results.items()})
+    yield cases.refusal_notes({job.name: [result] for job, result in results.items()})
 
 
 _COLUMNS = (
@@ -267,7 +260,7 @@ def _places_table(results: Mapping[Job, Found | Refusal]) -> Iterator[Cells]:
             off = [ends[k] for ends in group]
             if variant == FOUND:
                 row = _place_row(kind, f"{end} {variant}", off)
-                yield {**row, "target": f"RMS ≤ {limits[k]:g}", "met": rms(off) <= limits[k]}
+                yield {**row, "target": f"RMS ≤ {limits[k]:g}", "met": cases.rms(off) <= limits[k]}
             elif end == ENDS[0]:
                 yield _place_row(kind, f"{end} {variant}", off)
     sides: dict[str, list[float]] = {}
@@ -283,15 +276,15 @@ def _places_table(results: Mapping[Job, Found | Refusal]) -> Iterator[Cells]:
 def _place_row(kind: str, what: str, off: Sequence[float]) -> Cells:
     mean, largest = f"{np.mean(off):+.2f}", float(np.abs(off).max())
     cells: Cells = {"bodies": kind, "number": len(off), "what": what}
-    return {**cells, "mean": mean, "RMS": rms(off), "largest": largest}
+    return {**cells, "mean": mean, "RMS": cases.rms(off), "largest": largest}
 
 
 @table("ends.oblique")
 def _oblique_table(
-    cases: Sequence[Oblique], results: Sequence[tuple[str, Float] | Refusal]
+    tilted: Sequence[Oblique], results: Sequence[tuple[str, Float] | Refusal]
 ) -> Iterator[Cells | str]:
     """Error of thickness beside oblique end planes."""
-    names = [f"{c.spec.kind}, {c.degrees:g}° about the {c.about}" for c in cases]
+    names = [f"{c.spec.kind}, {c.degrees:g}° about the {c.about}" for c in tilted]
     for name, result in zip(names, results, strict=True):
         cells: dict[str, Cell] = {"planes": name}
         met = False
@@ -307,4 +300,4 @@ def _oblique_table(
                 "largest of a column": float(np.nanmax(np.abs(error))),
             }
         yield {**cells, "target": f"≤ {MAX_ROW:g}", "met": met}
-    yield refusal_notes({name: [result] for name, result in zip(names, results, strict=True)})
+    yield cases.refusal_notes({name: [result] for name, result in zip(names, results, strict=True)})

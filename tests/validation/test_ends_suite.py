@@ -79,7 +79,9 @@ def test_rows_at_oblique_planes_meet_the_target_and_miss_it_where_the_mesh_ends_
     right = ends.measure_oblique(case)
     up_to_the_planes = Settings().changed(grid={"beyond": 0.0})
     monkeypatch.setattr(
-        ends, "measure_body", lambda volume, hemi: measure_body(volume, hemi, up_to_the_planes)
+        ends.cases,
+        "measure_body",
+        lambda volume, hemi: measure_body(volume, hemi, up_to_the_planes),
     )
     rows = ends._oblique_table([case, case], [right, ends.measure_oblique(case)]).rows
     assert [row["met"] for row in rows] == [True, False]
@@ -93,7 +95,9 @@ def test_refused_planes_miss_the_target_and_are_explained():
 
 
 def test_a_short_run_says_what_was_left_out(monkeypatch):
-    monkeypatch.setattr(ends, "run_cases", lambda work, cases, **_: [work(case) for case in cases])
+    monkeypatch.setattr(
+        ends.cases, "run_cases", lambda work, group, **_: [work(one) for one in group]
+    )
     suite = ends.run(False)
     assert "Real labels were left out" in suite.text
     assert [table.missed for table in suite.tables] == [0, 0, 0]
