@@ -156,13 +156,6 @@ def summarize(body: Body, *, span: tuple[float, float] = (0.0, 1.0)) -> dict[str
     }
 
 
-def line_lengths(body: Body, u: Float, v: Float) -> tuple[Float, Float]:
-    """Lengths of the mid-surface's lines along u and along v through positions (u, v), mm."""
-    u, v = np.broadcast_arrays(np.asarray(u, np.float64), np.asarray(v, np.float64))
-    along = _axis_stretch(body, u)[0] * body.spec.length
-    return np.full(v.shape, body.spec.width), np.broadcast_to(along, u.shape).copy()
-
-
 def _surface_jet(body: Body, u: Float, v: Float, at: float) -> _Jet:
     """Differentiate ``mid + at * T * normal``.
 
@@ -265,7 +258,6 @@ class Phantom:
     ) -> PhantomTruth:
         """Return what a perfect method would measure at positions (u, v)."""
         x, y = np.broadcast_arrays(np.asarray(u, np.float64), np.asarray(v, np.float64))
-        extent_x, extent_y = line_lengths(self.body, x, y)
         interior, mid, exterior = (curvatures(self.body, x, y, at=at) for at in SURFACES.values())
         return PhantomTruth(
             thickness=self.body.thickness(x, y),
@@ -276,8 +268,8 @@ class Phantom:
             gaussian_curvature=mid[1],
             gaussian_curvature_interior=interior[1],
             gaussian_curvature_exterior=exterior[1],
-            extent_x=extent_x,
-            extent_y=extent_y,
+            extent_x=np.full(x.shape, self.spec.width),
+            extent_y=_axis_stretch(self.body, x)[0] * self.spec.length,
             subfield=tissue_at(self.spec, x, y),
             summary=summarize(self.body),
         )

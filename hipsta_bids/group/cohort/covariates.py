@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Mapping, Sequence
+from functools import cache
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -28,13 +29,9 @@ _LONGEST_NAME = 40
 
 def locate_sources(sources: Sequence[str], roots: Sequence[Path]) -> list[Path | None]:
     """Paths of segmentations, from their addresses in the quality records of datasets."""
-    links: dict[Path, Mapping[str, str]] = {}
-    result = []
-    for source, root in zip(sources, roots, strict=True):
-        if root not in links:
-            links[root] = read_links(root)
-        result.append(linked_path(source, root, links[root]))
-    return result
+    links = cache(read_links)
+    pairs = zip(sources, roots, strict=True)
+    return [linked_path(source, root, links(root)) for source, root in pairs]
 
 
 def relocate(source: str, folders: Sequence[Path]) -> str:
