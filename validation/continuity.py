@@ -1,7 +1,7 @@
 """Whether a small change of the labels makes a small change of the map."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
 from types import MappingProxyType
@@ -14,7 +14,6 @@ from hipsta_bids.geometry.digital import to_ras
 from hipsta_bids.inputs.search import HemisphereInput
 from hipsta_bids.phantom import PhantomSpec
 from hipsta_bids.protocols.protocol import Part
-from hipsta_bids.settings import Settings
 from hipsta_bids.types import End, Float, GivenEnd, HemisphereMaps, LabelVolume, Status
 from validation import cases
 from validation.damage import Site, make_defect
@@ -69,7 +68,6 @@ class Trial:
     subject: Subject
     perturbation: str
     draw: int
-    settings: Mapping[str, Mapping[str, object]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -239,22 +237,19 @@ def load(subject: Subject) -> tuple[LabelVolume, str]:
 
 
 @lru_cache(maxsize=4)
-def reference(subject: Subject, settings: Settings) -> HemisphereMaps:
+def reference(subject: Subject) -> HemisphereMaps:
     """Measure a subject's labels as they are."""
-    return cases.measure_body(*load(subject), settings)
+    return cases.measure_body(*load(subject))
 
 
 def move(trial: Trial) -> Movement:
     """Perturb labels, measure them, and compare the maps."""
-    settings = Settings().changed(**trial.settings) if trial.settings else Settings()
     volume, hemi = load(trial.subject)
-    maps = reference(trial.subject, settings)
+    maps = reference(trial.subject)
     number = list(PERTURBATIONS).index(trial.perturbation)
     random = np.random.default_rng((SEED, number, trial.draw))
     perturbed = PERTURBATIONS[trial.perturbation](volume, maps, random)
-    return compare(
-        maps, cases.measure_body(perturbed, hemi, settings), changed_points(volume, perturbed)
-    )
+    return compare(maps, cases.measure_body(perturbed, hemi), changed_points(volume, perturbed))
 
 
 def changed_points(volume: LabelVolume, perturbed: LabelVolume) -> Float:

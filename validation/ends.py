@@ -90,17 +90,6 @@ class Found:
     own: Mapping[str, tuple[float, float]]
     """Both ends in the body's own voxels, by variant; empty without labels that say where."""
 
-    @property
-    def longer(self) -> Float:
-        """(N,) by how much a copy is too long, mm."""
-        return np.asarray(self.copies[:, 1] - self.copies[:, 0])
-
-    @property
-    def spread(self) -> Float:
-        """SD (3,) over the copies of both ends and of the length, mm."""
-        both = np.column_stack([self.copies[:, :2], self.longer])
-        return np.asarray(both.std(axis=0, ddof=1))
-
 
 @dataclass(frozen=True, kw_only=True)
 class Oblique:
@@ -246,8 +235,10 @@ def _numbers(job: Job, found: Found) -> list[float]:
     """Compute a row of the table, by ``_COLUMNS``."""
     # An edge between two slices may be anywhere between them: the SD of a uniform distribution.
     alone = np.sqrt(np.mean([step**2 / 12 for step, _, _ in job.copies]))
-    both = [*found.spread, np.ptp(found.longer), alone, *found.copies[:, 2:].mean(axis=0)]
-    return [float(number) for number in both]
+    longer = found.copies[:, 1] - found.copies[:, 0]
+    spread = np.column_stack([found.copies[:, :2], longer]).std(axis=0, ddof=1)
+    row = [*spread, np.ptp(longer), alone, *found.copies[:, 2:].mean(axis=0)]
+    return [float(number) for number in row]
 
 
 @table("ends.places")

@@ -11,7 +11,7 @@ from scipy.ndimage import maximum_filter, minimum_filter
 from hipsta_bids.errors import ProtocolError
 from hipsta_bids.phantom.shape import Body, PhantomSpec, bad, check_rotation
 from hipsta_bids.protocols.protocol import CORE, LATERAL_END, Label, Part, Protocol, Tissue
-from hipsta_bids.types import Bool, Float, Int, LabelVolume
+from hipsta_bids.types import Float, LabelVolume
 
 
 def make_grid(
@@ -110,8 +110,11 @@ def draw(
         [table[_regions(body, part, affine, hemi, pose)] for part in _chunks(index, 1)]
     ).reshape(shape)
     if (counts > 1).any():
-        offsets = _sub_voxels(counts)
-        mixed = np.argwhere(_near_borders(codes)).astype(np.float64)
+        # In voxels, the points (M, 3) that vote for the label of one that touches another label.
+        steps = [(np.arange(count) + 0.5) / count - 0.5 for count in counts]
+        offsets = np.stack(np.meshgrid(*steps, indexing="ij"), axis=-1).reshape(-1, 3)
+        low, high = (f(codes, 3, mode="nearest") for f in (minimum_filter, maximum_filter))
+        mixed = np.argwhere(low != high).astype(np.float64)
         votes = [
             _majority(
                 table[_regions(body, (part[:, None] + offsets).reshape(-1, 3), affine, hemi, pose)],
@@ -253,18 +256,6 @@ def _regions(
     part = (v >= 0.0).astype(int) + (v > 1.0)
     region[near] = np.where(local > 0, part * _PER_PART + local, 0)
     return region
-
-
-def _sub_voxels(counts: Int) -> Float:
-    """Offsets (M, 3), in voxels, of the points that vote for a voxel's label."""
-    steps = [(np.arange(count) + 0.5) / count - 0.5 for count in counts]
-    return np.stack(np.meshgrid(*steps, indexing="ij"), axis=-1).reshape(-1, 3)
-
-
-def _near_borders(codes: NDArray[np.intp]) -> Bool:
-    """Voxels that touch (by face, edge or corner) a voxel of another label."""
-    low, high = (f(codes, 3, mode="nearest") for f in (minimum_filter, maximum_filter))
-    return np.asarray(low != high)
 
 
 def _majority(labels: NDArray[np.intp], *, per_voxel: int, kinds: int) -> NDArray[np.intp]:

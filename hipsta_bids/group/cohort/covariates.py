@@ -132,12 +132,9 @@ def _cleaned(table: pd.DataFrame) -> pd.DataFrame:
     table = table.map(str.strip)
     for column, prefix in ((PARTICIPANT, "sub-"), (SESSION, "ses-")):
         if column in table.columns:
-            table[column] = [_prefixed(cell, prefix) for cell in table[column]]
+            has_prefix = (table[column] == files.MISSING) | table[column].str.startswith(prefix)
+            table[column] = table[column].where(has_prefix, prefix + table[column])
     return table.where(table != files.MISSING, None)
-
-
-def _prefixed(cell: str, prefix: str) -> str:
-    return cell if cell == files.MISSING or cell.startswith(prefix) else prefix + cell
 
 
 def _join_sessions(joined: pd.DataFrame, bids_dir: Path) -> pd.DataFrame:

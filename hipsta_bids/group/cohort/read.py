@@ -45,11 +45,15 @@ def choose_measures(
     """Tell maps from summary measures."""
     if not requested:
         return Measures(maps=(*(DEFAULT if records else ()), *further))
-    summaries = _summary_names(records)
+    summaries = tuple(hemisphere.read_summary(records[0].result)) if records else ()
     available = [*(SHEET_MAPS if records else ()), *further, *_sampled(records), *summaries]
     maps, numbers = [], []
     for name in requested:
-        if name in further or (records and name in SHEET_MAPS) or _is_sampled(name, records):
+        if (
+            name in further
+            or (records and name in SHEET_MAPS)
+            or any(_sampled_table(record, name).is_file() for record in records)
+        ):
             maps.append(name)
         elif name in summaries or name.startswith(VOLUME):
             numbers.append(name)
@@ -75,10 +79,6 @@ def _unknown(name: str, available: Sequence[str], hint: str) -> InputError:
     return InputError(f"no measure is called {name!r}; {hint}")
 
 
-def _is_sampled(name: str, records: Sequence[SheetRecord]) -> bool:
-    return any(_sampled_table(record, name).is_file() for record in records)
-
-
 def _sampled(records: Sequence[SheetRecord]) -> list[str]:
     """Names of the sampled maps of the first hemisphere."""
     if not records:
@@ -87,10 +87,6 @@ def _sampled(records: Sequence[SheetRecord]) -> list[str]:
     start, _, end = pattern.name.partition("*")
     paths = pattern.parent.glob(pattern.name)
     return sorted(path.name.removeprefix(start).removesuffix(end) for path in paths)
-
-
-def _summary_names(records: Sequence[SheetRecord]) -> tuple[str, ...]:
-    return tuple(hemisphere.read_summary(records[0].result)) if records else ()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

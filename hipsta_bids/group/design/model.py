@@ -321,7 +321,13 @@ def build_design(
 ) -> Design:
     """Make the design matrix of a model, or say what keeps it from being fitted."""
     closed = closed_formula(model.formula)
-    formula = _read_formula(closed.text)
+    try:
+        formula = Formula(closed.text)
+    except Exception as error:  # formulaic raises all kinds where a formula makes no sense
+        raise ModelError(
+            f"formula {closed.text!r} cannot be read; write it as group + age, and names with"
+            " blanks in backticks"
+        ) from error
     names = sorted(closed.names)
     formulas.check_names(names, table.columns)
     variables = table[names].copy()
@@ -465,16 +471,6 @@ def _check_possible(values: pd.Series, name: str) -> None:
             f"model: column {values.name!r} has {rows_text}, which nobody has; correct them, or"
             " mark them n/a"
         )
-
-
-def _read_formula(text: str) -> Formula:
-    try:
-        return Formula(text)
-    except Exception as error:  # formulaic raises all kinds where a formula makes no sense
-        raise ModelError(
-            f"formula {text!r} cannot be read; write it as group + age, and names with blanks in"
-            " backticks"
-        ) from error
 
 
 def _check_matrix(

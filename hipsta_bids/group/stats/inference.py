@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 from scipy import special
 from statsmodels.stats.multitest import multipletests
 
@@ -255,7 +254,9 @@ class _Run:
     def reached(self, t: Float, highest: Float, highest_enhanced: Float) -> Float:
         """Count (3, points) permutations that reach what was observed."""
         pairs = ((t, self._observed), (highest, self._observed), (highest_enhanced, self._enhanced))
-        return np.stack([_at_least(*pair).sum(axis=0, dtype=np.float64) for pair in pairs])
+        # Values may be off by rounding.
+        reach = [np.abs(values) >= np.abs(seen) * (1 - _ROUNDING) for values, seen in pairs]
+        return np.stack([values.sum(axis=0, dtype=np.float64) for values in reach])
 
     def result(self) -> PermutationTest:
         """Turn counts into p-values."""
@@ -269,11 +270,6 @@ class _Run:
 def _maximum(values: Float) -> Float:
     """Largest size on each map."""
     return np.asarray(np.nanmax(np.abs(values), axis=1, keepdims=True, initial=0.0))
-
-
-def _at_least(values: Float, observed: Float) -> NDArray[np.bool_]:
-    """Whether values reach those observed, but for rounding."""
-    return np.abs(values) >= np.abs(observed) * (1 - _ROUNDING)
 
 
 @dataclass(frozen=True)
