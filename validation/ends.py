@@ -91,14 +91,9 @@ class Found:
     """Both ends in the body's own voxels, by variant; empty without labels that say where."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Oblique:
-    """A phantom whose head and tail labels end obliquely."""
-
-    spec: PhantomSpec
-    degrees: float
-    about: str
-    """Direction that the planes are tilted about: across the sheet, or through it."""
+Oblique = tuple[PhantomSpec, float, str]
+"""A phantom whose head and tail labels end at planes, their tilt in degrees, and the direction that
+they are tilted about: across the sheet, or through it."""
 
 
 @suite("ends")
@@ -114,12 +109,8 @@ def run(full: bool, labels: Path | None = None) -> Iterator[Content]:
     copies = tuple(product(*plan))
     jobs = [Job(body=body, copies=copies) for body in bodies]
     found = dict(zip(jobs, cases.run_cases(find_ends, jobs, timeout=120.0), strict=True))
-    tilted = [
-        Oblique(spec=spec, degrees=degrees, about=about)
-        for spec in (OBLIQUE if full else OBLIQUE[:1])
-        for degrees in (DEGREES if full else DEGREES[-1:])
-        for about in (ABOUT if full else ABOUT[:1])
-    ]
+    choices = (OBLIQUE, DEGREES, ABOUT) if full else (OBLIQUE[:1], DEGREES[-1:], ABOUT[:1])
+    tilted = list(product(*choices))
     yield _copies_table(found)
     yield _places_table(found)
     yield _oblique_table(tilted, cases.run_cases(measure_oblique, tilted))
@@ -187,9 +178,10 @@ def cut_obliquely(phantom: Phantom, volume: LabelVolume, degrees: float, about: 
 
 def measure_oblique(case: Oblique) -> tuple[str, Float]:
     """Measure a phantom between oblique planes: status, and error of thickness (Nx, Ny), mm."""
-    phantom = Phantom(case.spec)
+    spec, degrees, about = case
+    phantom = Phantom(spec)
     volume = phantom.label_volume(load_protocol("freesurfer"))
-    maps = cases.measure_body(cut_obliquely(phantom, volume, case.degrees, case.about), "L")
+    maps = cases.measure_body(cut_obliquely(phantom, volume, degrees, about), "L")
     truth, inside = cases.truth_at(phantom, maps.sheet.points[:, :, maps.sheet.middle])
     return maps.status, np.where(inside, maps.thickness - truth.thickness, np.nan)
 
@@ -275,7 +267,7 @@ def _oblique_table(
     tilted: Sequence[Oblique], results: Sequence[tuple[str, Float] | Refusal]
 ) -> Iterator[Cells | str]:
     """Error of thickness beside oblique end planes."""
-    names = [f"{c.spec.kind}, {c.degrees:g}° about the {c.about}" for c in tilted]
+    names = [f"{spec.kind}, {degrees:g}° about the {about}" for spec, degrees, about in tilted]
     for name, result in zip(names, results, strict=True):
         cells: dict[str, Cell] = {"planes": name}
         met = False
