@@ -19,7 +19,7 @@ from hipsta_bids.group.stats.arrays import SideMaps
 from hipsta_bids.group.stats.clusters import sheet_edges
 from hipsta_bids.group.stats.exchangeability import Visits
 from hipsta_bids.group.stats.glm import RowModel, fit_maps
-from hipsta_bids.group.stats.inference import JointPart, MapKey, PermutationPart, correct, permute
+from hipsta_bids.group.stats.inference import MapKey, PermutationPart, correct, permute
 from hipsta_bids.group.stats.mixed import fit_mixed
 from hipsta_bids.group.stats.registration import mean_profiles, register
 from hipsta_bids.group.stats.warps import warp_values
@@ -393,8 +393,8 @@ def joint_findings(effects: tuple[float, float], seed: int) -> dict[str, Bool]:
     )
     single = how.changed(method="permutation-max")
     one, two = (permute([part], contrast, settings=single)[0].p_max for part in parts)
-    (tippett,) = permute([JointPart(parts, "tippett")], contrast, settings=single)
-    (fisher,) = permute([JointPart(parts, "fisher")], contrast, settings=how)
+    (tippett,) = permute([parts], contrast, settings=single, combine="tippett")
+    (fisher,) = permute([parts], contrast, settings=how, combine="fisher")
     found = {
         "first measure alone, largest t": one <= LEVEL,
         "either, each at half the level": np.minimum(one, two) <= LEVEL / 2,

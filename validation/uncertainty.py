@@ -9,16 +9,8 @@ from hipsta_bids.participant.uncertainty import Uncertainty, estimate_uncertaint
 from hipsta_bids.phantom import Phantom, PhantomSpec
 from hipsta_bids.settings import Settings
 from hipsta_bids.types import Float
-from validation.cases import (
-    Case,
-    Measured,
-    Refusal,
-    along_slices,
-    any_pose,
-    draw,
-    measure_case,
-    run_groups,
-)
+from validation import cases
+from validation.cases import Case, Measured, Refusal
 from validation.report import Cell, Cells, Content, suite, table
 from validation.thick_slices import PHANTOMS
 
@@ -41,7 +33,7 @@ def measure_copies(copied: tuple[Case, float, int]) -> Uncertainty:
     """Estimate the uncertainty of a phantom by jittered copies."""
     case, jitter, copies = copied
     settings = Settings().changed(uncertainty={"jitter": jitter})
-    return estimate_uncertainty(draw(Phantom(case.spec), case), case.hemi, settings, copies)
+    return estimate_uncertainty(cases.draw(Phantom(case.spec), case), case.hemi, settings, copies)
 
 
 @suite("uncertainty")
@@ -55,27 +47,29 @@ def run(full: bool) -> Iterator[Content]:
 
 @table("uncertainty.sd")
 def _sds(specs: Sequence[PhantomSpec], poses: int, copied: int, copies: int) -> Iterator[Cells]:
-    cases = {(spec.kind, voxel): _posed(spec, voxel, poses) for spec in specs for voxel in VOXELS}
-    seen = run_groups(measure_case, cases)
+    drawings = {
+        (spec.kind, voxel): _posed(spec, voxel, poses) for spec in specs for voxel in VOXELS
+    }
+    seen = cases.run_groups(cases.measure_case, drawings)
     plan = {
         (*key, cause): [(case, jitter, copies) for case in group[:copied]]
-        for key, group in cases.items()
+        for key, group in drawings.items()
         for cause, jitter in CAUSES.items()
     }
-    for (kind, voxel, cause), predicted in run_groups(measure_copies, plan).items():
+    for (kind, voxel, cause), predicted in cases.run_groups(measure_copies, plan).items():
         yield _uncertainty_row(kind, voxel, cause, seen[kind, voxel], predicted)
 
 
 def _posed(spec: PhantomSpec, voxel: tuple[float, float, float], count: int) -> list[Case]:
     """One phantom in several poses; thick slices go across its axis, as in scans."""
     generator = np.random.default_rng((SEED, 200))
-    cases = []
+    drawings = []
     for _ in range(count):
-        pose, turn = any_pose(generator), None
+        pose, turn = cases.any_pose(generator), None
         if voxel[2] > voxel[0]:
-            pose, turn = along_slices(generator)
-        cases.append(Case(spec=spec, voxel_size=voxel, pose=pose, grid_rotation=turn))
-    return cases
+            pose, turn = cases.along_slices(generator)
+        drawings.append(Case(spec=spec, voxel_size=voxel, pose=pose, grid_rotation=turn))
+    return drawings
 
 
 def _uncertainty_row(

@@ -24,7 +24,7 @@ def perturbed(labels, name):
 @pytest.mark.parametrize("size", [1e-6, 1e-5])
 def test_an_affine_moves_points_by_no_more_than_its_size(labels, size):
     volume, _ = labels
-    moved = continuity.near_affine(size)(volume, None, np.random.default_rng(0))
+    moved = continuity.near_affine(volume, None, np.random.default_rng(0), size=size)
     corner = np.append(np.array(volume.tissue.shape) - 1, 1.0)
     step = np.abs((moved.affine - volume.affine) @ corner)[:3]
     assert 0 < step.max() < 4 * size

@@ -83,14 +83,19 @@ class UserTable:
         return notes
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
 class Choices:
-    """What a person says about hemispheres."""
+    """What a person says about hemispheres: a table of those to leave out, and one of ratings.
 
-    excluded: UserTable
-    """To leave out."""
-    rated: UserTable
-    """To use or to leave out."""
+    A table of ratings may stand for one of exclusions. InputError if a table lacks a column, or has
+    another rating than `RATINGS`.
+    """
+
+    def __init__(self, exclusions: Path | None, ratings: Path | None) -> None:
+        excluded = [] if exclusions is None else _read(exclusions, ())
+        rated = [] if ratings is None else _read(ratings, (_RATING,))
+        last = [row for row in excluded if row.get(_RATING, RATINGS[-1]) == RATINGS[-1]]
+        self.excluded = UserTable(exclusions, tuple(last))
+        self.rated = UserTable(ratings, tuple(rated))
 
     def reason_to_leave_out(
         self, name: HemisphereName, digest: str | None
@@ -112,22 +117,6 @@ class Choices:
             ratings = {row[_RATING] for row in self.rated.applying(name, digest)}
             counts[next((word for word in reversed(RATINGS) if word in ratings), _NO_RATING)] += 1
         return counts
-
-
-def read_choices(exclusions: Path | None, ratings: Path | None) -> Choices:
-    """Read the user's tables; one of ratings may stand for one of exclusions.
-
-    InputError if a table lacks a column, or has another rating than `RATINGS`.
-    """
-    excluded = [] if exclusions is None else _read(exclusions, ())
-    rated = [] if ratings is None else _read(ratings, (_RATING,))
-    return Choices(
-        excluded=UserTable(
-            exclusions,
-            tuple(row for row in excluded if row.get(_RATING, RATINGS[-1]) == RATINGS[-1]),
-        ),
-        rated=UserTable(ratings, tuple(rated)),
-    )
 
 
 def _read(path: Path, needed: Sequence[str]) -> list[dict[str, str]]:

@@ -14,7 +14,7 @@ from hipsta_bids.errors import InputError
 from hipsta_bids.geometry.catalog import MAPS, why_impossible
 from hipsta_bids.geometry.sheet import sheet_levels
 from hipsta_bids.group.cohort.collect import Exclusion, SheetRecord
-from hipsta_bids.group.cohort.data import Measures
+from hipsta_bids.group.cohort.data import Cohort, Measures
 from hipsta_bids.group.stats.arrays import MOST_KEPT, Float, SideMaps, blocks
 from hipsta_bids.protocols import EXPERIMENTAL
 from hipsta_bids.settings import SheetSettings
@@ -44,11 +44,15 @@ def choose_measures(
     """Tell maps from summary measures."""
     if not requested:
         return Measures(maps=(*(DEFAULT if records else ()), *further))
-    summaries = _summary_names(records)
+    summaries = tuple(hemisphere.read_summary(records[0].result)) if records else ()
     available = [*(SHEET_MAPS if records else ()), *further, *_sampled(records), *summaries]
     maps, numbers = [], []
     for name in requested:
-        if name in further or (records and name in SHEET_MAPS) or _is_sampled(name, records):
+        if (
+            name in further
+            or (records and name in SHEET_MAPS)
+            or any(_sampled_table(record, name).is_file() for record in records)
+        ):
             maps.append(name)
         elif name in summaries or name.startswith(VOLUME):
             numbers.append(name)
@@ -74,10 +78,6 @@ def _unknown(name: str, available: Sequence[str], hint: str) -> InputError:
     return InputError(f"no measure is called {name!r}; {hint}")
 
 
-def _is_sampled(name: str, records: Sequence[SheetRecord]) -> bool:
-    return any(_sampled_table(record, name).is_file() for record in records)
-
-
 def _sampled(records: Sequence[SheetRecord]) -> list[str]:
     """Names of the sampled maps of the first hemisphere."""
     if not records:
@@ -88,20 +88,10 @@ def _sampled(records: Sequence[SheetRecord]) -> list[str]:
     return sorted(path.name.removeprefix(start).removesuffix(end) for path in paths)
 
 
-def _summary_names(records: Sequence[SheetRecord]) -> tuple[str, ...]:
-    return tuple(hemisphere.read_summary(records[0].result)) if records else ()
-
-
-@dataclass(frozen=True, kw_only=True)
-class Measured:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Measured(Cohort):
     """Sheets and summaries, before covariates are known."""
 
-    visits: pd.DataFrame
-    """Participant and session, one row per visit; the index has the names of visits."""
-    sides: Mapping[str, SideMaps]
-    x: Float
-    y: Float
-    units: Mapping[str, str]
     sources: Mapping[str, tuple[str, Path]]
     """Address of one segmentation, and the dataset whose record has it, of visits with sheets."""
     damaged: tuple[Exclusion, ...] = ()
@@ -163,7 +153,7 @@ def read_sheets(
         index=[visit_name(*visit) for visit in visits],
     )
     return Measured(
-        visits=table,
+        table=table,
         sides=sides,
         x=x,
         y=y,

@@ -139,7 +139,7 @@ def draw_roc(analysis: Analysis) -> "list[Figure]":
 
     def line(axis: "Axes", result: ClassifierResult, color: str) -> str:
         axis.plot(*result.curve, color=color)
-        area, left_out = result.auc, result.cross_validation.auc
+        area, left_out = result.auc, result.validated[0]
         return f"{area.area:.2f} ({area.low:.2f} to {area.high:.2f}),\n   left out {left_out:.2f}"
 
     labels = "1 - specificity", "sensitivity"

@@ -229,7 +229,7 @@ def read_study(
     tell("reading")
     external.check_volumes(options.volumes)
     collection = collect.collect_sheets(options.sheets, may_lack=bool(options.maps))
-    reserved = external.taken_names(with_sheets=bool(collection.records))
+    reserved = read.SHEET_MAPS if collection.records else ()
     requests = external.map_patterns(options.maps, options.surfaces, reserved)
     requested = designs.wanted_measures(options.model, options.measures)
     measures = read.choose_measures(requested, collection.records, [one.name for one in requests])
@@ -254,7 +254,7 @@ def read_study(
     read.check_summaries(measures, measured.sides)
     all_visits = Cohort(
         table=with_factors(
-            read_covariates(measured.visits, options.bids_dir, options.covariates),
+            read_covariates(measured.table, options.bids_dir, options.covariates),
             settings.design,
             settings.model,
         ),
@@ -287,7 +287,7 @@ def read_study(
         exclusions=(
             *collection.exclusions,
             *measured.damaged,
-            *collect.exclude_visits(measured.visits, reasons_of),
+            *collect.exclude_visits(measured.table, reasons_of),
         ),
         notes=(*collection.notes, *map_notes, *volume_notes, *_damaged(measured)),
         among=among,

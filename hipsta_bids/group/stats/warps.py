@@ -86,43 +86,27 @@ class Template:
     are; warps are followed by its inverse."""
 
 
-@dataclass(frozen=True)
 class _Moments:
-    """What the steps need to know of the profiles at their registered coordinates."""
+    """What the steps need to know of the profiles at their registered coordinates.
 
-    squares: Float
-    """(subjects, splines, splines) of the splines there."""
-    products: Float
-    """(subjects, splines) of splines and profiles."""
-    grid: Float
-    """(nodes, splines) mean of the splines."""
-    power: float
-    """Sum of the squared profiles."""
+    ``squares`` (subjects, splines, splines) of the splines there, their ``products`` with profiles
+    (subjects, splines), the mean of the splines at each node, and the sum of squared profiles.
+    """
 
-    @classmethod
-    def collect(cls, profiles: Float, warps: Float, knots: Float) -> "_Moments":
+    def __init__(self, profiles: Float, warps: Float, knots: Float) -> None:
         splines = make_basis(knots)
         size = splines.c.shape[1]
-        squares, products = np.empty((len(warps), size, size)), np.empty((len(warps), size))
-        grid = np.zeros((warps.shape[1], size))
+        self.squares, self.products = (
+            np.empty((len(warps), size, size)),
+            np.empty((len(warps), size)),
+        )
+        self.grid, self.power = np.zeros((warps.shape[1], size)), float(np.sum(profiles**2))
         for part in blocks(len(warps), _BLOCK):
             basis = splines(warps[part])
-            squares[part] = np.swapaxes(basis, 1, 2) @ basis
-            products[part] = np.einsum("sdk,sd->sk", basis, profiles[part])
-            grid += basis.sum(axis=0)
-        return cls(squares, products, grid / len(warps), float(np.sum(profiles**2)))
-
-
-@dataclass(frozen=True)
-class _Scores:
-    mean: Float
-    """(subjects, components)"""
-    covariance: Float
-    """(subjects, components, components)"""
-    squares: Float
-    """(subjects, components, components) of the components at the subject's nodes."""
-    projection: Float
-    """(subjects, components)"""
+            self.squares[part] = np.swapaxes(basis, 1, 2) @ basis
+            self.products[part] = np.einsum("sdk,sd->sk", basis, profiles[part])
+            self.grid += basis.sum(axis=0)
+        self.grid /= len(warps)
 
 
 def fit_template(
@@ -137,16 +121,15 @@ def fit_template(
     et al. 2018), all subjects at once.
     """
     knots = inner_knots(warps, splines)
-    moments = _Moments.collect(profiles, warps, knots)
+    moments = _Moments(profiles, warps, knots)
     mean = np.linalg.solve(moments.squares.sum(axis=0), moments.products.sum(axis=0))
     expected = BSpline(make_basis(knots).t, mean, DEGREE)(warps)
     parts = _start(profiles - expected, moments.grid, components)
     noise = 1.0
-    scores = _expect(moments, mean, parts, noise)  # the answer if there are no steps
+    scores, *_ = _expect(moments, mean, parts, noise)  # the answer if there are no steps
     for _ in range(EM_ITERATIONS - 1):
-        scores = _expect(moments, mean, parts, noise)
-        new_mean, new_parts = _maximize(moments, scores)
-        new_noise = _noise(moments, mean, scores)
+        scores, covariance, new_noise = _expect(moments, mean, parts, noise)
+        new_mean, new_parts = _maximize(moments, scores, covariance)
         change = np.sum((new_parts - parts) ** 2) + np.sum((new_mean - mean) ** 2)
         change += (new_noise - noise) ** 2
         mean, parts, noise = new_mean, new_parts, new_noise
@@ -154,14 +137,14 @@ def fit_template(
             break
     grid = np.linspace(0.0, 1.0, warps.shape[1])
     template = Template(knots, mean, parts, noise, scale=1.0, turns=0, center=grid)
-    return template, mean + scores.mean @ parts.T
+    return template, mean + scores @ parts.T
 
 
 def subject_curves(template: Template, profiles: Float, warps: Float) -> Float:
     """Each subject's own curve, by a template that does not change."""
-    moments = _Moments.collect(profiles, warps, template.knots)
-    scores = _expect(moments, template.mean, template.components, template.noise)
-    return template.mean + scores.mean @ template.components.T
+    moments = _Moments(profiles, warps, template.knots)
+    scores, *_ = _expect(moments, template.mean, template.components, template.noise)
+    return template.mean + scores @ template.components.T
 
 
 def _start(residuals: Float, grid: Float, components: int) -> Float:
@@ -171,31 +154,32 @@ def _start(residuals: Float, grid: Float, components: int) -> Float:
     return np.asarray(parts * size[:components] / np.sqrt(len(residuals)), dtype=np.float64)
 
 
-def _expect(moments: _Moments, mean: Float, parts: Float, noise: float) -> _Scores:
-    """Posterior of the scores."""
+def _expect(
+    moments: _Moments, mean: Float, parts: Float, noise: float
+) -> tuple[Float, Float, float]:
+    """Mean (subjects, components) and covariance of the scores' posterior.
+
+    Also the mean square, as expected, of what the subjects' templates leave.
+    """
     squares = parts.T @ moments.squares @ parts
     covariance = np.linalg.inv(squares / noise + np.eye(parts.shape[1]))
     projection = (moments.products - moments.squares @ mean) @ parts
     scores = np.einsum("spq,sq->sp", covariance, projection) / noise
-    return _Scores(scores, np.asarray(covariance, dtype=np.float64), squares, projection)
-
-
-def _noise(moments: _Moments, mean: Float, scores: _Scores) -> float:
-    """Mean square, as expected, of what the subjects' templates leave."""
     total = moments.power - 2 * float(moments.products.sum(axis=0) @ mean)
     total += float(mean @ moments.squares.sum(axis=0) @ mean)
-    total -= 2 * float(np.sum(scores.mean * scores.projection))
-    second = scores.covariance + scores.mean[:, :, None] * scores.mean[:, None, :]
-    total += float(np.sum(scores.squares * second))
-    return total / (len(moments.products) * len(moments.grid))
+    total -= 2 * float(np.sum(scores * projection))
+    second = covariance + scores[:, :, None] * scores[:, None, :]
+    total += float(np.sum(squares * second))
+    noise = total / (len(moments.products) * len(moments.grid))
+    return scores, np.asarray(covariance, dtype=np.float64), noise
 
 
-def _maximize(moments: _Moments, scores: _Scores) -> tuple[Float, Float]:
+def _maximize(moments: _Moments, scores: Float, covariance: Float) -> tuple[Float, Float]:
     """Mean and components that fit the profiles best, given the scores' posterior."""
-    subjects, components = scores.mean.shape
-    first = np.column_stack([scores.mean, np.ones(subjects)])
+    subjects, components = scores.shape
+    first = np.column_stack([scores, np.ones(subjects)])
     second = first[:, :, None] * first[:, None, :]
-    second[:, :components, :components] += scores.covariance
+    second[:, :components, :components] += covariance
     splines = moments.squares.shape[1]
     size = splines * (components + 1)
     system = np.einsum("sij,spq->ipjq", moments.squares, second, optimize=True)

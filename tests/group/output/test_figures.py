@@ -340,7 +340,7 @@ def test_legends_of_curves_are_beside_them_and_small_groups_have_no_calibration(
     calibration = calibrate(score, score > 0, ClassificationSettings(least_calibrated=2))
     one = SimpleNamespace(
         auc=Area(0.6, 0.1, 0.4, 0.8),
-        cross_validation=SimpleNamespace(auc=0.07),
+        validated=(0.07, 0.01),
         curve=roc_curve(score, score > 0),
         calibration=calibration,
     )
