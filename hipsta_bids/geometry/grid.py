@@ -173,11 +173,11 @@ def continued_nodes(grid: WedgeGrid, body: Body, depth: float) -> Float:
         slope = float(outward @ plane.normal)
         missing = depth + (points - plane.point) @ plane.normal * np.sign(slope)
         short = missing > 0
-        away, inward = missing[short], -outward / abs(slope)
+        depths, inward = missing[short], -outward / abs(slope)
         center, change = _motion(body, end, inward)
-        moved = points[short] - center + away[:, None] * inward
-        back = np.eye(3) - away[:, None, None] * change
-        points[short] = center + np.linalg.solve(back, moved[..., None])[..., 0]
+        moved = points[short] - center + depths[:, None] * inward
+        matrix = np.eye(3) - depths[:, None, None] * change
+        points[short] = center + np.linalg.solve(matrix, moved[..., None])[..., 0]
     return points
 
 
@@ -197,14 +197,14 @@ def _motion(body: Body, end: End, inward: Float) -> tuple[Float, Float]:
     places = digital.voxel_points(np.ones_like(mask), body.affine)
     places += body.affine[:3, :3] @ digital.low_corner(around)
     depth = (places - plane.point) @ normal
-    known = (depth > 0).reshape(mask.shape).astype(np.float64)
+    behind = (depth > 0).reshape(mask.shape).astype(np.float64)
     sigma = np.maximum(MOTION_SD / np.linalg.norm(body.affine[:3, :3], axis=0), 0.5)
-    weight = ndimage.gaussian_filter(known, sigma)
-    smooth = ndimage.gaussian_filter(known * mask, sigma) / np.maximum(weight, 1e-6)
+    weight = ndimage.gaussian_filter(behind, sigma)
+    smooth = ndimage.gaussian_filter(behind * mask, sigma) / np.maximum(weight, 1e-6)
     slopes = np.stack([*np.gradient(smooth)], axis=-1).reshape(-1, 3)
     slopes = slopes @ np.linalg.inv(body.affine[:3, :3])
-    used = (depth > body.ends.half_slice) & (depth < MOTION_REACH) & (slopes != 0).any(axis=1)
-    slopes, depth, places = slopes[used], depth[used], places[used]
+    edge = (depth > body.ends.half_slice) & (depth < MOTION_REACH) & (slopes != 0).any(axis=1)
+    slopes, depth, places = slopes[edge], depth[edge], places[edge]
     weight = MOTION_REACH - depth
     flat = places - depth[:, None] * inward  # moved back to the plane
     center = np.average(flat, axis=0, weights=weight * np.linalg.norm(slopes, axis=1))
