@@ -1,7 +1,7 @@
 """Whether a small change of the labels makes a small change of the map."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from pathlib import Path
 from types import MappingProxyType
@@ -14,6 +14,7 @@ from hipsta_bids.geometry.digital import to_ras
 from hipsta_bids.inputs.search import HemisphereInput
 from hipsta_bids.phantom import PhantomSpec
 from hipsta_bids.protocols.protocol import Part
+from hipsta_bids.settings import Settings
 from hipsta_bids.types import End, Float, GivenEnd, HemisphereMaps, LabelVolume, Status
 from validation import cases
 from validation.damage import Site, make_defect
@@ -68,6 +69,7 @@ class Trial:
     subject: Subject
     perturbation: str
     draw: int
+    settings: Settings = field(default_factory=Settings)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -237,19 +239,20 @@ def load(subject: Subject) -> tuple[LabelVolume, str]:
 
 
 @lru_cache(maxsize=4)
-def reference(subject: Subject) -> HemisphereMaps:
+def reference(subject: Subject, settings: Settings) -> HemisphereMaps:
     """Measure a subject's labels as they are."""
-    return cases.measure_body(*load(subject))
+    return cases.measure_body(*load(subject), settings)
 
 
 def move(trial: Trial) -> Movement:
     """Perturb labels, measure them, and compare the maps."""
     volume, hemi = load(trial.subject)
-    maps = reference(trial.subject)
+    maps = reference(trial.subject, trial.settings)
     number = list(PERTURBATIONS).index(trial.perturbation)
     random = np.random.default_rng((SEED, number, trial.draw))
     perturbed = PERTURBATIONS[trial.perturbation](volume, maps, random)
-    return compare(maps, cases.measure_body(perturbed, hemi), changed_points(volume, perturbed))
+    moved = cases.measure_body(perturbed, hemi, trial.settings)
+    return compare(maps, moved, changed_points(volume, perturbed))
 
 
 def changed_points(volume: LabelVolume, perturbed: LabelVolume) -> Float:
@@ -298,7 +301,8 @@ def _at(middle: Float, thickness: Float, points: Float) -> Float:
 def _choices(maps: HemisphereMaps, perturbed: HemisphereMaps) -> tuple[str, ...]:
     """Name discrete choices that differ."""
     keys = ("side_rule", "posterior_end_rule", "anterior_end_rule")
-    changed = [key for key in keys if maps.qc[key] != perturbed.qc[key]]
+    # A plane that the perturbation gives is no choice.
+    changed = [key for key in keys if perturbed.qc[key] not in (maps.qc[key], "user")]
     if len(maps.repairs) != len(perturbed.repairs):
         changed.append("repairs")
     return tuple(changed)
