@@ -142,10 +142,11 @@ class Body:
         return index, points
 
 
-def extract_body(volume: LabelVolume, settings: BodySettings) -> Body:
+def extract_body(volume: LabelVolume, settings: BodySettings, *, second: bool = False) -> Body:
     """Merge the sheet's subfields and find where the body begins and ends.
 
-    Merging and the molecular-layer rule: Diers et al. 2023, section 2.1.
+    With ``second``, doubtful cavities are taken for the other kind. Merging and the molecular-layer
+    rule: Diers et al. 2023, section 2.1.
     """
     tissue, layer_voxels = _merge_layer(volume, settings)
     if not tissue.any():
@@ -156,7 +157,7 @@ def extract_body(volume: LabelVolume, settings: BodySettings) -> Body:
         )
     ends = find_end_planes(volume, tissue, settings)
     volume, tissue, handed_over = completion.hand_over(volume, tissue, ends, settings.plane_reach)
-    cavities = completion.find_cavities(volume, tissue, ends, settings)
+    cavities = completion.find_cavities(volume, tissue, ends, settings, second=second)
     volume, tissue = completion.fill_cavities(volume, tissue, cavities, settings)
     change = None
     if volume.edited_mask is not None:

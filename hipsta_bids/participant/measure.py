@@ -334,9 +334,14 @@ def unfold(volume: LabelVolume, hemi: str, settings: Settings, clock: Clock) -> 
         if boundaries.rival is not None:
             rival = sample_sheet(mesh, lay_out(boundaries.rival), settings.sheet)
             rivals["medial or lateral boundary"] = measure_thickness(rival)
-        if solid.rival is not None:
-            with suppress(GeometryError):
+        with suppress(GeometryError):
+            if solid.rival is not None:
                 rivals["repair"] = _thickness(solid.rival, body, settings)
+        with suppress(GeometryError):
+            if body.cavities.doubtful:
+                second = extract_body(volume, settings.body, second=True)
+                field = resample_body(second, hemi, settings.grid, settings.slices)
+                rivals["reading of a cavity"] = _thickness(field, second, settings)
     return Evidence(
         body=body,
         surface=surface,
