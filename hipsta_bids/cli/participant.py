@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from hipsta_bids.inputs.scan import HemisphereInput, InputRequest
     from hipsta_bids.inputs.search import Findings
     from hipsta_bids.participant.run import RunOptions
+    from hipsta_bids.settings import Settings
 
 COLLECT = "collect"
 LEVELS = ("participant", COLLECT)
@@ -366,6 +367,7 @@ def _run(options: "Namespace", arguments: Sequence[str]) -> ExitCode:
     if options.dry_run:
         console.echo_table(selection_table(items))
         console.echo_table(ignored_table(findings.ignored))
+        _check_labels(items, settings)
         return ExitCode.OK
     check_output_is_no_input(options.output_dir, items)
     from hipsta_bids.participant.run import collect, run_participants  # noqa: PLC0415  (heavy)
@@ -380,6 +382,19 @@ def _run(options: "Namespace", arguments: Sequence[str]) -> ExitCode:
             result = run_participants(items, out, settings, run_options, progress.report)
     console.echo_result(result, out)
     return result.exit_code
+
+
+def _check_labels(items: "Sequence[HemisphereInput]", settings: "Settings") -> None:
+    """Print what is wrong with the labels of each usable hemisphere."""
+    from hipsta_bids.participant.job import check_item  # noqa: PLC0415  (heavy)
+
+    usable = [item for item in items if item.problem is None]
+    problems = [(item, text) for item in usable for text in check_item(item, settings)]
+    for item, text in problems:
+        session = f" ses-{item.session}" if item.session else ""
+        console.echo(f"sub-{item.subject}{session} {item.hemi} {item.protocol.name}, {text}")
+    wrong = len({id(item) for item, _ in problems})
+    console.echo(f"labels of {len(usable)} hemispheres checked, problems in {wrong}")
 
 
 def _find(

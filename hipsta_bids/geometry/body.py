@@ -223,14 +223,19 @@ def check_side(body: Body, hemi: str) -> float:
     # Six real bodies show 4-8 mm; one millimeter leaves room for a rotated head.
     centers = points[medial].mean(axis=0), points[lateral].mean(axis=0)
     if offset < -1.0 and not _has_handedness(body, *centers, hemi):
-        side = {"L": "left", "R": "right"}
-        opposite = side["R" if hemi == "L" else "L"]
-        raise GeometryError(
-            f"labeled {side[hemi]}, but the subiculum lies {-offset:.1f} mm lateral of CA1 as in "
-            f"a {opposite} hemisphere: check the image's affine and which file is which",
-            reason="left-right-swapped",
-        )
+        raise wrong_side(hemi, offset)
     return offset
+
+
+def wrong_side(hemi: str, offset: float) -> GeometryError:
+    """Make the error of a hemisphere whose medial subfields lie ``offset`` mm medially of CA1."""
+    side = {"L": "left", "R": "right"}
+    opposite = side["R" if hemi == "L" else "L"]
+    return GeometryError(
+        f"labeled {side[hemi]}, but the subiculum lies {-offset:.1f} mm lateral of CA1 as in "
+        f"a {opposite} hemisphere: check the image's affine and which file is which",
+        reason="left-right-swapped",
+    )
 
 
 def _has_handedness(body: Body, subiculum: Float, ca1: Float, hemi: str) -> bool:

@@ -264,6 +264,19 @@ def warm_up() -> None:
     import hipsta_bids.participant.measure  # noqa: F401, PLC0415
 
 
+def check_item(item: HemisphereInput, settings: Settings) -> list[str]:
+    """Read and check the labels of a hemisphere without measuring it; list what is wrong."""
+    from hipsta_bids.geometry.label_checks import check_label_image  # noqa: PLC0415  (heavy)
+    from hipsta_bids.inputs.labels import read_label_volume  # noqa: PLC0415  (heavy)
+
+    try:
+        volume = read_label_volume(item, settings.body.region)
+        findings = check_label_image(volume, item.hemi, settings.checks)
+    except HipstaError as error:
+        return [f"will be refused: {error}"]
+    return [f"will be flagged: {f.text}: {f.remedy}" for f in findings if f.raised]
+
+
 def run_job(job: Job) -> Outcome:
     """Measure one hemisphere and write its results; never raises a foreseen error.
 
