@@ -8,6 +8,7 @@ the hippocampus is thicker at its head and bows laterally.
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.body import wrong_side
@@ -130,7 +131,7 @@ def _check_axes(volume: LabelVolume, hemi: str) -> list[Finding]:
             f"anterior one, as if its head lay posterior: {check}",
             reason="axis-flipped",
         )
-    if position.winding < -_CLEAR_WINDING:
+    if position.winding < -_CLEAR_WINDING and _is_ordered(volume.tissue):
         if position.offset < 0:
             raise wrong_side(hemi, position.offset)
         raise GeometryError(
@@ -155,6 +156,16 @@ def _check_axes(volume: LabelVolume, hemi: str) -> list[Finding]:
             (behind, _CLEAR_BULGE, "the head seems to lie posterior of the tail"),
         )
     ]
+
+
+def _is_ordered(tissue: NDArray[np.uint8]) -> bool:
+    """Say whether the subiculum borders more on CA1 than on CA2 and CA3; else labels are wrong."""
+    bits = np.zeros(len(Tissue), dtype=np.uint8)
+    bits[list(MEDIAL_END)], bits[Tissue.CA1], bits[list(LATERAL_END)] = 1, 2, 4
+    groups = bits[tissue]
+    pairs = [np.moveaxis(groups, k, 0)[1:] | np.moveaxis(groups, k, 0)[:-1] for k in range(3)]
+    count = sum(np.bincount(pair.ravel(), minlength=8) for pair in pairs)
+    return bool(count[1 | 2] > count[1 | 4])
 
 
 def _find_position(volume: LabelVolume, hemi: str) -> _Position | None:

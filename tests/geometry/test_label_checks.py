@@ -163,6 +163,15 @@ def test_swapped_labels_of_head_and_tail_are_refused(body):
     assert verdict(replace(body, part=np.where(body.tissue > 0, part, 0))) == {"axis-flipped"}
 
 
+def test_labels_in_the_wrong_order_are_no_mirror_image(body):
+    tissue = np.select(
+        [body.tissue == Tissue.CA1, body.tissue == Tissue.CA2_3],
+        [Tissue.CA2_3, Tissue.CA1],
+        body.tissue,
+    )
+    assert flags(replace(body, tissue=tissue)) == set()  # a later check refuses them
+
+
 @pytest.mark.parametrize("flip", FLIPS)
 @pytest.mark.parametrize("labeled", [True, False])
 @pytest.mark.parametrize("degrees", [(0, 0, 0), (25, 0, 0), (0, -25, 0), (0, 0, 25)])
