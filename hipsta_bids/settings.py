@@ -35,6 +35,9 @@ class BodySettings(toml.SettingsTable):
     plane_reach: PositiveFloat = 3.0
     """End planes are fitted to labels within this distance of the interface, mm; head and tail
     labels that lie up to it on the wrong side get the subfield of a neighbor."""
+    end_rule: Literal["graded", "last-slice"] = "graded"
+    """Ends without labels of head or tail: a mean over graded evidence, or ``last-slice`` (the last
+    slice with CA1 and CA2 or CA3 posteriorly, with CA2 or CA3 anteriorly; Diers et al. 2023)."""
     end_margin: NonNegativeFloat = 0.0
     """Taken off either end where head or tail labels are missing, mm."""
     slit_area: NonNegativeFloat = 2.5
@@ -117,6 +120,15 @@ class BoundarySettings(toml.SettingsTable):
 
     solver: Literal["two-level", "lapy"] = "two-level"
     """What solves Laplace's equation, for boundaries and coordinates; ``lapy`` is slower."""
+    operator: Literal["sharp-bends", "published"] = "sharp-bends"
+    """What slows diffusion on the wall: convex bends beyond ``sharp_bend``, or ``published``: both
+    principal curvatures, without a threshold (Diers et al. 2023, appendix A)."""
+    edges: Literal["faces", "zero-lines"] = "faces"
+    """Where x is fixed: on the end faces of the sheet, or ``zero-lines``: on the zero lines of the
+    eigenfunction as they are (Diers et al. 2023)."""
+    published_anisotropy: NonNegativeFloat = 40.0
+    """Of the operator ``published``: exp(-this |k|), k in LaPy's units, that grow with the mesh's
+    edges; the default is that of Hipsta."""
     sharp_bend: NonNegativeFloat = 0.5
     """Convex bends with less curvature than this do not slow diffusion, 1/mm."""
     anisotropy: NonNegativeFloat = 8.0

@@ -300,6 +300,16 @@ _X_COORDINATE = {
     " without notches, so that it does not depend on the thickness.",
     "volume": "",
 }
+_END_RULE = {
+    "graded": "",
+    "last-slice": " Ends without labels of head or tail lay at the last slices with labels of CA1"
+    " and CA2 or CA3 (posterior), and of CA2 or CA3 (anterior), as in the original method.",
+}
+_OPERATOR = {
+    "sharp-bends": "",
+    "published": " of the original method, without a threshold of curvature",
+}
+_EDGES = {"faces": " and moved to the middle of the sheet's edges", "zero-lines": ""}
 _REGIONS = {
     "body": "",
     "extended": " For files with label-extended, the sheet goes on beyond the subiculum into the"
@@ -357,11 +367,13 @@ def citation_text(settings: Settings, protocols: Sequence[Protocol]) -> str:
             " sheet; the molecular layer, where labeled,"
             f" {_layer_rule(settings.body, protocols)}."
             f"{_REGIONS[settings.body.region]}"
+            f"{_END_RULE[settings.body.end_rule]}"
             " The sheet was continued a little beyond both ends, meshed as a closed surface of"
             " checked topology and filled with"
             f" tetrahedra by TetGen {cite['tetgen']}. Its medial and lateral ends were located with"
-            " an eigenfunction of the anisotropic Laplace-Beltrami operator, computed with LaPy"
-            f" {cite['shapedna']}{cite['brainprint']} and moved to the middle of the sheet's edges;"
+            " an eigenfunction of the anisotropic Laplace-Beltrami operator"
+            f"{_OPERATOR[settings.boundaries.operator]}, computed with LaPy"
+            f" {cite['shapedna']}{cite['brainprint']}{_EDGES[settings.boundaries.edges]};"
             " three harmonic functions between opposite"
             " faces gave each point a medial-to-lateral, posterior-to-anterior and"
             f" interior-to-exterior coordinate.{_X_COORDINATE[settings.sheet.x_coordinate]}"

@@ -263,7 +263,7 @@ def find_boundaries(
     wall = Wall(surface, settings)
     thickness = mean_wall_thickness(surface)
     values = _eigenfunction(wall, settings)
-    centered = None if values is None else center_curves(wall, values, thickness)
+    centered = None if values is None else _find_curves(wall, values, thickness, settings)
     if values is None or centered is None:
         raise GeometryError(
             "no line runs along the medial and the lateral edge from end to end: check the labels "
@@ -271,7 +271,10 @@ def find_boundaries(
             reason="boundaries",
         )
     curves, smooth = centered
-    strips, sides, pair = _strips_and_sides(wall, laplace, curves, smooth, thickness)
+    if settings.edges == "zero-lines":
+        strips, sides, pair = _narrow_strips(wall, curves)
+    else:
+        strips, sides, pair = _strips_and_sides(wall, laplace, curves, smooth, thickness)
     if sides is None:
         raise _inseparable(curves, body)
     if _rank(pair[0], body) > _rank(pair[1], body):
@@ -303,7 +306,9 @@ def _operators(wall: Wall, settings: BoundarySettings) -> Iterator[Laplace]:
     for bend, anisotropy in ((1.0, 1.0), *TILTS):
         yield wall.operator(
             settings.changed(
-                sharp_bend=bend * settings.sharp_bend, anisotropy=anisotropy * settings.anisotropy
+                sharp_bend=bend * settings.sharp_bend,
+                anisotropy=anisotropy * settings.anisotropy,
+                published_anisotropy=anisotropy * settings.published_anisotropy,
             )
         )
 
@@ -329,9 +334,28 @@ def _doubt(
     distances = []
     for operator in islice(_operators(wall, settings), 1, None):
         tilted = operator.eigenfunctions(1, near=values, residual=1e-3)[1][:, 0]
-        moved = center_curves(wall, tilted, thickness)
+        moved = _find_curves(wall, tilted, thickness, settings)
         distances.append(float("nan") if moved is None else _curve_distance(moved[0], curves))
     return float(np.max(distances))
+
+
+def _find_curves(
+    wall: Wall, values: Float, thickness: float, settings: BoundarySettings
+) -> tuple[Pair, Float] | None:
+    """Return the zero lines of a function (V,), centered or as they are, and the function."""
+    if settings.edges == "faces":
+        return center_curves(wall, values, thickness)
+    curves = end_to_end(wall, values)
+    return None if curves is None else (curves, values)
+
+
+def _narrow_strips(
+    wall: Wall, curves: Pair
+) -> tuple[tuple[Bool, Bool], tuple[Bool, Bool] | None, Pair]:
+    """Find the vertices along two curves, one on each edge that a curve crosses, and the sides."""
+    reach = 0.51 * float(wall.lengths.max())
+    first, second = (np.isfinite(wall.distance(curve, reach)) for curve in curves)
+    return (first, second), wall.sides(first | second), curves
 
 
 def _strips_and_sides(

@@ -43,7 +43,8 @@ class EndPlane(NamedTuple):
     """One end plane, and the rule by which it was found.
 
     The rule is ``user``, ``labels``, or what the automatic rule found most different beyond the
-    plane: ``subfields`` (no CA1, CA2 or CA3), ``core`` (no dentate gyrus) or ``cross-section``.
+    plane: ``subfields`` (no CA1, CA2 or CA3), ``core`` (no dentate gyrus) or ``cross-section``; or
+    ``last-slice``.
     """
 
     point: Float
