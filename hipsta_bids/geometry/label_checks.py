@@ -164,7 +164,7 @@ def _is_ordered(tissue: NDArray[np.uint8]) -> bool:
     bits[list(MEDIAL_END)], bits[Tissue.CA1], bits[list(LATERAL_END)] = 1, 2, 4
     groups = bits[tissue]
     pairs = [np.moveaxis(groups, k, 0)[1:] | np.moveaxis(groups, k, 0)[:-1] for k in range(3)]
-    count = sum(np.bincount(pair.ravel(), minlength=8) for pair in pairs)
+    count = np.sum([np.bincount(pair.ravel(), minlength=8) for pair in pairs], axis=0)
     return bool(count[1 | 2] > count[1 | 4])
 
 
