@@ -5,7 +5,9 @@ What does not change a result (jobs, verbosity, folders) is in
 :class:`hipsta_bids.participant.run.RunOptions`.
 """
 
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
@@ -38,6 +40,9 @@ class BodySettings(toml.SettingsTable):
     end_rule: Literal["graded", "last-slice"] = "graded"
     """Ends without labels of head or tail: a mean over graded evidence, or ``last-slice`` (the last
     slice with CA1 and CA2 or CA3 posteriorly, with CA2 or CA3 anteriorly; Diers et al. 2023)."""
+    mending: Literal["gaps", "closing"] = "gaps"
+    """Before the surface: ``gaps`` (slits, pits and cavities that match no fold are filled), or
+    ``closing`` (the mask is dilated and eroded by a voxel; Diers et al. 2023)."""
     end_margin: NonNegativeFloat = 0.0
     """Taken off either end where head or tail labels are missing, mm."""
     slit_area: NonNegativeFloat = 2.5
@@ -278,6 +283,17 @@ class SurrogateSettings(toml.SettingsTable):
     """Standard deviation of the Gaussian that rounds the voxels' corners, in-plane voxels."""
 
 
+#: Settings of ``--method published``: what Diers et al. 2023 describe. Topology is repaired in any
+#: case, where the original stops.
+PUBLISHED: Mapping[str, Mapping[str, str]] = MappingProxyType(
+    {
+        "body": {"end_rule": "last-slice", "mending": "closing"},
+        "boundaries": {"operator": "published", "edges": "zero-lines"},
+        "sheet": {"x_coordinate": "volume"},
+    }
+)
+
+
 class Settings(toml.SettingsTable):
     """All settings of the participant level."""
 
@@ -294,6 +310,15 @@ class Settings(toml.SettingsTable):
     maps: MapSettings = Field(default_factory=MapSettings)
     uncertainty: UncertaintySettings = Field(default_factory=UncertaintySettings)
     surrogate: SurrogateSettings = Field(default_factory=SurrogateSettings)
+
+    def as_published(self) -> list[str]:
+        """List the settings of ``--method published`` that hold here, as ``group.name``."""
+        return [
+            f"{group}.{name}"
+            for group, values in PUBLISHED.items()
+            for name, value in values.items()
+            if getattr(getattr(self, group), name) == value
+        ]
 
 
 def load_settings(path: Path | None) -> Settings:

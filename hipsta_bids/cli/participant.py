@@ -195,6 +195,12 @@ def _add_processing(parser: Parser) -> None:
         choices=REGIONS,
     )
     add(
+        "--method",
+        "NAME",
+        "default, or published: ends, mending, boundaries and x as in Diers et al. (2023)",
+        choices=("default", "published"),
+    )
+    add(
         "--x-coordinate",
         "NAME",
         "midsurface (default: harmonic on the mid-surface) or volume (Diers et al. 2023)",
@@ -330,7 +336,7 @@ def run_participant_level(options: "Namespace", arguments: Sequence[str] = ()) -
 
 def _run(options: "Namespace", arguments: Sequence[str]) -> ExitCode:
     pin_threads()
-    from hipsta_bids.settings import load_settings  # noqa: PLC0415  (start-up time)
+    from hipsta_bids.settings import PUBLISHED, load_settings  # noqa: PLC0415  (start-up time)
 
     for name, reason in options.ignored.items():
         console.echo(f"note: {name} has no effect: {reason}")
@@ -340,7 +346,9 @@ def _run(options: "Namespace", arguments: Sequence[str]) -> ExitCode:
         raise UsageError("collect is about all parts; leave --shard out")
     if options.reports_only:
         return _rebuild_reports(options)
-    settings = load_settings(options.settings).changed(
+    preset = PUBLISHED if options.method == "published" else {}
+    settings = load_settings(options.settings).changed(**preset)
+    settings = settings.changed(
         body={"region": options.region} if options.region else {},
         sheet={"x_coordinate": options.x_coordinate} if options.x_coordinate else {},
     )

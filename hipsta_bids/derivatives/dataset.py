@@ -305,6 +305,10 @@ _END_RULE = {
     "last-slice": " Ends without labels of head or tail lay at the last slices with labels of CA1"
     " and CA2 or CA3 (posterior), and of CA2 or CA3 (anterior), as in the original method.",
 }
+_MENDING = {
+    "gaps": "",
+    "closing": " The mask was dilated and eroded by a voxel, which closes small holes.",
+}
 _OPERATOR = {
     "sharp-bends": "",
     "published": " of the original method, without a threshold of curvature",
@@ -367,7 +371,7 @@ def citation_text(settings: Settings, protocols: Sequence[Protocol]) -> str:
             " sheet; the molecular layer, where labeled,"
             f" {_layer_rule(settings.body, protocols)}."
             f"{_REGIONS[settings.body.region]}"
-            f"{_END_RULE[settings.body.end_rule]}"
+            f"{_END_RULE[settings.body.end_rule]}{_MENDING[settings.body.mending]}"
             " The sheet was continued a little beyond both ends, meshed as a closed surface of"
             " checked topology and filled with"
             f" tetrahedra by TetGen {cite['tetgen']}. Its medial and lateral ends were located with"

@@ -156,7 +156,9 @@ def extract_body(volume: LabelVolume, settings: BodySettings) -> Body:
         )
     ends = find_end_planes(volume, tissue, settings)
     volume, tissue, handed_over = completion.hand_over(volume, tissue, ends, settings.plane_reach)
-    cavities = completion.find_cavities(volume, tissue, ends, settings)
+    cavities = completion.Cavities()
+    if settings.mending == "gaps":
+        cavities = completion.find_cavities(volume, tissue, ends, settings)
     volume, tissue = completion.fill_cavities(volume, tissue, cavities, settings)
     change = None
     if volume.edited_mask is not None:
@@ -179,12 +181,8 @@ def extract_body(volume: LabelVolume, settings: BodySettings) -> Body:
         )
     if region != "body":
         check_reach(points, tissue[inside], ends, settings)
-    empty = volume.tissue == Tissue.BACKGROUND
-    slits = completion.fill_slits(tissue, inside, empty, volume.affine, settings)
-    if volume.edited_mask is not None:  # a person has taken these voxels out
-        empty &= volume.edited_mask.inside
-    tissue, pits = completion.fill_pits(slits.tissue, inside, empty, volume.affine, settings)
-    if len(slits.filled) or len(pits):
+    tissue, added, gap = _mend(volume, tissue, inside, settings)
+    if len(added):
         inside, _ = completion.between(tissue > 0, volume.affine, ends)
     return Body(
         tissue=tissue,
@@ -195,13 +193,29 @@ def extract_body(volume: LabelVolume, settings: BodySettings) -> Body:
         ends=ends,
         layer_voxels=layer_voxels,
         inside=inside,
-        filled=np.concatenate([slits.filled, pits]),
+        filled=added,
         cavities=cavities,
         uncus=uncus,
         handed_over=handed_over,
-        gap=slits.gap,
+        gap=gap,
         mask_change=change,
     )
+
+
+def _mend(
+    volume: LabelVolume, tissue: completion.Tissues, inside: Bool, settings: BodySettings
+) -> tuple[completion.Tissues, completion.Index, completion.Index]:
+    """Fill what the settings say; return the tissue, what was added, and a gap that was left."""
+    affine, empty = volume.affine, volume.tissue == Tissue.BACKGROUND
+    allowed = np.ones_like(empty)
+    if volume.edited_mask is not None:  # a person has taken these voxels out
+        allowed = volume.edited_mask.inside
+    if settings.mending == "closing":
+        tissue, added = completion.close_mask(tissue, allowed, affine)
+        return tissue, added, added[:0]
+    slits = completion.fill_slits(tissue, inside, empty, affine, settings)
+    tissue, pits = completion.fill_pits(slits.tissue, inside, empty & allowed, affine, settings)
+    return tissue, np.concatenate([slits.filled, pits]), slits.gap
 
 
 def check_side(body: Body, hemi: str) -> float:

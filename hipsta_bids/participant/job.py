@@ -139,6 +139,7 @@ def base_record(job: Job) -> dict[str, Any]:
         | ({"normal_ras": end.normal} if end.normal else {})
         for end in item.ends
     ]
+    published = job.settings.as_published()
     return {
         "version": __version__,
         "settings_hash": job.settings_hash,
@@ -157,6 +158,7 @@ def base_record(job: Job) -> dict[str, Any]:
         ],
         "notes": item.notes,
         **({"given_ends": given_ends} if given_ends else {}),
+        **({"as_published": published} if published else {}),
     }
 
 
