@@ -5,7 +5,9 @@ What does not change a result (jobs, verbosity, folders) is in
 :class:`hipsta_bids.participant.run.RunOptions`.
 """
 
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
@@ -35,6 +37,12 @@ class BodySettings(toml.SettingsTable):
     plane_reach: PositiveFloat = 3.0
     """End planes are fitted to labels within this distance of the interface, mm; head and tail
     labels that lie up to it on the wrong side get the subfield of a neighbor."""
+    end_rule: Literal["graded", "last-slice"] = "graded"
+    """Ends without labels of head or tail: a mean over graded evidence, or ``last-slice`` (the last
+    slice with CA1 and CA2 or CA3 posteriorly, with CA2 or CA3 anteriorly; Diers et al. 2023)."""
+    mending: Literal["gaps", "closing"] = "gaps"
+    """Before the surface: ``gaps`` (slits, pits and cavities that match no fold are filled), or
+    ``closing`` (the mask is dilated and eroded by a voxel; Diers et al. 2023)."""
     end_margin: NonNegativeFloat = 0.0
     """Taken off either end where head or tail labels are missing, mm."""
     slit_area: NonNegativeFloat = 2.5
@@ -117,6 +125,15 @@ class BoundarySettings(toml.SettingsTable):
 
     solver: Literal["two-level", "lapy"] = "two-level"
     """What solves Laplace's equation, for boundaries and coordinates; ``lapy`` is slower."""
+    operator: Literal["sharp-bends", "published"] = "sharp-bends"
+    """What slows diffusion on the wall: convex bends beyond ``sharp_bend``, or ``published``: both
+    principal curvatures, without a threshold (Diers et al. 2023, appendix A)."""
+    edges: Literal["faces", "zero-lines"] = "faces"
+    """Where x is fixed: on the end faces of the sheet, or ``zero-lines``: on the zero lines of the
+    eigenfunction as they are (Diers et al. 2023)."""
+    published_anisotropy: NonNegativeFloat = 40.0
+    """Of the operator ``published``: exp(-this |k|), k in LaPy's units, that grow with the mesh's
+    edges; the default is that of Hipsta."""
     sharp_bend: NonNegativeFloat = 0.5
     """Convex bends with less curvature than this do not slow diffusion, 1/mm."""
     anisotropy: NonNegativeFloat = 8.0
@@ -266,6 +283,17 @@ class SurrogateSettings(toml.SettingsTable):
     """Standard deviation of the Gaussian that rounds the voxels' corners, in-plane voxels."""
 
 
+#: Settings of ``--method published``: what Diers et al. 2023 describe. Topology is repaired in any
+#: case, where the original stops.
+PUBLISHED: Mapping[str, Mapping[str, str]] = MappingProxyType(
+    {
+        "body": {"end_rule": "last-slice", "mending": "closing"},
+        "boundaries": {"operator": "published", "edges": "zero-lines"},
+        "sheet": {"x_coordinate": "volume"},
+    }
+)
+
+
 class Settings(toml.SettingsTable):
     """All settings of the participant level."""
 
@@ -282,6 +310,15 @@ class Settings(toml.SettingsTable):
     maps: MapSettings = Field(default_factory=MapSettings)
     uncertainty: UncertaintySettings = Field(default_factory=UncertaintySettings)
     surrogate: SurrogateSettings = Field(default_factory=SurrogateSettings)
+
+    def as_published(self) -> list[str]:
+        """List the settings of ``--method published`` that hold here, as ``group.name``."""
+        return [
+            f"{group}.{name}"
+            for group, values in PUBLISHED.items()
+            for name, value in values.items()
+            if getattr(getattr(self, group), name) == value
+        ]
 
 
 def load_settings(path: Path | None) -> Settings:

@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from hipsta_bids.inputs.scan import HemisphereInput, InputRequest
     from hipsta_bids.inputs.search import Findings
     from hipsta_bids.participant.run import RunOptions
+    from hipsta_bids.settings import Settings
 
 _HELP = "participant"
 """Texts of the help."""
@@ -105,6 +106,7 @@ def _add_processing(parser: Parser) -> None:
     add = adder(group, _HELP)
     add("--settings --config-file", "FILE.toml")
     add("--region", "NAME", choices=REGIONS)
+    add("--method", "NAME", choices=("default", "published"))
     add("--x-coordinate", "NAME", choices=("midsurface", "volume"))
     add("--ends", "FILE.tsv")
     add("--write-meshes")
@@ -181,7 +183,7 @@ def run_participant_level(options: "Namespace", arguments: Sequence[str] = ()) -
 
 def _run(options: "Namespace", arguments: Sequence[str]) -> ExitCode:
     pin_threads()
-    from hipsta_bids.settings import load_settings  # noqa: PLC0415  (start-up time)
+    from hipsta_bids.settings import PUBLISHED, load_settings  # noqa: PLC0415  (start-up time)
 
     for name, reason in dict(options.ignored).items():
         console.echo(f"note: {name} has no effect: {reason}")
@@ -191,7 +193,9 @@ def _run(options: "Namespace", arguments: Sequence[str]) -> ExitCode:
         raise UsageError("collect is about all parts; leave --shard out")
     if options.reports_only:
         return _rebuild_reports(options)
-    settings = load_settings(options.settings).changed(
+    preset = PUBLISHED if options.method == "published" else {}
+    settings = load_settings(options.settings).changed(**preset)
+    settings = settings.changed(
         body={"region": options.region} if options.region else {},
         sheet={"x_coordinate": options.x_coordinate} if options.x_coordinate else {},
     )
@@ -218,6 +222,7 @@ def _run(options: "Namespace", arguments: Sequence[str]) -> ExitCode:
     if options.dry_run:
         console.echo_table(selection_table(items))
         console.echo_table(ignored_table(findings.ignored))
+        _check_labels(items, settings)
         return ExitCode.OK
     check_output_is_no_input(options.output_dir, items)
     from hipsta_bids.participant.run import collect, run_participants  # noqa: PLC0415  (heavy)
@@ -232,6 +237,19 @@ def _run(options: "Namespace", arguments: Sequence[str]) -> ExitCode:
             result = run_participants(items, out, settings, run_options, progress.report)
     console.echo_result(result, out)
     return result.exit_code
+
+
+def _check_labels(items: "Sequence[HemisphereInput]", settings: "Settings") -> None:
+    """Print what is wrong with the labels of each usable hemisphere."""
+    from hipsta_bids.participant.job import check_item  # noqa: PLC0415  (heavy)
+
+    usable = [item for item in items if item.problem is None]
+    problems = [(item, text) for item in usable for text in check_item(item, settings)]
+    for item, text in problems:
+        session = f" ses-{item.session}" if item.session else ""
+        console.echo(f"sub-{item.subject}{session} {item.hemi} {item.protocol.name}, {text}")
+    wrong = len({id(item) for item, _ in problems})
+    console.echo(f"labels of {len(usable)} hemispheres checked, problems in {wrong}")
 
 
 def _find(

@@ -301,6 +301,10 @@ def citation_text(settings: Settings, protocols: Sequence[Protocol]) -> str:
         titles=titles,
         layer=_layer_rule(settings.body, protocols),
         region=region,
+        end_rule=about["end_rule"][settings.body.end_rule],
+        mending=about["mending"][settings.body.mending],
+        operator=about["operator"][settings.boundaries.operator],
+        edges=about["edges"][settings.boundaries.edges],
         x_coordinate=about["x_coordinate"][settings.sheet.x_coordinate],
     )
     lines = [

@@ -272,13 +272,15 @@ def find_boundaries(
     for bend, anisotropy in TILTS:
         operator = wall.operator(
             settings.changed(
-                sharp_bend=bend * settings.sharp_bend, anisotropy=anisotropy * settings.anisotropy
+                sharp_bend=bend * settings.sharp_bend,
+                anisotropy=anisotropy * settings.anisotropy,
+                published_anisotropy=anisotropy * settings.published_anisotropy,
             )
         )
         # A rough function leads to the same curves where these are certain.
         accuracy = 1e-3 if lines else 1e-6
         values = operator.eigenfunctions(1, near=values, residual=accuracy)[1][:, 0]
-        centered = center_curves(wall, values, thickness)
+        centered = _find_curves(wall, values, thickness, settings)
         if centered is not None:
             lines.append(centered)
         tilt += not lines
@@ -290,11 +292,11 @@ def find_boundaries(
         )
     distances = [_curve_distance(curves, lines[0][0]) for curves, _ in lines]
     farthest = int(np.argmax(distances))
-    along = partial(_along_curves, surface, wall, laplace, body, thickness=thickness)
-    first, rival = along(lines[0]), None
+    along = partial(_along_curves, surface, wall, laplace, body, settings, thickness=thickness)
+    first, rival = along(centered=lines[0]), None
     if distances[farthest] > SAME_CURVES:
         with suppress(GeometryError):
-            rival = along(lines[farthest])
+            rival = along(centered=lines[farthest])
     return replace(first, tilt=tilt, doubt=distances[farthest], rival=rival)
 
 
@@ -303,12 +305,16 @@ def _along_curves(
     wall: Wall,
     laplace: Laplace,
     body: Body,
-    centered: tuple[Pair, Float],
+    settings: BoundarySettings,
     *,
+    centered: tuple[Pair, Float],
     thickness: float,
 ) -> Boundaries:
     """Find strips and sides along two curves, given with the function whose zero lines they are."""
-    strips, sides, pair = _strips_and_sides(wall, laplace, *centered, thickness)
+    if settings.edges == "zero-lines":
+        strips, sides, pair = _narrow_strips(wall, centered[0])
+    else:
+        strips, sides, pair = _strips_and_sides(wall, laplace, *centered, thickness)
     if sides is None:
         raise _inseparable(centered[0], body)
     if _rank(pair[0], body) > _rank(pair[1], body):
@@ -332,6 +338,25 @@ def _along_curves(
         * signed_volume(surface.vertices, surface.triangles)
         / (float(wall.areas.sum()) - area),
     )
+
+
+def _find_curves(
+    wall: Wall, values: Float, thickness: float, settings: BoundarySettings
+) -> tuple[Pair, Float] | None:
+    """Return the zero lines of a function (V,), centered or as they are, and the function."""
+    if settings.edges == "faces":
+        return center_curves(wall, values, thickness)
+    curves = end_to_end(wall, values)
+    return None if curves is None else (curves, values)
+
+
+def _narrow_strips(
+    wall: Wall, curves: Pair
+) -> tuple[tuple[Bool, Bool], tuple[Bool, Bool] | None, Pair]:
+    """Find the vertices along two curves, one on each edge that a curve crosses, and the sides."""
+    reach = 0.51 * float(wall.lengths.max())
+    first, second = (np.isfinite(wall.distance(curve, reach)) for curve in curves)
+    return (first, second), wall.sides(first | second), curves
 
 
 def _strips_and_sides(

@@ -74,7 +74,8 @@ class Wall:
         plain = bare_mesh(TriaMesh, self.vertices, self.triangles)
         self._laplace = Laplace(plain, settings.solver)
         curved = _Mesh(self.vertices, self.triangles)
-        self._across, self._along, least, _ = curved.curvature_tria(CURVATURE_SMOOTHING)
+        self._across, self._along, least, largest = curved.curvature_tria(CURVATURE_SMOOTHING)
+        self._curvature = np.abs(np.stack([largest, least], axis=1))
         self._bend = -least / (LAPY_CURVATURE * float(self.lengths.mean()))
         self.evenly_aware = self.operator(settings, LEAST_DIFFUSION)
 
@@ -88,6 +89,9 @@ class Wall:
         divided by that and a factor (see the settings). On outward triangles it is negative where
         the surface is convex.
         """
+        if settings.operator == "published" and not least:
+            speeds = np.exp(-settings.published_anisotropy * self._curvature)
+            return self._laplace.directed(self._across, self._along, speeds)
         excess = np.maximum(self._bend - settings.sharp_bend, 0)
         slowed = np.maximum(np.exp(-settings.anisotropy * excess), least)
         speeds = np.stack([np.ones_like(slowed), slowed], axis=1)

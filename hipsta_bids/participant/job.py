@@ -139,6 +139,7 @@ def base_record(job: Job) -> dict[str, Any]:
         | ({"normal_ras": end.normal} if end.normal else {})
         for end in item.ends
     ]
+    published = job.settings.as_published()
     return {
         "version": __version__,
         "settings_hash": job.settings_hash,
@@ -157,6 +158,7 @@ def base_record(job: Job) -> dict[str, Any]:
         ],
         "notes": item.notes,
         **({"given_ends": given_ends} if given_ends else {}),
+        **({"as_published": published} if published else {}),
     }
 
 
@@ -262,6 +264,19 @@ def warm_up() -> None:
     """Load the libraries, so that no hemisphere's time includes it."""
     import hipsta_bids.inputs.labels  # noqa: PLC0415  (loaded in workers only)
     import hipsta_bids.participant.measure  # noqa: F401, PLC0415
+
+
+def check_item(item: HemisphereInput, settings: Settings) -> list[str]:
+    """Read and check the labels of a hemisphere without measuring it; list what is wrong."""
+    from hipsta_bids.geometry.label_checks import check_label_image  # noqa: PLC0415  (heavy)
+    from hipsta_bids.inputs.labels import read_label_volume  # noqa: PLC0415  (heavy)
+
+    try:
+        volume = read_label_volume(item, settings.body.region)
+        findings = check_label_image(volume, item.hemi, settings.checks)
+    except HipstaError as error:
+        return [f"will be refused: {error}"]
+    return [f"will be flagged: {f.text}: {f.remedy}" for f in findings if f.raised]
 
 
 def run_job(job: Job) -> Outcome:

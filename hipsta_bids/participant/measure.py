@@ -44,7 +44,8 @@ from hipsta_bids.geometry.findings import (
     flag_margins,
     raise_flags,
 )
-from hipsta_bids.geometry.grid import Field, check_voxel, in_plane_voxel, resample_body
+from hipsta_bids.geometry.grid import Field, in_plane_voxel, resample_body
+from hipsta_bids.geometry.label_checks import check_label_image
 from hipsta_bids.geometry.measures import bending_angle, measure_thickness
 from hipsta_bids.geometry.mesh import extract_surface, fill_surface, tetra_quality
 from hipsta_bids.geometry.sheet import (
@@ -96,6 +97,8 @@ class Evidence(Measured):
     """One hemisphere's sheet, and what the stages found out on their way to it."""
 
     coordinates: Coordinates
+    image: tuple[Finding, ...]
+    """What the checks of the label image found."""
     side: float
     """How far the medial subfields lie medially of CA1, mm."""
     solid: SolidField
@@ -298,7 +301,7 @@ Clock = Callable[[str], AbstractContextManager[None]]
 def unfold(volume: LabelVolume, hemi: str, settings: Settings, clock: Clock) -> Evidence:
     """Lay out the sheet of one hippocampal body; arguments are those of `measure_hemisphere`."""
     with clock("body"):
-        check_voxel(volume, settings.checks)
+        findings = check_label_image(volume, hemi, settings.checks)
         body = extract_body(volume, settings.body)
         side = check_side(body, hemi)
     with clock("surface"):
@@ -351,6 +354,7 @@ def unfold(volume: LabelVolume, hemi: str, settings: Settings, clock: Clock) -> 
         subfield=subfield,
         whole=whole,
         settings=settings,
+        image=tuple(findings),
         side=side,
         solid=solid,
         voxels_across=across,
@@ -474,6 +478,7 @@ def _find(volume: LabelVolume, hemi: str, evidence: Evidence) -> list[Finding]:
     body, settings, checks = evidence.body, evidence.settings, evidence.settings.checks
     mask = volume.edited_mask
     return [
+        *evidence.image,
         *check_end_labels(volume, body, checks),
         *check_thickness(evidence.thickness, evidence.boundaries.sheet_thickness, checks),
         *([check_flipped(evidence.sheet, hemi)] if body.region == "extended" else []),

@@ -274,3 +274,24 @@ def test_local_means_are_gaussian_in_the_distance():
     points, vectors = np.array([[1.0, 0, 0], [3.0, 0, 0]]), np.eye(3)[:2]
     found = boundaries._local_mean(np.zeros((1, 3)), points, vectors, np.array([1.0, 2.0]), sd=2.0)
     np.testing.assert_allclose(found, [[1.0, 2 * np.exp(-0.5 * (9 - 1) / 4), 0.0]], rtol=1e-12)
+
+
+@pytest.mark.parametrize("operator", ["sharp-bends", "published"])
+def test_published_boundaries_are_the_zero_lines(case, operator):
+    """Vertices beside a line, not the end faces; the sides reach to them."""
+    settings = BoundarySettings(operator=operator, edges="zero-lines")
+    laplace = volume_laplace(case.mesh, settings.solver)
+    found = find_boundaries(case.surface, laplace, case.body, settings)
+    assert 0 < found.strip_width < 0.7 < case.boundaries.strip_width
+    for u, curve, strip in (
+        (0, found.medial_curve, found.medial),
+        (1, found.lateral_curve, found.lateral),
+    ):
+        gap, _ = cKDTree(curve).query(case.surface.vertices[strip])
+        assert gap.max() < 0.4  # half of the longest edge of a mesh of 0.35 mm
+        assert cKDTree(rim(case, u)).query(curve)[0].max() < 1.0
+    sheet = sample_sheet(case.mesh, solve_coordinates(laplace, found), SheetSettings())
+    step = np.diff(sheet.points, axis=2)
+    thickness = np.linalg.norm(step, axis=3).sum(axis=2)
+    # Without end faces x does not converge beside the edges; in the middle half 2 mm are 2 mm.
+    assert np.nanmedian(thickness[10:31]) == pytest.approx(2.0, abs=0.05)

@@ -25,6 +25,7 @@ def evidence(arc):
         whole=arc.sheet,
         settings=Settings(),
         coordinates=arc.coordinates,
+        image=(),
         side=5.0,
         solid=arc.solid,
         voxels_across=5.0,
