@@ -131,14 +131,12 @@ class BoundarySettings(toml.SettingsTable):
     edges: Literal["faces", "zero-lines"] = "faces"
     """Where x is fixed: on the end faces of the sheet, or ``zero-lines``: on the zero lines of the
     eigenfunction as they are (Diers et al. 2023)."""
-    published_anisotropy: NonNegativeFloat = 40.0
-    """Of the operator ``published``: exp(-this |k|), k in LaPy's units, that grow with the mesh's
-    edges; the default is that of Hipsta."""
     sharp_bend: NonNegativeFloat = 0.5
     """Convex bends with less curvature than this do not slow diffusion, 1/mm."""
     anisotropy: NonNegativeFloat = 8.0
     """Diffusion across sharper ones, of curvature k, is slowed by exp(-anisotropy (k -
-    sharp_bend)), mm."""
+    sharp_bend)), mm. By the operator ``published`` exp(-anisotropy |k|) in both directions, k in
+    LaPy's units, which grow with the mesh's edges; Hipsta takes 40."""
 
 
 class SheetSettings(toml.SettingsTable):
@@ -285,10 +283,10 @@ class SurrogateSettings(toml.SettingsTable):
 
 #: Settings of ``--method published``: what Diers et al. 2023 describe. Topology is repaired in any
 #: case, where the original stops.
-PUBLISHED: Mapping[str, Mapping[str, str]] = MappingProxyType(
+PUBLISHED: Mapping[str, Mapping[str, str | float]] = MappingProxyType(
     {
         "body": {"end_rule": "last-slice", "mending": "closing"},
-        "boundaries": {"operator": "published", "edges": "zero-lines"},
+        "boundaries": {"operator": "published", "anisotropy": 40.0, "edges": "zero-lines"},
         "sheet": {"x_coordinate": "volume"},
     }
 )

@@ -11,7 +11,7 @@ import numpy as np
 from hipsta_bids.inputs.labels import read_label_volume
 from hipsta_bids.inputs.search import HemisphereInput
 from hipsta_bids.phantom import Phantom, PhantomSpec
-from hipsta_bids.settings import Settings
+from hipsta_bids.settings import PUBLISHED, Settings
 from hipsta_bids.types import Status
 from validation import cases, continuity
 from validation.report import Cell, Cells, Content, suite, table
@@ -29,9 +29,14 @@ POSES = 2
 VARIANTS: Mapping[str, Mapping[str, Mapping[str, Any]]] = MappingProxyType(
     {
         "default": {},
+        "published operator": {"boundaries": {"operator": "published", "anisotropy": 40.0}},
+        "edges at zero lines": {"boundaries": {"edges": "zero-lines"}},
+        "published rule of the ends": {"body": {"end_rule": "last-slice"}},
+        "closing, no gaps mended": {"body": {"mending": "closing"}},
         "x of the volume": {"sheet": {"x_coordinate": "volume"}},
         "no pits or slits filled": {"body": {"slit_voxel": 0.0}},
         "slices interpolated linearly": {"slices": {"min_ratio": 1e6}},
+        "all as published": PUBLISHED,
     }
 )
 #: Perturbations of the suite of continuity: small ones, and damage of an edge.

@@ -274,7 +274,6 @@ def find_boundaries(
             settings.changed(
                 sharp_bend=bend * settings.sharp_bend,
                 anisotropy=anisotropy * settings.anisotropy,
-                published_anisotropy=anisotropy * settings.published_anisotropy,
             )
         )
         # A rough function leads to the same curves where these are certain.

@@ -90,7 +90,7 @@ class Wall:
         the surface is convex.
         """
         if settings.operator == "published" and not least:
-            speeds = np.exp(-settings.published_anisotropy * self._curvature)
+            speeds = np.exp(-settings.anisotropy * self._curvature)
             return self._laplace.directed(self._across, self._along, speeds)
         excess = np.maximum(self._bend - settings.sharp_bend, 0)
         slowed = np.maximum(np.exp(-settings.anisotropy * excess), least)

@@ -255,7 +255,7 @@ def test_lapys_own_solver_finds_the_same(case):
     for name in ("medial", "lateral", "interior", "exterior"):
         np.testing.assert_array_equal(getattr(found, name), getattr(case.boundaries, name))
     # Directions at the edges are solved for to 1e-6, and curves follow them.
-    np.testing.assert_allclose(found.medial_curve, case.boundaries.medial_curve, atol=1e-4)
+    np.testing.assert_allclose(found.medial_curve, case.boundaries.medial_curve, atol=3e-4)
     sheet = sample_sheet(case.mesh, solve_coordinates(laplace, found), SheetSettings())
     np.testing.assert_allclose(sheet.points, case.sheet.points, atol=1e-6)
 
