@@ -137,7 +137,10 @@ def facing_strips(
             strip = np.flatnonzero(weights[k])
             starts = wall.vertices[strip]
             outward = -inward * _direction_at_edge(flow, starts, inward * thickness)
-            close = np.flatnonzero(np.isfinite(distance))
+            # Nearer and farther ones have a weight of 1 and 0, wherever they face.
+            close = np.flatnonzero(
+                (distance > LEAST_STRIP - 0.5 * LEAST_FADE) & (distance < reach + 0.5 * REACH_FADE)
+            )
             share = (weights[k] * areas)[strip]
             towards = _local_mean(wall.vertices[close], starts, outward, share, EDGE_SD * thickness)
             cosine = (normals[close] * _unit(towards)).sum(axis=1)
