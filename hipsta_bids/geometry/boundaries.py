@@ -5,6 +5,7 @@ parts of the wall belong to the edges by weights that fall smoothly from 1 to 0,
 change of the labels moves the boundary by little.
 """
 
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -17,7 +18,7 @@ from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.body import Body
 from hipsta_bids.geometry.checks import name_place
 from hipsta_bids.geometry.fem import DIRECTION_RESIDUAL, Laplace
-from hipsta_bids.geometry.mesh import mean_wall_thickness, signed_volume
+from hipsta_bids.geometry.mesh import mean_wall_thickness, signed_volume, tetra_volumes
 from hipsta_bids.geometry.wall import Wall, end_to_end
 from hipsta_bids.settings import BoundarySettings
 from hipsta_bids.types import Bool, Float, Int, Surface
@@ -55,6 +56,9 @@ HOLD_FADE = 0.15
 TILTS = ((1.0, 1.0), (0.8, 1.0), (1.0, 0.625))
 #: Curves this near to each other on average lead to the same map, mm.
 SAME_CURVES = 0.05
+#: Curves this near to each other on their way to the middle of the edges end in the same place, mm:
+#: each band divides their distance by about ten.
+MET_CURVES = 0.01
 #: Distances at which interior labels are looked for, mm outside the wall.
 PROBE_DISTANCES = (0.4, 0.8, 1.2)
 #: Fewer hits than this share count as no interior labels.
@@ -62,6 +66,10 @@ MIN_PROBE_SHARE = 0.02
 
 #: Medial and lateral, or the other way round.
 Pair = tuple[Float, Float]
+#: Such curves, and the function (V,) whose zero lines they are.
+Centered = tuple[Pair, Float]
+#: Unit vectors (N, 3) at points (N, 3).
+Flow = Callable[[Float], Float]
 
 
 def ramp(values: Float) -> Float:
@@ -70,24 +78,34 @@ def ramp(values: Float) -> Float:
     return np.asarray(share * share * (3 - 2 * share))
 
 
-def center_curves(wall: Wall, values: Float, thickness: float) -> tuple[Pair, Float] | None:
+def center_curves(
+    wall: Wall,
+    values: Float,
+    thickness: float,
+    reference: Sequence[Centered] = (),
+    bands: Sequence[float] = EDGE_BANDS,
+) -> Sequence[Centered] | None:
     """Move zero lines of a function (V,) to the middle of the sheet's edges, which may be rounded.
 
     The function is made again, free in ever narrower bands of equal width on both sides of its
     lines and held at its signs elsewhere: a side that bends more, or reaches farther into a band,
     would pull the line towards itself. Bands fade out, so that a vertex that enters one moves
-    nothing by much. Returns the lines and the function.
+    nothing by much. Returns the lines and the function before the first band and after each. Lines
+    that meet those of a ``reference`` on their way become these.
     """
-    curves = end_to_end(wall, values)
-    for width in EDGE_BANDS:
+    curves, steps = end_to_end(wall, values), list[Centered]()
+    for width in bands:
         if curves is None:
             return None
+        if reference and _curve_distance(curves, reference[len(steps)][0]) < MET_CURVES:
+            return reference
+        steps.append((curves, values))
         reach = (width + BAND_FADE) * thickness
         distance = np.minimum(*(wall.distance(curve, reach) for curve in curves)) / thickness
         hold = ramp((distance - width) / BAND_FADE + 0.5)
         values = _screened(wall, hold, values, thickness)
         curves = end_to_end(wall, values)
-    return None if curves is None else (curves, values)
+    return None if curves is None else [*steps, (curves, values)]
 
 
 def _screened(wall: Wall, hold: Float, values: Float, thickness: float) -> Float:
@@ -114,15 +132,19 @@ def facing_strips(
     """
     normals, areas = wall.smooth_normals, wall.vertex_areas
     weights = [1.0 * np.isfinite(wall.distance(line, FIRST_STRIP * thickness)) for line in curves]
+    mean = LocalMean(laplace)
     for reach in STRIP_REACH:
         medial, lateral = (wall.index[weight > STRIP_WEIGHT] for weight in weights)
-        flow = Flow(laplace, laplace.between(medial, lateral, DIRECTION_RESIDUAL))
+        flow = mean.direction(laplace.between(medial, lateral, DIRECTION_RESIDUAL))
         for k, inward in enumerate((1.0, -1.0)):
             distance = wall.distance(curves[k], (reach + REACH_FADE) * thickness) / thickness
             strip = np.flatnonzero(weights[k])
             starts = wall.vertices[strip]
             outward = -inward * _direction_at_edge(flow, starts, inward * thickness)
-            close = np.flatnonzero(np.isfinite(distance))
+            # Nearer and farther ones have a weight of 1 and 0, wherever they face.
+            close = np.flatnonzero(
+                (distance > LEAST_STRIP - 0.5 * LEAST_FADE) & (distance < reach + 0.5 * REACH_FADE)
+            )
             share = (weights[k] * areas)[strip]
             towards = _local_mean(wall.vertices[close], starts, outward, share, EDGE_SD * thickness)
             cosine = (normals[close] * _unit(towards)).sum(axis=1)
@@ -152,7 +174,7 @@ def _in_order(lines: Pair, curves: Pair) -> Pair:
     return lines if first <= second else (lines[1], lines[0])
 
 
-def _direction_at_edge(flow: "Flow", starts: Float, inward: float) -> Float:
+def _direction_at_edge(flow: Flow, starts: Float, inward: float) -> Float:
     """Compute the unit direction (N, 3) of the flow at the sheet's edge.
 
     Three steps are made into the sheet; a line through the directions found there is continued
@@ -179,47 +201,51 @@ def _local_mean(at: Float, points: Float, vectors: Float, weight: Float, sd: flo
     return np.asarray(np.einsum("mk,mkd->md", share, vectors[near]))
 
 
-class Flow:
-    """Direction of a harmonic function in a volume, averaged over a neighborhood.
+class LocalMean:
+    """Mean of directions in the tetrahedra of a volume, over a neighborhood.
 
-    The mean is taken on a grid, so that the tetrahedra's number and place matter little.
+    It is taken on a grid, so that the tetrahedra's number and place matter little.
     """
 
     _STEP = 0.7
     """Of the grid, times the SD."""
 
-    def __init__(self, laplace: Laplace, values: Float) -> None:
-        corners = laplace.points[laplace.cells.T]
-        volume = np.abs(
-            np.einsum(
-                "ij,ij->i",
-                corners[1] - corners[0],
-                np.cross(corners[2] - corners[0], corners[3] - corners[0]),
-            )
-        )
-        flow = laplace.gradient(values)
-        centers = corners.mean(axis=0)
-        self._step = self._STEP * FLOW_SD
+    def __init__(self, laplace: Laplace) -> None:
+        """Find the node of the grid nearest to each tetrahedron."""
+        self._laplace = laplace
+        points, step = laplace.points, self._STEP * FLOW_SD
+        self._volume = np.abs(tetra_volumes(points, laplace.cells))
         # Around the middle, so that mirror images get mirrored grids.
-        middle = 0.5 * (laplace.points.max(axis=0) + laplace.points.min(axis=0))
-        half = np.ceil(np.ptp(laplace.points, axis=0) / 2 / self._step).astype(int) + 6
-        self._low = middle - half * self._step
-        shape = 2 * half + 1
-        cell = np.rint((centers - self._low) / self._step).astype(np.intp)
-        index = np.ravel_multi_index(tuple(cell.T), tuple(shape))
-        total = [np.bincount(index, volume * part, int(np.prod(shape))) for part in flow.T]
-        self._grid = np.stack(
-            [
-                ndimage.gaussian_filter(part.reshape(shape), 1 / self._STEP, truncate=3.0)
-                for part in total
-            ]
-        )
+        low, high = points.min(axis=0), points.max(axis=0)
+        half = np.ceil((high - low) / 2 / step).astype(int) + 6
+        self._low, self._shape = 0.5 * (high + low) - half * step, 2 * half + 1
+        centers = sum(points[corner] for corner in laplace.cells.T) / 4
+        node = np.rint((centers - self._low) / step).astype(np.intp)
+        self._node = np.ravel_multi_index(tuple(node.T), tuple(self._shape))
 
-    def __call__(self, points: Float) -> Float:
-        """Return unit vectors (N, 3) at points (N, 3)."""
-        place = ((points - self._low) / self._step).T
-        rows = [ndimage.map_coordinates(part, place, order=1) for part in self._grid]
-        return _unit(np.stack(rows, axis=1))
+    def direction(self, values: Float) -> Flow:
+        """Return a function that gives the mean unit gradient (N, 3) of values at points (N, 3)."""
+        step = self._STEP * FLOW_SD
+        grids = [
+            ndimage.gaussian_filter(
+                np.bincount(self._node, self._volume * part, np.prod(self._shape)).reshape(
+                    self._shape
+                ),
+                1 / self._STEP,
+                output=np.float32,
+                truncate=3.0,
+            )
+            for part in self._laplace.gradient(values).T
+        ]
+
+        def flow(points: Float) -> Float:
+            place = ((points - self._low) / step).T
+            rows = [
+                ndimage.map_coordinates(grid, place, order=1, output=np.float64) for grid in grids
+            ]
+            return _unit(np.stack(rows, axis=1))
+
+        return flow
 
 
 def _unit(vectors: Float) -> Float:
@@ -268,7 +294,8 @@ def find_boundaries(
     """
     wall = Wall(surface, settings)
     thickness = mean_wall_thickness(surface)
-    tilt, values, lines = 0, None, list[tuple[Pair, Float]]()
+    tilt, lines, first = 0, list[Sequence[Centered]](), None
+    bands = EDGE_BANDS if settings.edges == "faces" else ()
     for bend, anisotropy in TILTS:
         operator = wall.operator(
             settings.changed(
@@ -276,10 +303,11 @@ def find_boundaries(
                 anisotropy=anisotropy * settings.anisotropy,
             )
         )
-        # A rough function leads to the same curves where these are certain.
-        accuracy = 1e-3 if lines else 1e-6
-        values = operator.eigenfunctions(1, near=values, residual=accuracy)[1][:, 0]
-        centered = _find_curves(wall, values, thickness, settings)
+        if first is None:
+            first, values = operator, operator.eigenfunctions(1)[1][:, 0]
+        else:  # A rough function leads to the same curves where these are certain.
+            values = operator.first_near(values, first)
+        centered = center_curves(wall, values, thickness, lines[0] if lines else (), bands)
         if centered is not None:
             lines.append(centered)
         tilt += not lines
@@ -289,14 +317,14 @@ def find_boundaries(
             "for folds that touch each other",
             reason="boundaries",
         )
-    distances = [_curve_distance(curves, lines[0][0]) for curves, _ in lines]
+    distances = [_curve_distance(steps[-1][0], lines[0][-1][0]) for steps in lines]
     farthest = int(np.argmax(distances))
     along = partial(_along_curves, surface, wall, laplace, body, settings, thickness=thickness)
-    first, rival = along(centered=lines[0]), None
+    boundaries, rival = along(centered=lines[0][-1]), None
     if distances[farthest] > SAME_CURVES:
         with suppress(GeometryError):
-            rival = along(centered=lines[farthest])
-    return replace(first, tilt=tilt, doubt=distances[farthest], rival=rival)
+            rival = along(centered=lines[farthest][-1])
+    return replace(boundaries, tilt=tilt, doubt=distances[farthest], rival=rival)
 
 
 def _along_curves(
@@ -306,7 +334,7 @@ def _along_curves(
     body: Body,
     settings: BoundarySettings,
     *,
-    centered: tuple[Pair, Float],
+    centered: Centered,
     thickness: float,
 ) -> Boundaries:
     """Find strips and sides along two curves, given with the function whose zero lines they are."""
@@ -339,16 +367,6 @@ def _along_curves(
     )
 
 
-def _find_curves(
-    wall: Wall, values: Float, thickness: float, settings: BoundarySettings
-) -> tuple[Pair, Float] | None:
-    """Return the zero lines of a function (V,), centered or as they are, and the function."""
-    if settings.edges == "faces":
-        return center_curves(wall, values, thickness)
-    curves = end_to_end(wall, values)
-    return None if curves is None else (curves, values)
-
-
 def _narrow_strips(
     wall: Wall, curves: Pair
 ) -> tuple[tuple[Bool, Bool], tuple[Bool, Bool] | None, Pair]:
@@ -365,17 +383,21 @@ def _strips_and_sides(
 
     Where strips that face along the sheet do not, those within ``FIRST_STRIP`` of the curves may.
     """
-    plain = [np.isfinite(wall.distance(curve, FIRST_STRIP * thickness)) for curve in curves]
-    attempts = [(plain, curves)]
     facing = facing_strips(wall, laplace, curves, values, thickness)
     if facing is not None:
         weights, lines = facing
-        attempts.insert(0, ([weight > STRIP_WEIGHT for weight in weights], lines))
-    for (first, second), _middle in attempts:
-        sides = None if (first & second).any() else wall.sides(first | second)
+        medial, lateral = (weight > STRIP_WEIGHT for weight in weights)
+        sides = _sides_between(wall, medial, lateral)
         if sides is not None:
-            break
-    return (first, second), sides, _middle
+            return (medial, lateral), sides, lines
+    reach = FIRST_STRIP * thickness
+    medial, lateral = (np.isfinite(wall.distance(curve, reach)) for curve in curves)
+    return (medial, lateral), _sides_between(wall, medial, lateral), curves
+
+
+def _sides_between(wall: Wall, medial: Bool, lateral: Bool) -> tuple[Bool, Bool] | None:
+    """Find the sides between two strips that do not touch, if there are two."""
+    return None if (medial & lateral).any() else wall.sides(medial | lateral)
 
 
 def _inseparable(curves: Pair, body: Body) -> GeometryError:

@@ -84,8 +84,7 @@ def whole_body(settings: SheetSettings) -> SheetSettings:
 def folded_fraction(mesh: TetMesh, coordinates: Coordinates) -> float:
     """Fraction of the body's volume in which the coordinates' orientation is not the usual one."""
     volume = tetra_volumes(mesh.vertices, mesh.tetrahedra)
-    corners = coordinates.values[mesh.tetrahedra]
-    inner = np.linalg.det(corners[:, 1:] - corners[:, :1])
+    inner = tetra_volumes(coordinates.values, mesh.tetrahedra)
     sign = np.sign((volume * inner).sum())
     return float(volume[inner * sign < 0].sum() / volume.sum())
 

@@ -37,6 +37,7 @@ from hipsta_bids.geometry.checks import (
     name_place,
     name_subfields,
 )
+from hipsta_bids.geometry.completion import DOUBTFUL_CAVITY
 from hipsta_bids.geometry.fem import Laplace, volume_laplace
 from hipsta_bids.geometry.findings import (
     add_consequence,
@@ -343,8 +344,10 @@ def unfold(volume: LabelVolume, hemi: str, settings: Settings, clock: Clock) -> 
         with suppress(GeometryError):
             if body.cavities.doubtful:
                 second = extract_body(volume, settings.body, second=True)
-                field = resample_body(second, hemi, settings.grid, settings.slices)
-                rivals["reading of a cavity"] = _thickness(field, second, settings)
+                changed = np.count_nonzero(second.inside != body.inside) * body.voxel_volume
+                if changed > DOUBTFUL_CAVITY:
+                    field = resample_body(second, hemi, settings.grid, settings.slices)
+                    rivals["reading of a cavity"] = _thickness(field, second, settings)
     return Evidence(
         body=body,
         surface=surface,

@@ -188,7 +188,7 @@ def test_curves_are_centered_from_any_start(arc):
     wall = Wall(arc.surface, SETTINGS)
     _, _, n = arc.phantom.body.locate(wall.vertices, hemi="L", reach=3.0).T
     n = np.nan_to_num(n)
-    ends = [center_curves(wall, n + shift, 2.0)[0] for shift in (-0.5, 0.0, 0.5)]
+    ends = [center_curves(wall, n + shift, 2.0)[-1][0] for shift in (-0.5, 0.0, 0.5)]
     for pair in (ends[0], ends[2]):
         for line, middle in zip(pair, ends[1], strict=True):
             assert cKDTree(middle).query(line)[0].mean() < 0.01
@@ -197,7 +197,7 @@ def test_curves_are_centered_from_any_start(arc):
 def test_weights_of_strips_fall_smoothly(arc):
     wall = Wall(arc.surface, SETTINGS)
     values = wall.operator(SETTINGS).eigenfunctions(1)[1][:, 0]
-    curves, smooth = center_curves(wall, values, 2.0)
+    curves, smooth = center_curves(wall, values, 2.0)[-1]
     weights, lines = facing_strips(wall, arc.laplace, curves, smooth, 2.0)
     for weight, line in zip(weights, lines, strict=True):
         assert weight.min() == 0.0

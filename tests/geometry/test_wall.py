@@ -109,7 +109,7 @@ def test_the_published_operator_is_lapys(slab):
     difference = abs(wall.operator(settings).stiffness - lapys.stiffness).max()
     assert difference < 1e-10 * abs(lapys.stiffness).max()  # rounding
     assert abs(wall.operator(SETTINGS).stiffness - lapys.stiffness).max() > 0.01
-    # Curves are moved to the middle of the edges by the operator with a threshold and a least speed.
+    # Curves are moved to the middle of the edges by the operator with a threshold and a floor.
     usual = Wall(slab.surface, BoundarySettings(anisotropy=40.0)).evenly_aware
     assert abs(wall.evenly_aware.stiffness - usual.stiffness).max() == 0
 
