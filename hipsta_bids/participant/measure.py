@@ -295,8 +295,10 @@ def quality_metrics(evidence: Evidence) -> dict[str, Any]:
 Clock = Callable[[str], AbstractContextManager[None]]
 
 
-def unfold(volume: LabelVolume, hemi: str, settings: Settings, clock: Clock) -> Evidence:
-    """Lay out the sheet of one hippocampal body; arguments are those of `measure_hemisphere`."""
+def unfold(
+    volume: LabelVolume, hemi: str, settings: Settings, clock: Clock, *, rivals: bool = True
+) -> Evidence:
+    """Lay out the sheet of one body, with second choices or not; cf. `measure_hemisphere`."""
     with clock("body"):
         check_voxel(volume, settings.checks)
         body = extract_body(volume, settings.body)
@@ -330,13 +332,13 @@ def unfold(volume: LabelVolume, hemi: str, settings: Settings, clock: Clock) -> 
         subfield = label_sheet(sheet, body)
         folded = folded_fraction(mesh, coordinates)
     with clock("second choices"):
-        rivals = {}
-        if boundaries.rival is not None:
+        rival_maps = {}
+        if rivals and boundaries.rival is not None:
             rival = sample_sheet(mesh, lay_out(boundaries.rival), settings.sheet)
-            rivals["medial or lateral boundary"] = measure_thickness(rival)
-        if solid.rival is not None:
+            rival_maps["medial or lateral boundary"] = measure_thickness(rival)
+        if rivals and solid.rival is not None:
             with suppress(GeometryError):
-                rivals["repair"] = _thickness(solid.rival, body, settings)
+                rival_maps["repair"] = _thickness(solid.rival, body, settings)
     return Evidence(
         body=body,
         surface=surface,
@@ -354,7 +356,7 @@ def unfold(volume: LabelVolume, hemi: str, settings: Settings, clock: Clock) -> 
         label_order=order,
         bending=bending,
         folded=folded,
-        rivals=rivals,
+        rivals=rival_maps,
     )
 
 

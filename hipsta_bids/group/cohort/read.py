@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from scipy.ndimage import uniform_filter
 
 from hipsta_bids.derivatives import hemisphere
 from hipsta_bids.errors import InputError
 from hipsta_bids.geometry.catalog import MAPS, why_impossible
+from hipsta_bids.geometry.measures import pool_sd
 from hipsta_bids.geometry.sheet import sheet_levels
 from hipsta_bids.group.cohort.collect import Exclusion, SheetRecord
 from hipsta_bids.group.cohort.data import Measures
@@ -230,17 +230,10 @@ def _read_errors(
     tables = [
         hemisphere.read_sheet(r.result.path("uncertainty"), columns, shape=shape) for r in records
     ]
-    errors = {}
-    for name in maps:
-        squares = np.stack([t[hemisphere.spread_name(name)] for t in tables]) ** 2
-        finite = np.isfinite(squares)
-        total, count = (
-            uniform_filter(values, (1, window, window), mode="nearest")
-            for values in (np.where(finite, squares, 0.0), finite.astype(np.float64))
-        )
-        mean = total / np.where(finite, count, 1.0)
-        errors[name] = np.where(finite, np.sqrt(np.maximum(mean, 0.0)), np.nan)
-    return errors
+    return {
+        name: pool_sd(np.stack([table[hemisphere.spread_name(name)] for table in tables]), window)
+        for name in maps
+    }
 
 
 def visits_of(records: Sequence[SheetRecord]) -> list[VisitKey]:
