@@ -242,7 +242,8 @@ class CheckSettings(toml.SettingsTable):
     flag_loose_part: NonNegativeFloat = 0.15
     """Flag a second piece of voxels, connected by faces, above this share of the sheet."""
     flag_rival: NonNegativeFloat = 0.12
-    """Flag if a second choice that is as likely moves the map by more than this (RMS), mm."""
+    """Flag if a second choice that is as likely, or a second group of copies (`--uncertainty`),
+    moves the map by more than this (RMS), mm."""
 
 
 class MapSettings(toml.SettingsTable):
@@ -257,12 +258,17 @@ class MapSettings(toml.SettingsTable):
 class UncertaintySettings(toml.SettingsTable):
     """Perturbed copies of the labels; their spread says how certain a map is (`--uncertainty`)."""
 
+    relabeling: NonNegativeFloat = 0.3
+    """Boundaries are drawn elsewhere by this in all, mm: SD along each axis."""
+    correlation: toml.Lengths = (1.0, 3.0)
+    """Distances over which these errors correlate by 1/e, mm, in equal shares of the variance that
+    ``jitter`` leaves."""
+    end_shift: NonNegativeFloat = 0.5
+    """End planes are placed elsewhere by this, slices: SD along the normal. An end without a label
+    moves by its standard error if that is larger."""
     jitter: NonNegativeFloat = 0.5
-    """Boundaries may be drawn this far away, voxels along each axis of the voxels, evenly
-    distributed: SD is this over the root of 3. 0: perfect labels, but for their voxels."""
-    correlation: PositiveFloat = 1.0
-    """Points this far apart move alike with a correlation of 1/e, voxels: 1 if voxels are labeled
-    one by one. Errors that reach farther make maps less certain."""
+    """Part of these errors is independent from voxel to voxel, evenly distributed up to this,
+    voxels along each axis of the voxels. 0, with ``relabeling`` 0: labels without errors."""
     rotation: Annotated[float, Field(ge=0, le=45)] = 5.0
     """Voxels are turned by up to this about each axis, degrees, and shifted by up to half of one:
     as if the body had lain elsewhere in the scanner."""

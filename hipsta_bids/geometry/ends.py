@@ -60,6 +60,16 @@ class EndPlane(NamedTuple):
         point, normal = self.point.round(3).tolist(), self.normal.round(4).tolist()
         return {"point_ras_mm": point, "normal_ras": normal}
 
+    def moved(self, end: End, shift: float, points: Float) -> GivenEnd:
+        """Give the plane that lies ``shift`` mm anterior, by a place beside one of points (N, 3).
+
+        The point of an automatic plane may lie far from the body.
+        """
+        height = (points - self.point) @ self.normal
+        nearest = np.abs(height).argmin()
+        point = points[nearest] + (shift - height[nearest]) * self.normal
+        return GivenEnd(end=end, point=tuple(point.tolist()), normal=tuple(self.normal.tolist()))
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class EndPlanes:

@@ -8,7 +8,7 @@ import sys
 import time
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -322,7 +322,7 @@ def _measure(job: Job) -> Outcome:
                 spread = uncertainty.estimate_uncertainty(
                     volume, job.item.hemi, job.settings, job.copies
                 )
-                maps = replace(maps, qc={**maps.qc, **spread.metrics})
+                maps = uncertainty.add_uncertainty(maps, spread)
                 record["notes"] = [*record["notes"], *spread.notes]
         with clock("write"):
             hemisphere.write_results(

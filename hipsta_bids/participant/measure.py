@@ -299,8 +299,10 @@ def quality_metrics(evidence: Evidence) -> dict[str, Any]:
 Clock = Callable[[str], AbstractContextManager[None]]
 
 
-def unfold(volume: LabelVolume, hemi: str, settings: Settings, clock: Clock) -> Evidence:
-    """Lay out the sheet of one hippocampal body; arguments are those of `measure_hemisphere`."""
+def unfold(
+    volume: LabelVolume, hemi: str, settings: Settings, clock: Clock, *, rivals: bool = True
+) -> Evidence:
+    """Lay out the sheet of one body, with second choices or not; cf. `measure_hemisphere`."""
     with clock("body"):
         findings = check_label_image(volume, hemi, settings.checks)
         body = extract_body(volume, settings.body)
@@ -334,20 +336,20 @@ def unfold(volume: LabelVolume, hemi: str, settings: Settings, clock: Clock) -> 
         subfield = label_sheet(sheet, body)
         folded = folded_fraction(mesh, coordinates)
     with clock("second choices"):
-        rivals = {}
-        if boundaries.rival is not None:
+        rival_maps = {}
+        if rivals and boundaries.rival is not None:
             rival = sample_sheet(mesh, lay_out(boundaries.rival), settings.sheet)
-            rivals["medial or lateral boundary"] = measure_thickness(rival)
+            rival_maps["medial or lateral boundary"] = measure_thickness(rival)
         with suppress(GeometryError):
-            if solid.rival is not None:
-                rivals["repair"] = _thickness(solid.rival, body, settings)
+            if rivals and solid.rival is not None:
+                rival_maps["repair"] = _thickness(solid.rival, body, settings)
         with suppress(GeometryError):
-            if body.cavities.doubtful:
+            if rivals and body.cavities.doubtful:
                 second = extract_body(volume, settings.body, second=True)
                 changed = np.count_nonzero(second.inside != body.inside) * body.voxel_volume
                 if changed > DOUBTFUL_CAVITY:
                     field = resample_body(second, hemi, settings.grid, settings.slices)
-                    rivals["reading of a cavity"] = _thickness(field, second, settings)
+                    rival_maps["reading of a cavity"] = _thickness(field, second, settings)
     return Evidence(
         body=body,
         surface=surface,
@@ -366,7 +368,7 @@ def unfold(volume: LabelVolume, hemi: str, settings: Settings, clock: Clock) -> 
         label_order=order,
         bending=bending,
         folded=folded,
-        rivals=rivals,
+        rivals=rival_maps,
     )
 
 
