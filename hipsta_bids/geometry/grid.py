@@ -19,7 +19,8 @@ from hipsta_bids.types import Bool, End, Float, LabelVolume
 
 #: Free space around the body, mm.
 GRID_MARGIN = 1.5
-#: How cross-sections change towards an end plane is taken from this depth behind it, mm, ...
+#: How cross-sections change towards an end plane is taken from this depth behind it, mm, and a
+#: slice more, so that there is one in any case, ...
 MOTION_REACH = 3.0
 #: ... of the mask smoothed by this SD, mm, and of half a voxel at least.
 MOTION_SD = 0.4
@@ -196,8 +197,9 @@ def _motion(body: Body, end: End, inward: Float) -> tuple[Float, Float, Float]:
     """
     plane = body.ends[end]
     normal = plane.normal * np.sign(plane.normal @ inward)
+    reach = MOTION_REACH + 2 * body.ends.half_slice
     index, points = body.inside_points()
-    near = index[(points - plane.point) @ normal < MOTION_REACH]
+    near = index[(points - plane.point) @ normal < reach]
     around = digital.box(np.maximum(near.min(axis=0) - 4, 0), near.max(axis=0) + 5)
     mask = body.tissue[around] > 0
     places = digital.voxel_points(np.ones_like(mask), body.affine)
@@ -209,9 +211,9 @@ def _motion(body: Body, end: End, inward: Float) -> tuple[Float, Float, Float]:
     smooth = ndimage.gaussian_filter(behind * mask, sigma) / np.maximum(weight, 1e-6)
     slopes = np.stack([*np.gradient(smooth)], axis=-1).reshape(-1, 3)
     slopes = slopes @ np.linalg.inv(body.affine[:3, :3])
-    edge = (depth > body.ends.half_slice) & (depth < MOTION_REACH) & (slopes != 0).any(axis=1)
+    edge = (depth > body.ends.half_slice) & (depth < reach) & (slopes != 0).any(axis=1)
     slopes, depth, places = slopes[edge], depth[edge], places[edge]
-    weight = MOTION_REACH - depth
+    weight = reach - depth
     flat = places - depth[:, None] * inward  # moved back to the plane
     center = np.average(flat, axis=0, weights=weight * np.linalg.norm(slopes, axis=1))
     across = np.linalg.svd(normal[None])[2][1:]

@@ -224,3 +224,18 @@ def test_cross_sections_go_on_changing_beyond_an_end_as_they_do_behind_it(growth
     expected = 3.0 + (nodes[:, 0] - 3.0) / (1 + 1.5 * growth)
     # 0.45 mm at the wall without the change; walls are known to a quarter of a voxel.
     np.testing.assert_allclose(read[:, 0], expected, atol=0.08)
+
+
+@pytest.mark.parametrize("offset", [0.0, 0.5, 1.0, 1.5])
+def test_cross_sections_of_thick_slices_go_on_wherever_the_plane_lies(offset):
+    """Slices of 2 mm: between half a slice and 3 mm behind a plane there may be no center."""
+    body = box_body(voxel=0.4, length=12.0)
+    affine = np.diag([0.4, 0.4, 2.0, 1.0])
+    affine[:3, 3] = [-1.0, -1.0, -3.0 + offset]
+    tissue = np.repeat(body.tissue[:, :, :1], 10, axis=2)
+    ends = replace(body.ends, half_slice=1.0)
+    thick = replace(body, tissue=tissue, inside=tissue > 0, affine=affine, ends=ends)
+    nodes = np.array([[x, 1.2, z] for x in (0.5, 5.5) for z in (-1.0, 13.0)])
+    grid = SimpleNamespace(node_points=nodes.copy)
+    read = continued_nodes(grid, thick, 0.0)
+    np.testing.assert_allclose(read[:, :2], nodes[:, :2], atol=0.02)  # the box does not change
