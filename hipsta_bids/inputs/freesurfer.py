@@ -9,16 +9,16 @@ folders, which have the same layout.
 
 import os
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from hipsta_bids.errors import HipstaError, InputError
 from hipsta_bids.inputs import scan
-from hipsta_bids.inputs.selection import Selection
+from hipsta_bids.inputs.selection import Context, LabelFile
 from hipsta_bids.protocols.load import load_protocol
 
-_NAME = re.compile(
+NAME = re.compile(
     r"(?P<hemi>[lr])h\.(?P<base>hippoAmygLabels|hippoSfLabels)(?P<analysis>.*?)"
     r"(?:\.(?P<hierarchy>CA|FS60|HBT))?(?P<coarse>\.FSvoxelSpace)?\.(?:mgz|mgh|nii|nii\.gz)"
 )
@@ -104,18 +104,10 @@ class _Run:
         return next(ways, None)
 
 
-def volume_table(path: Path) -> Path | None:
-    """Name the table of volumes that was written with a segmentation."""
-    match = _NAME.fullmatch(path.name)
-    if match is None:
-        return None
-    return path.with_name(f"{match['hemi']}h.hippoSfVolumes{match['analysis']}.txt")
-
-
 def without_labels(visit: scan.VisitFolders) -> Iterator[Path]:
     """List the subjects' folders of FreeSurfer that hold no segmentation of subfields."""
     for folder in visit.folders:
-        if folder.path.name == "mri" and not any(map(_NAME.fullmatch, folder.names)):
+        if folder.path.name == "mri" and not any(map(NAME.fullmatch, folder.names)):
             yield folder.path.parent
 
 
@@ -138,64 +130,51 @@ def same_labels(folders: Iterable[scan.SubjectFolder]) -> dict[str, HipstaError]
     }
 
 
-def find_freesurfer(
-    visit: scan.VisitFolders, source: scan.Source, selection: Selection
+def choose_run(
+    files: Sequence[LabelFile], context: Context, hemi: str
 ) -> Iterator[scan.HemisphereInput]:
-    """Find FreeSurfer's segmentations of one visit.
+    """Choose one hemisphere's files among FreeSurfer's.
 
     Taken are the files that are not resampled, of the preferred analysis (see
     :attr:`Analysis.rank`), in the full hierarchy; else ``.FS60`` or ``.CA``, combined with
     ``.HBT`` where that exists.
     """
-    for hemi in selection.wanted_hemis():
-        runs = _runs(visit, hemi)
-        if not runs:
-            continue
-        request = parse_analysis(selection.fs_analysis) if selection.fs_analysis else None
-        matching = [run for run in runs if request is None or run.analysis.answers(request)]
-        usable = [run for run in matching if run.way]
-        best = usable[0] if usable else None
-        problem = None if best else _problem(runs, matching, selection.fs_analysis)
-        run = best or runs[0]
-        subfields, parts, protocol = run.way or (next(iter(run.files)), None, "freesurfer")
-        files = tuple(run.files[name] for name in (subfields, parts) if name)
-        if run.old and run.way:
-            protocol = "freesurferFS60"
-        coarse = "only .FSvoxelSpace exists: labels resampled to 1 mm lose thin layers"
-        yield scan.HemisphereInput(
-            subject=visit.subject,
-            session=visit.session,
-            hemi=hemi,
-            protocol=load_protocol(protocol),
-            files=files,
-            parts_protocol=load_protocol("freesurferHBT") if parts else None,
-            source=source.name,
-            source_path=source.path,
-            explanation=_why(run, subfields, parts, selection.fs_analysis),
-            passed_over=tuple(_passed_over(runs, run, files)),
-            problem=problem,
-            notes=(coarse,) if best and run.coarse else (),
-        )
+    analysis = context.selection.fs_analysis
+    request = parse_analysis(analysis) if analysis else None
+    runs = _runs(files)
+    matching = [run for run in runs if request is None or run.analysis.answers(request)]
+    best = next((run for run in matching if run.way), None)
+    run = best or runs[0]
+    subfields, parts, protocol = run.way or (next(iter(run.files)), None, "freesurfer")
+    paths = [run.files[name] for name in (subfields, parts) if name]
+    coarse = "only .FSvoxelSpace exists: labels resampled to 1 mm lose thin layers"
+    yield context.input(
+        hemi,
+        load_protocol("freesurferFS60" if run.old and run.way else protocol),
+        paths,
+        _why(run, subfields, parts, analysis),
+        parts_protocol=load_protocol("freesurferHBT") if parts else None,
+        passed_over=_passed_over(runs, run, paths),
+        problem=None if best else _problem(runs, matching, analysis),
+        notes=(coarse,) if best and run.coarse else (),
+    )
 
 
-def _runs(visit: scan.VisitFolders, hemi: str) -> list[_Run]:
+def _runs(files: Iterable[LabelFile]) -> list[_Run]:
     """Group a hemisphere's files by analysis and resolution, best first."""
     runs: dict[tuple[object, ...], _Run] = {}
-    for folder in _each_once(visit.folders):
-        for name in folder.names:
-            match = _NAME.fullmatch(name) if ".hippo" in name else None
-            if match is None or match["hemi"] != hemi.lower():
-                continue
-            analysis = parse_analysis(match["analysis"], longitudinal=folder.longitudinal)
-            coarse, old = match["coarse"] is not None, match["base"] == _OLD
-            key = (str(folder.path), analysis.name, coarse, old)
-            run = runs.setdefault(key, _Run(analysis=analysis, coarse=coarse, old=old, files={}))
-            # Of several formats, the first by name: .mgz before .nii.
-            run.files.setdefault(match["hierarchy"] or "full", folder.path / name)
+    for file in files:
+        traits = file.traits
+        analysis = parse_analysis(traits["analysis"] or "", longitudinal=file.longitudinal)
+        coarse, old = traits["coarse"] is not None, traits["base"] == _OLD
+        key = (str(file.path.parent), analysis.name, coarse, old)
+        run = runs.setdefault(key, _Run(analysis=analysis, coarse=coarse, old=old, files={}))
+        # Of several formats, the first by name: .mgz before .nii.
+        run.files.setdefault(traits["hierarchy"] or "full", file.path)
     return sorted(runs.values(), key=lambda run: run.rank)
 
 
-def _each_once(folders: tuple[scan.Folder, ...]) -> tuple[scan.Folder, ...]:
+def each_once(folders: tuple[scan.Folder, ...]) -> tuple[scan.Folder, ...]:
     """Leave out longitudinal folders that are links to others here, as FastSurfer's tools make."""
     if not any(folder.longitudinal for folder in folders):
         return folders
@@ -212,21 +191,17 @@ def _why(run: _Run, subfields: str, parts: str | None, requested: str | None) ->
     return f"{hierarchy}{combined}, analysis {run.analysis.name}{choice}"
 
 
-def _passed_over(
-    runs: list[_Run], best: _Run, used_paths: tuple[Path, ...]
-) -> Iterator[tuple[str, str]]:
+def _passed_over(runs: list[_Run], best: _Run, used_paths: list[Path]) -> Iterator[tuple[str, str]]:
     for run in runs:
+        name = run.analysis.name
         for hierarchy, path in run.files.items():
-            if path in used_paths:
-                continue
+            reason = f"analysis {name} comes later by default; --fs-analysis {name} selects it"
             if run.coarse and not best.coarse:
                 reason = "resampled to 1 mm; a finer file exists"
             elif run is best:
                 reason = f"{hierarchy} hierarchy: less detail than what was taken"
-            else:
-                name = run.analysis.name
-                reason = f"analysis {name} comes later by default; --fs-analysis {name} selects it"
-            yield path.name, reason
+            if path not in used_paths:
+                yield path.name, reason
 
 
 def _problem(runs: list[_Run], matching: list[_Run], requested: str | None) -> HipstaError:

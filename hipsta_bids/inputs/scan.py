@@ -226,6 +226,10 @@ class VisitFolders(Visit):
     folders: tuple[Folder, ...]
 
 
+#: Stands for the visit where there is none yet.
+NO_VISIT = VisitFolders(subject="", session=None, folders=())
+
+
 def list_folder(path: Path) -> tuple[list[str], list[str]]:
     """List a folder."""
     folders: list[str] = []

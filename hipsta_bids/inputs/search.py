@@ -1,8 +1,8 @@
 """Finding the segmentations of each hemisphere.
 
 The flow: which datasets to search, and which subjects and sessions they hold (``scan``), which
-files are segmentations (one module per layout: ``freesurfer``, ``ashs``, ``hippunfold``,
-``tools``, ``generic``), and which of several to take. No image is opened, except where ASHS's atlas
+files are segmentations (``layouts``; ``freesurfer``, ``ashs`` and ``generic`` have what is
+special), and which of several to take. No image is opened, except where ASHS's atlas
 can only be told from the labels.
 
 A picture of labels on an image from another space misleads, so pages show only these images:
@@ -24,11 +24,11 @@ from pathlib import Path
 
 from hipsta_bids.derivatives.dataset import read_description
 from hipsta_bids.errors import InputError, NothingToDoError, UsageError
-from hipsta_bids.inputs import ashs, freesurfer
-from hipsta_bids.inputs.ashs import AtlasFinder, choose_atlas, find_ashs
+from hipsta_bids.inputs.ashs import choose_atlas
 from hipsta_bids.inputs.edits import EditedFile, attach_edits, each_once, edits_of_visit, list_edits
-from hipsta_bids.inputs.freesurfer import find_freesurfer, same_labels, without_labels
-from hipsta_bids.inputs.generic import find_named, forget_tables, without_side
+from hipsta_bids.inputs.freesurfer import same_labels, without_labels
+from hipsta_bids.inputs.generic import forget_tables, without_side
+from hipsta_bids.inputs.layouts import LAYOUTS, atlas_finder, find, volume_table
 from hipsta_bids.inputs.scan import (
     HEMIS,
     HemisphereInput,
@@ -36,15 +36,13 @@ from hipsta_bids.inputs.scan import (
     InputRequest,
     Source,
     SubjectFolder,
-    VisitFolders,
     list_folder,
     list_participants,
     list_sources,
     list_visits,
     sort_folders,
 )
-from hipsta_bids.inputs.selection import Selection, make_selection
-from hipsta_bids.inputs.tools import find_hippunfold, find_tools
+from hipsta_bids.inputs.selection import Context, Selection, make_selection
 from hipsta_bids.io.files import entities
 from hipsta_bids.protocols.protocol import Protocol
 from hipsta_bids.types import Hemisphere
@@ -242,10 +240,12 @@ def _search(source: Source, selection: Selection, option: Protocol | None, resul
     results.strays += strays
     results.renamed += [folder for folder in folders if folder.renamed]
     renaming = _renaming(folders)
-    atlases = AtlasFinder(source.path, option)
+    context = Context(source=source, selection=selection, atlas=option)
+    context = replace(context, atlases=atlas_finder(context))
+    searched = [layout for layout in LAYOUTS if layout.kind in source.layouts]
     for visit in filter(selection.wants_visit, list_visits(folders, results.ignored)):
         results.edited += edits_of_visit(visit, source.path, source.name, beside=True)
-        items = list(_search_visit(visit, source, selection, atlases))
+        items = [i for layout in searched for i in find(layout, replace(context, visit=visit))]
         results.ignored += without_side(visit) if "named" in source.layouts else ()
         used_files = [file for item in items for file in item.files]
         results.ignored += [
@@ -258,22 +258,6 @@ def _search(source: Source, selection: Selection, option: Protocol | None, resul
             note = renaming.get((item.subject, item.session))
             notes = item.notes if note is None else (*item.notes, note)
             results.items.append(replace(item, problem=problem, notes=notes))
-
-
-def _search_visit(
-    visit: VisitFolders, source: Source, selection: Selection, atlases: AtlasFinder
-) -> Iterator[HemisphereInput]:
-    """Search the folders of one visit for all kinds of segmentations."""
-    if "freesurfer" in source.layouts:
-        yield from find_freesurfer(visit, source, selection)
-    if "ashs" in source.layouts:
-        yield from find_ashs(visit, source, selection, atlases)
-    if "hippunfold" in source.layouts:
-        yield from find_hippunfold(visit, source, selection)
-    if "tools" in source.layouts:
-        yield from find_tools(visit, source, selection)
-    if "named" in source.layouts:
-        yield from find_named(visit, source, selection)
 
 
 def _without_clashes(
@@ -385,12 +369,12 @@ class Candidate:
 
 def find_anatomy(labels: Path, hemisphere: Hemisphere, bids_dir: Path) -> Iterator[Candidate]:
     """List anatomical images that may lie behind a hemisphere's labels, best first, unopened."""
-    if freesurfer.volume_table(labels) is not None:
+    if volume_table(labels, "freesurfer") is not None:
         for name in _FREESURFER:
             if (path := labels.with_name(name)).is_file():
                 yield Candidate(path=path, proven=True)
         return
-    if ashs.volume_table(labels) is not None:
+    if volume_table(labels, "ashs") is not None:
         folder = labels.parent
         for parent in (folder, folder.parent) if folder.name == "final" else (folder,):
             for name in _names(parent):

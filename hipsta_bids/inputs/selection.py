@@ -4,15 +4,18 @@ import difflib
 import json
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from hipsta_bids.errors import HipstaError, InputError, ProtocolError, UsageError
 from hipsta_bids.inputs import scan
 from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.protocols.protocol import Protocol
+
+if TYPE_CHECKING:
+    from hipsta_bids.inputs.ashs import AtlasFinder
 
 #: The entry of the filter file that applies to segmentations.
 _QUERY = "dseg"
@@ -83,48 +86,85 @@ class Selection:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SidedFile:
-    """Labels of one hemisphere, or of both."""
+class LabelFile:
+    """A file with labels, as its name says."""
 
     path: Path
     hemi: str | None
     """None for both."""
-    rank: tuple[int, ...]
+    traits: Mapping[str, str | None]
+    """Groups of its layout's pattern, and entities."""
+    longitudinal: bool = False
+    rank: tuple[Any, ...] = ()
     """Order of preference, the least first."""
 
+    def ranked(self, rank: tuple[Any, ...]) -> "LabelFile":
+        """Return this file with its rank."""
+        return replace(self, rank=rank)
 
-def choose_file(
-    files: Sequence[SidedFile],
-    visit: scan.VisitFolders,
-    hemi: str,
-    source: scan.Source,
-    *,
-    candidate: tuple[Protocol, HipstaError | None],
-    explanation: tuple[str, str],
-    passed_over: Iterable[tuple[str, str]],
-) -> scan.HemisphereInput:
-    """Take the first file of a hemisphere, unless another one is as good."""
-    (protocol, problem), best = candidate, files[0]
-    rivals = [file.path.name for file in files if file.rank == best.rank]
-    if len(rivals) > 1:
-        problem = InputError(
-            f"{best.path.parent}: {' and '.join(rivals)} are equally good; "
-            "keep one of them in the subject's folder",
-            reason="several-files",
+
+@dataclass(frozen=True, kw_only=True)
+class Verdict:
+    """Which protocol a file has, and why."""
+
+    protocol: Protocol
+    explanation: tuple[str, str]
+    """Before and after a remark about the hemispheres in the file."""
+    problem: HipstaError | None = None
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Context:
+    """What the choice of a visit's files depends on."""
+
+    source: scan.Source
+    selection: Selection
+    atlas: Protocol | None
+    """Of ``--ashs-atlas``."""
+    visit: scan.VisitFolders = scan.NO_VISIT
+    atlases: "AtlasFinder | None" = None
+
+    def input(
+        self,
+        hemi: str,
+        protocol: Protocol,
+        paths: Sequence[Path],
+        explanation: str,
+        *,
+        parts_protocol: Protocol | None = None,
+        bilateral: bool = False,
+        passed_over: Iterable[tuple[str, str]] = (),
+        problem: HipstaError | None = None,
+        notes: tuple[str, ...] = (),
+    ) -> scan.HemisphereInput:
+        """Make the input of one hemisphere of the visit."""
+        return scan.HemisphereInput(
+            subject=self.visit.subject,
+            session=self.visit.session,
+            hemi=hemi,
+            protocol=protocol,
+            files=tuple(paths),
+            parts_protocol=parts_protocol,
+            bilateral=bilateral,
+            source=self.source.name,
+            source_path=self.source.path,
+            explanation=explanation,
+            passed_over=tuple(passed_over),
+            problem=problem,
+            notes=notes,
         )
-    note = ", both hemispheres in one file" if best.hemi is None else ""
-    return scan.HemisphereInput(
-        subject=visit.subject,
-        session=visit.session,
-        hemi=hemi,
-        protocol=protocol,
-        files=(best.path,),
-        bilateral=best.hemi is None,
-        source=source.name,
-        source_path=source.path,
-        explanation=note.join(explanation),
-        passed_over=tuple(passed_over),
-        problem=problem,
+
+
+def rivals_problem(files: Sequence[LabelFile]) -> InputError | None:
+    """Refuse to choose between files of which none is better."""
+    names = [file.path.name for file in files if file.rank == files[0].rank]
+    if len(names) == 1:
+        return None
+    return InputError(
+        f"{files[0].path.parent}: {' and '.join(names)} are equally good; "
+        "keep one of them in the subject's folder",
+        reason="several-files",
     )
 
 

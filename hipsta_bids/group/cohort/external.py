@@ -17,7 +17,7 @@ from hipsta_bids.group.cohort.covariates import locate_sources
 from hipsta_bids.group.cohort.data import Cohort
 from hipsta_bids.group.cohort.read import CURVATURE, THICKNESS, VOLUME, Measured, visit_name
 from hipsta_bids.group.stats.arrays import SideMaps
-from hipsta_bids.inputs import ashs, freesurfer
+from hipsta_bids.inputs.layouts import volume_table
 from hipsta_bids.inputs.maps import Found, check_pattern, fields_of, fill, find, scan
 from hipsta_bids.io import files
 from hipsta_bids.io.files import entities
@@ -365,8 +365,8 @@ def _hippunfold(segmentation: Path) -> Path | None:
 
 
 _BESIDE: Mapping[str, Callable[[Path], Path | None]] = {
-    "freesurfer": freesurfer.volume_table,
-    "ashs": ashs.volume_table,
+    "freesurfer": lambda path: volume_table(path, "freesurfer"),
+    "ashs": lambda path: volume_table(path, "ashs"),
     "hippunfold": _hippunfold,
 }
 

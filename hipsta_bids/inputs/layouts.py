@@ -1,0 +1,379 @@
+"""Layouts of programs that segment subfields: a row of data each, and functions for what differs.
+
+FreeSurfer writes ``mri/{lh,rh}.hippoAmygLabels*`` (see ``freesurfer``). ASHS writes
+``*_{left,right}_lfseg_{corr_usegray,corr_nogray,heur}.nii.gz`` to ``final/`` below the subject's
+folder or directly to it; the part of the name that it takes for the subject's ID is often wrong,
+so the folder decides. HippUnfold writes ``*_hemi-{L,R}_*desc-subfields*_dseg.nii.gz``; the order
+of entities differs between its versions 0 to 2. HSF writes
+``*_{left,right}_hippocampus_seg.nii.gz`` beside the image. NextBrain writes
+``seg.{left,right}.nii.gz`` (or ``seg_{left,right}.mgz``) beside a copy of its label table. MAGeT
+Brain writes both hemispheres to one file, ``*_label*.nii.gz``: others use such names too.
+"""
+
+import re
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from hipsta_bids.errors import InputError, ProtocolError
+from hipsta_bids.inputs import ashs, freesurfer, generic, scan
+from hipsta_bids.inputs.selection import Context, LabelFile, Verdict, rivals_problem
+from hipsta_bids.io.files import entities
+from hipsta_bids.protocols.load import load_protocol, protocol_names
+
+_SIDES = {"left": "L", "right": "R", "l": "L", "r": "R"}
+
+
+def _named_protocol(layout: "Layout", file: LabelFile, context: Context, _: str) -> Verdict:
+    """Find the protocol of a program's file."""
+    users = context.selection.protocol
+    if users is not None and users.tool == layout.name:
+        explanation = (layout.title, f", protocol {users.name} from --scheme")
+        return Verdict(protocol=users, explanation=explanation)
+    protocols = map(load_protocol, protocol_names())
+    fitting = [protocol for protocol in protocols if protocol.tool == layout.name]
+    if len(fitting) == 1:
+        explanation = (layout.title, f", protocol {fitting[0].name}")
+        return Verdict(protocol=fitting[0], explanation=explanation)
+    names = " or ".join(f"--scheme {each.name} ({each.title})" for each in fitting)
+    return Verdict(
+        protocol=scan.unknown_protocol(layout.name, f"{layout.title}, mode not given"),
+        explanation=(layout.title, ", mode not given"),
+        problem=ProtocolError(
+            f"{file.path}: {layout.choice}; say which: {names}", reason="ambiguous-scheme"
+        ),
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Layout:
+    """The files of one program."""
+
+    name: str
+    """As in ``Protocol.tool``."""
+    title: str
+    kind: str = "tools"
+    """Kind of folder that it is in (``scan.LAYOUTS``)."""
+    mark: str
+    """Part of all of its names."""
+    pattern: re.Pattern[str]
+    """Of its names. A group ``hemi`` is the side, and there is none for both."""
+    bids: bool = True
+    """Names have BIDS' entities, by which a filter file selects."""
+    rank: Callable[[LabelFile, Context], tuple[Any, ...]] = lambda _, __: ()
+    """Order of preference, the least first; equal ones are not chosen between."""
+    reason: Callable[[LabelFile, LabelFile], str] = lambda _, __: ""
+    """Why a file is passed over for the best one."""
+    protocol: Callable[["Layout", LabelFile, Context, str], Verdict] = _named_protocol
+    """Which protocol the best file has."""
+    choose: Callable[[list[LabelFile], Context, str], Iterable[scan.HemisphereInput]] | None = None
+    """Where more than one file matters: which, and how."""
+    beside: frozenset[str] = frozenset()
+    """Files of which one lies beside those of the program; none are needed if empty."""
+    distinct: bool = True
+    """No other program uses such names; else the user or the dataset has to name this one."""
+    generators: bool = False
+    """Datasets that name other software hold none of its files."""
+    unless: str = ""
+    """Layout whose files are not of this one."""
+    choice: str = ""
+    """What the user has to know where there are several protocols."""
+    volumes: str = ""
+    """Name of the table of volumes beside a file."""
+
+    def reads(self, name: str, source: scan.Source) -> dict[str, str | None] | None:
+        """Return what a file's name says, if it is one of this program's."""
+        match = self.pattern.fullmatch(name) if self.mark in name else None
+        if match is None or (
+            self.generators
+            and source.generators
+            and not any(self.name in generator for generator in source.generators)
+        ):
+            return None
+        if self.unless and _BY_NAME[self.unless].reads(name, source) is not None:
+            return None
+        return (entities(name) if self.bids else {}) | {"hemi": None, **match.groupdict()}
+
+    def files(self, context: Context) -> list[LabelFile]:
+        """List the files of one visit, best first."""
+        source, users = context.source, context.selection.protocol
+        named = (users is not None and users.tool == self.name) or any(
+            self.name in generator for generator in source.generators
+        )
+        files = []
+        for folder in freesurfer.each_once(context.visit.folders):
+            marked = not self.beside or not self.beside.isdisjoint(folder.names)
+            for name in folder.names if named or (self.distinct and marked) else ():
+                traits = self.reads(name, source)
+                path = folder.path / name
+                if traits is None or (self.bids and not context.selection.wants_file(path)):
+                    continue
+                side = (traits.get("hemi") or "").lower()
+                file = LabelFile(
+                    path=path,
+                    hemi=_SIDES.get(side),
+                    traits=traits,
+                    longitudinal=folder.longitudinal,
+                )
+                files.append((self.rank(file, context), str(path), file))
+        files.sort(key=lambda entry: entry[:2])
+        return [file.ranked(rank) for rank, _, file in files]
+
+
+def find(layout: Layout, context: Context) -> Iterator[scan.HemisphereInput]:
+    """Find the segmentations of one program in one visit."""
+    all_files = layout.files(context)
+    for hemi in context.selection.wanted_hemis() if all_files else ():
+        files = [file for file in all_files if file.hemi in (hemi, None)]
+        if layout.choose is not None:
+            yield from layout.choose(files, context, hemi) if files else ()
+        elif files:
+            yield _best(layout, files, context, hemi)
+
+
+def _best(
+    layout: Layout, files: list[LabelFile], context: Context, hemi: str
+) -> scan.HemisphereInput:
+    """Take the first file of a hemisphere, unless another one is as good."""
+    best = files[0]
+    verdict = layout.protocol(layout, best, context, hemi)
+    note = ", both hemispheres in one file" if best.hemi is None else ""
+    return context.input(
+        hemi,
+        verdict.protocol,
+        [best.path],
+        note.join(verdict.explanation),
+        bilateral=best.hemi is None,
+        passed_over=[(file.path.name, layout.reason(file, best)) for file in files[1:]],
+        problem=rivals_problem(files) or verdict.problem,
+        notes=verdict.notes,
+    )
+
+
+def volume_table(path: Path, name: str) -> Path | None:
+    """Name the table of volumes that a program wrote with a segmentation."""
+    layout = _BY_NAME[name]
+    match = layout.pattern.fullmatch(path.name)
+    return None if match is None else path.with_name(layout.volumes.format(**match.groupdict()))
+
+
+# Programs of which a T2-weighted image comes first
+
+
+def _t2_first(file: LabelFile, _: Context) -> tuple[Any, ...]:
+    """Rank T2-weighted images, which show the subfields, before others."""
+    return (int("T2w" not in file.path.name),)
+
+
+def _t2_reason(file: LabelFile, _: LabelFile) -> str:
+    return "T2w comes first" if file.rank[0] else "as good as the first one"
+
+
+# What HippUnfold writes differs by space and atlas.
+
+#: Atlases with the bundled protocol's codes, best first; None is version 0, which had one atlas.
+_ATLASES = ("multihist7", "bigbrain", None)
+
+
+def _space(file: LabelFile) -> str:
+    return file.traits.get("space") or ""
+
+
+def _cropped(file: LabelFile) -> bool:
+    return _space(file).startswith("crop")
+
+
+def _scaled(file: LabelFile) -> bool:
+    """Check for a space that differs from the subject's own by more than rotation and shift."""
+    # corobl is reached by an affine registration to a template unless asked otherwise.
+    return _space(file) not in {"", "T1w", "T2w"} and not _cropped(file)
+
+
+def _unfold_rank(file: LabelFile, _: Context) -> tuple[Any, ...]:
+    """Rank the finest grid in the subject's own space (``space-crop*``), then the image's own."""
+    atlas = file.traits.get("atlas")
+    index = _ATLASES.index(atlas) if atlas in _ATLASES else len(_ATLASES)
+    return _scaled(file), index, not _cropped(file), file.path.name
+
+
+def _unfold_reason(file: LabelFile, best: LabelFile) -> str:
+    if _scaled(file):
+        return f"space {_space(file)} may be scaled, which changes thickness"
+    if file.traits.get("atlas") != best.traits.get("atlas"):
+        atlas = best.traits.get("atlas")
+        return f"atlas {atlas} comes first; a --bids-filter-file selects another one"
+    if _cropped(best) and not _cropped(file):
+        return f"coarser grid than space {_space(best)}"
+    return "as good as the first one; a --bids-filter-file selects it"
+
+
+def _unfold_protocol(layout: Layout, file: LabelFile, context: Context, _: str) -> Verdict:
+    """Take the bundled protocol for its atlases, and the user's for others."""
+    atlas, selection = file.traits.get("atlas"), context.selection
+    is_known = atlas in _ATLASES
+    users = selection.protocol if not is_known and selection.describes(layout.name) else None
+    problem: InputError | ProtocolError | None = None
+    if _scaled(file):
+        problem = InputError(
+            f"{file.path}: space {_space(file)} may be scaled, which changes thickness; "
+            "run HippUnfold with its default output space",
+            reason="template-space",
+        )
+    elif not is_known and users is None:
+        problem = ProtocolError(
+            f"{file.path}: no bundled protocol for HippUnfold's atlas {atlas}; "
+            "describe its labels in a TOML file and pass it with --scheme",
+            reason="unknown-atlas",
+        )
+    note = "labels on the image's own grid, which may be coarse; no space-crop* file exists"
+    return Verdict(
+        protocol=users or load_protocol(layout.name),
+        explanation=(f"space {_space(file) or 'not named'}, atlas {atlas or 'not named'}", ""),
+        problem=problem,
+        notes=() if _cropped(file) else (note,),
+    )
+
+
+# What ASHS writes differs by step, and its atlas is told by table or values.
+
+#: ASHS's last step comes first.
+_KINDS = ("corr_usegray", "corr_nogray", "heur")
+
+
+def _ashs_rank(file: LabelFile, context: Context) -> tuple[Any, ...]:
+    """Rank one hemisphere before both, later steps before earlier, final before others."""
+    outside = file.path.parent.name != "final"
+    other_id = f"sub-{context.visit.subject}" not in file.path.name
+    return file.hemi is None, _KINDS.index(file.traits["kind"] or ""), outside, other_id
+
+
+def _ashs_reason(file: LabelFile, best: LabelFile) -> str:
+    if file.hemi is None and best.hemi is not None:
+        return "both hemispheres in one file; one file per hemisphere comes first"
+    if file.rank[1] != best.rank[1]:
+        return f"{best.traits['kind']} comes before {file.traits['kind']}"
+    if file.rank == best.rank:
+        return "as good as the first one"
+    return "files in final/ and with the subject's label come first"
+
+
+def _ashs_protocol(_: Layout, file: LabelFile, context: Context, hemi: str) -> Verdict:
+    """Identify the atlas; a file of both hemispheres takes one that tells them apart."""
+    bilateral = file.hemi is None
+    protocol, explanation, problem = (context.atlases or atlas_finder(context)).identify(
+        (file.path, hemi, bilateral)
+    )
+    if problem is None and bilateral and not protocol.offset:
+        problem = InputError(
+            f"{file.path}: neither left nor right is in its name, and the protocol "
+            f"{protocol.name} does not say how the hemispheres differ; set right_offset in its "
+            "TOML file",
+            reason="unknown-hemisphere",
+        )
+    explanations = (file.traits["kind"] or "", f"; {explanation}")
+    return Verdict(protocol=protocol, explanation=explanations, problem=problem)
+
+
+#: Subjects whose files are opened to find out a dataset's atlas, spread over the dataset.
+_SAMPLE = 8
+
+
+def atlas_finder(context: Context) -> ashs.AtlasFinder:
+    """Prepare what identifies the atlases of one dataset of ASHS."""
+    root = context.source.path
+
+    def sample() -> Iterator[ashs.Image]:
+        """List some of the dataset's segmentations, the same whoever is processed."""
+        folders = scan.sort_folders(root, any_name=context.source.any_name)[0]
+        for visit in scan.list_visits(folders[:: max(len(folders) // _SAMPLE, 1)]):
+            files = _BY_NAME["ashs"].files(replace(context, visit=visit))
+            for hemi in scan.HEMIS:
+                best = next((file for file in files if file.hemi in (hemi, None)), None)
+                if best is not None:
+                    yield best.path, hemi, best.hemi is None
+
+    return ashs.AtlasFinder(root, context.atlas, sample)
+
+
+#: All layouts, in the order in which they are looked for.
+LAYOUTS = (
+    Layout(
+        name="freesurfer",
+        title="FreeSurfer",
+        kind="freesurfer",
+        mark=".hippo",
+        pattern=freesurfer.NAME,
+        bids=False,
+        choose=freesurfer.choose_run,
+        volumes="{hemi}h.hippoSfVolumes{analysis}.txt",
+    ),
+    Layout(
+        name="ashs",
+        title="ASHS",
+        kind="ashs",
+        mark="lfseg",
+        pattern=re.compile(
+            r"(?P<stem>(?:.*_)?(?P<hemi>(?i:left|right))|.*?)_?"
+            r"lfseg_(?P<kind>corr_usegray|corr_nogray|heur)\.nii(?:\.gz)?"
+        ),
+        bids=False,
+        rank=_ashs_rank,
+        reason=_ashs_reason,
+        protocol=_ashs_protocol,
+        volumes="{stem}_{kind}_volumes.txt",
+    ),
+    Layout(
+        name="hippunfold",
+        title="HippUnfold",
+        kind="hippunfold",
+        mark="desc-subfields",
+        pattern=re.compile(
+            r"(?=.*_hemi-(?P<hemi>[LR])_)(?=.*_desc-subfields_)(?!.*_label-(?!hipp_))"
+            r".+_dseg\.nii(?:\.gz)?"
+        ),
+        rank=_unfold_rank,
+        reason=_unfold_reason,
+        protocol=_unfold_protocol,
+        generators=True,
+    ),
+    Layout(
+        name="hsf",
+        title="HSF",
+        mark="_hippocampus_seg",
+        pattern=re.compile(r".+_(?P<hemi>left|right)_hippocampus_seg\.nii(?:\.gz)?"),
+        rank=_t2_first,
+        reason=_t2_reason,
+        choice="HSF's codes depend on its ca_mode, which the file does not tell",
+    ),
+    Layout(
+        name="maget",
+        title="MAGeT Brain",
+        mark="_label",
+        pattern=re.compile(r".+_labels?(?:_\w+)?\.(?:nii|nii\.gz|mgz)"),
+        rank=_t2_first,
+        reason=_t2_reason,
+        distinct=False,
+    ),
+    Layout(
+        name="nextbrain",
+        title="NextBrain",
+        mark="seg",
+        pattern=re.compile(r"seg[._](?P<hemi>left|right)\.(?:nii\.gz|nii|mgz)"),
+        rank=_t2_first,
+        reason=_t2_reason,
+        beside=frozenset({"lut.txt", "lookup_table.txt"}),
+    ),
+    Layout(
+        name="named",
+        title="BIDS",
+        kind="named",
+        mark="dseg.",
+        pattern=re.compile(
+            r"(?=.*_hemi-(?P<hemi>[LR])_)(?!.*_desc-edited_).+_dseg\.(?:nii|nii\.gz|mgz|mgh)"
+        ),
+        choose=generic.choose_described,
+        unless="hippunfold",
+    ),
+)
+_BY_NAME = {layout.name: layout for layout in LAYOUTS}
