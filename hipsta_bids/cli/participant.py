@@ -137,6 +137,12 @@ def add_segmentations(parser: Parser) -> None:
         "NAME",
         "FreeSurfer analysis to use where there are several, such as T1 or T1-T2",
     )
+    add(
+        "--participants-map",
+        "FILE.tsv",
+        "whose folders are, where names do not tell: columns folder, participant_id (and"
+        " session_id)",
+    )
     add("--ashs-atlas", "SCHEME", "atlas of the ASHS runs, a name from `hipsta-bids schemes`")
     add(
         "--scheme --protocol",
@@ -347,9 +353,9 @@ def _run(options: "Namespace", arguments: Sequence[str]) -> ExitCode:
         console.echo(f"note: region {settings.body.region} is experimental")
     request = input_request(options)
     console.echo_start(options.analysis_level, options.bids_dir)
+    from hipsta_bids.inputs import account, search  # noqa: PLC0415  (heavy)
     from hipsta_bids.inputs.edits import attach_ends  # noqa: PLC0415  (heavy)
     from hipsta_bids.inputs.maps import attach, map_requests  # noqa: PLC0415  (heavy)
-    from hipsta_bids.inputs.search import dataset_notes, ignored_table, selection_table  # noqa: PLC0415  (heavy)
     from hipsta_bids.io.volumes import limit_memory  # noqa: PLC0415  (heavy)
 
     limit_memory(options.mem)
@@ -360,18 +366,23 @@ def _run(options: "Namespace", arguments: Sequence[str]) -> ExitCode:
         return ExitCode.OK
     items, end_notes = attach_ends(findings.items, options.ends)
     items, map_notes = attach(items, requests, options.roi, options.bids_dir)
-    notes = (*dataset_notes(request, items), *findings.notes, *end_notes, *map_notes)
+    notes = (*search.dataset_notes(request, items), *findings.notes, *end_notes, *map_notes)
+    unused = (*findings.ignored, *findings.other_entries)
+    inputs = account.input_table(items, unused, options.bids_dir)
     for note in notes:
         console.echo(f"note: {note}")
+    console.echo(f"inputs: {account.count_inputs(inputs)}")
     if options.dry_run:
-        console.echo_table(selection_table(items))
-        console.echo_table(ignored_table(findings.ignored))
+        console.echo_table(account.selection_table(items))
+        console.echo_table(account.ignored_table(findings.ignored))
+        console.echo_table(account.other_entries_table(findings.other_entries))
         return ExitCode.OK
     check_output_is_no_input(options.output_dir, items)
     from hipsta_bids.participant.run import collect, run_participants  # noqa: PLC0415  (heavy)
 
     notes += tuple(f"not used: {entry.path}: {entry.reason}" for entry in findings.ignored)
     out, run_options = options.output_dir, _run_options(options, arguments, notes)
+    run_options = replace(run_options, inputs=tuple(inputs), is_whole=request.is_whole)
     with console.Progress(-1 if options.quiet else options.verbose) as progress:
         if collects:
             result = collect(items, out, settings, run_options)
@@ -489,7 +500,7 @@ def input_request(options: "Namespace") -> "InputRequest":
 
 def _settle_labels(options: "Namespace") -> None:
     """Read names of FreeSurfer's folders as labels where they have their option, else refuse."""
-    from hipsta_bids.inputs.scan import plain_label  # noqa: PLC0415  (heavy)
+    from hipsta_bids.inputs.tree import plain_label  # noqa: PLC0415  (heavy)
 
     for option in ("participant_label", "exclude_participant_label"):
         labels = getattr(options, option)

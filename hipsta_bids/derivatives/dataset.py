@@ -414,7 +414,7 @@ COLUMNS: dict[str, str] = {
 NOT_FINISHED = "not-finished"
 """Reason of a hemisphere that a run has not reached yet."""
 
-_KEY = ("subject", "session", "hemi", "seg")
+KEY = ("subject", "session", "hemi", "seg")
 
 #: Cells that the quality record has too.
 RECORDED = ("status", "reason", "version", "settings_hash", "input_hash")
@@ -437,7 +437,7 @@ def row_key(row: Row) -> tuple[str, ...]:
     """Cells that distinguish rows."""
     region = row.get("region", files.MISSING)
     # Rows of a table without that column are about the body.
-    return *(row[key] for key in _KEY), "body" if region == files.MISSING else region
+    return *(row[key] for key in KEY), "body" if region == files.MISSING else region
 
 
 def table_path(shard: str | None = None) -> str:
@@ -468,7 +468,7 @@ def read_table(path: Path) -> list[dict[str, str]]:
         rows = files.read_tsv(path)
     except InputError:
         return []
-    return [row for row in rows if all(key in row for key in _KEY)]
+    return [row for row in rows if all(key in row for key in KEY)]
 
 
 def _current(root: Path, rows: Sequence[dict[str, str]]) -> dict[str, str]:
@@ -533,3 +533,31 @@ def write_sidecar(root: Path) -> None:
     described = {name: {"Description": text} for name, text in COLUMNS.items()}
     described[f"{STAGE_PREFIX}*"] = {"Description": "elapsed time of one stage, s"}
     files.write_json(root / DATASET_FILES["status_sidecar"], described)
+
+
+#: Columns of ``inputs.tsv``, with their meaning.
+INPUT_COLUMNS: dict[str, str] = {
+    "path": "file or folder; a folder stands for all in it that has no row of its own",
+    **{name: COLUMNS[name] for name in KEY},
+    "status": "used; failed; not used, though it seems meant to be; or not a segmentation",
+    "reason": "why it was chosen, failed, or was not used",
+}
+
+
+def write_inputs(root: Path, rows: Iterable[Row], *, is_whole: bool = True) -> None:
+    """Write ``inputs.tsv``, an account of what a search found.
+
+    Rows of earlier searches stay if they are about other participants and this one was not about
+    every participant.
+    """
+    listed = [{**dict.fromkeys(INPUT_COLUMNS, files.MISSING), **row} for row in rows]
+    path = root / DATASET_FILES["inputs"]
+    with locked(root, DATASET):
+        if not is_whole:
+            subjects = {row["subject"] for row in listed}
+            listed += [row for row in read_table(path) if row["subject"] not in subjects]
+        listed.sort(key=lambda row: [row[key] for key in KEY])
+        cells = ([row.get(name, files.MISSING) for name in INPUT_COLUMNS] for row in listed)
+        files.write_tsv(path, tuple(INPUT_COLUMNS), cells)
+        described = {name: {"Description": text} for name, text in INPUT_COLUMNS.items()}
+        files.write_json(root / DATASET_FILES["inputs_sidecar"], described)

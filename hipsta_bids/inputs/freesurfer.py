@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hipsta_bids.errors import HipstaError, InputError
-from hipsta_bids.inputs import scan
+from hipsta_bids.inputs import scan, tree
 from hipsta_bids.inputs.selection import Context, LabelFile
 from hipsta_bids.protocols.load import load_protocol
 
@@ -93,6 +93,10 @@ class _Run:
     files: dict[str, Path]
 
     @property
+    def longitudinal(self) -> bool:
+        return self.analysis.longitudinal
+
+    @property
     def rank(self) -> tuple[object, ...]:
         return self.coarse, self.analysis.rank, self.old, self.way is None
 
@@ -104,28 +108,23 @@ class _Run:
         return next(ways, None)
 
 
-def without_labels(visit: scan.VisitFolders) -> Iterator[Path]:
-    """List the subjects' folders of FreeSurfer that hold no segmentation of subfields."""
-    for folder in visit.folders:
-        if folder.path.name == "mri" and not any(map(NAME.fullmatch, folder.names)):
-            yield folder.path.parent
-
-
-def same_labels(folders: Iterable[scan.SubjectFolder]) -> dict[str, HipstaError]:
-    """Describe, by label, the folders of several names that would get the same label."""
-    spellings: dict[str, set[str]] = {}
+def same_labels(folders: Iterable[tree.SubjectFolder]) -> dict[str, HipstaError]:
+    """Describe, by label, the folders of several names that would get the same labels."""
+    spellings: dict[tuple[str, str | None], set[str]] = {}
     renamed = set()
     for folder in folders:
-        spellings.setdefault(folder.subject, set()).add(folder.spelling)
+        spellings.setdefault((folder.subject, None), set()).add(folder.spelling)
+        stem = folder.path.name.partition(".long.")[0]
+        spellings.setdefault((folder.subject, folder.session or ""), set()).add(stem)
         if folder.renamed:
             renamed.add(folder.subject)
     return {
         label: InputError(
-            f"{' and '.join(sorted(names))} would all be sub-{label}; give links with other names"
-            " in place of all but one",
+            f"{' and '.join(sorted(names))} would all be sub-{label}"
+            f"{f'_ses-{session}' if session else ''}; say whose they are with --participants-map",
             reason="same-label",
         )
-        for label, names in spellings.items()
+        for (label, session), names in reversed(spellings.items())
         if len(names) > 1 and label in renamed
     }
 
@@ -142,7 +141,11 @@ def choose_run(
     analysis = context.selection.fs_analysis
     request = parse_analysis(analysis) if analysis else None
     runs = _runs(files)
-    matching = [run for run in runs if request is None or run.analysis.answers(request)]
+    matching = [
+        run
+        for run in runs
+        if (run.analysis.answers(request) if request else run.longitudinal == context.longitudinal)
+    ]
     best = next((run for run in matching if run.way), None)
     run = best or runs[0]
     subfields, parts, protocol = run.way or (next(iter(run.files)), None, "freesurfer")
@@ -160,6 +163,18 @@ def choose_run(
     )
 
 
+def is_longitudinal(files: Iterable[LabelFile]) -> bool:
+    """Choose between the kinds of runs of a visit: both sides come from one, cross-sectional first.
+
+    The longitudinal run comes first only if it alone has more sides.
+    """
+    sides: dict[bool, set[str | None]] = {False: set(), True: set()}
+    for file in files:
+        longitudinal = "long" in re.split(r"[-._]", file.traits.get("analysis") or "")
+        sides[file.longitudinal or longitudinal].add(file.hemi)
+    return len(sides[True]) > len(sides[False])
+
+
 def _runs(files: Iterable[LabelFile]) -> list[_Run]:
     """Group a hemisphere's files by analysis and resolution, best first."""
     runs: dict[tuple[object, ...], _Run] = {}
@@ -174,7 +189,7 @@ def _runs(files: Iterable[LabelFile]) -> list[_Run]:
     return sorted(runs.values(), key=lambda run: run.rank)
 
 
-def each_once(folders: tuple[scan.Folder, ...]) -> tuple[scan.Folder, ...]:
+def each_once(folders: tuple[tree.Folder, ...]) -> tuple[tree.Folder, ...]:
     """Leave out longitudinal folders that are links to others here, as FastSurfer's tools make."""
     if not any(folder.longitudinal for folder in folders):
         return folders
@@ -191,7 +206,9 @@ def _why(run: _Run, subfields: str, parts: str | None, requested: str | None) ->
     return f"{hierarchy}{combined}, analysis {run.analysis.name}{choice}"
 
 
-def _passed_over(runs: list[_Run], best: _Run, used_paths: list[Path]) -> Iterator[tuple[str, str]]:
+def _passed_over(
+    runs: list[_Run], best: _Run, used_paths: list[Path]
+) -> Iterator[tuple[Path, str]]:
     for run in runs:
         name = run.analysis.name
         for hierarchy, path in run.files.items():
@@ -201,7 +218,7 @@ def _passed_over(runs: list[_Run], best: _Run, used_paths: list[Path]) -> Iterat
             elif run is best:
                 reason = f"{hierarchy} hierarchy: less detail than what was taken"
             if path not in used_paths:
-                yield path.name, reason
+                yield path, reason
 
 
 def _problem(runs: list[_Run], matching: list[_Run], requested: str | None) -> HipstaError:
@@ -210,6 +227,13 @@ def _problem(runs: list[_Run], matching: list[_Run], requested: str | None) -> H
         names = ", ".join(dict.fromkeys(run.analysis.name for run in runs))
         return InputError(
             f"{folder}: no analysis {requested} here (found {names}); change --fs-analysis",
+            reason="analysis-missing",
+        )
+    if not matching:
+        kind = "longitudinal" if runs[0].longitudinal else "cross-sectional"
+        return InputError(
+            f"{folder}: this side has a {kind} run only, and the visit's other side another kind; "
+            "choose with --fs-analysis",
             reason="analysis-missing",
         )
     return InputError(

@@ -7,7 +7,7 @@ from functools import cache, lru_cache
 from pathlib import Path
 
 from hipsta_bids.errors import HipstaError, InputError, ProtocolError
-from hipsta_bids.inputs import scan
+from hipsta_bids.inputs import scan, tree
 from hipsta_bids.inputs.selection import Context, LabelFile, Verdict
 from hipsta_bids.io.files import entities
 from hipsta_bids.protocols.load import NamedCode, protocol_from_names
@@ -111,7 +111,7 @@ def forget_tables() -> None:
 def _tables_in(folder: Path) -> tuple[dict[str, dict[str, str]], bool]:
     """List a folder's ``dseg.tsv`` tables by the entities they require, and look for ITK-SNAP's."""
     try:
-        names = scan.list_folder(folder)[1]
+        names = tree.list_folder(folder)[1]
     except InputError:  # no such folder, which is the usual case for "snap"
         return {}, False
     parsed = {name: entities(name) for name in names if name.endswith("dseg.tsv")}
@@ -168,7 +168,7 @@ def _rank(file: LabelFile, verdict: Verdict) -> tuple[bool, bool, bool, int, str
     return problem, not _OWN_SPACE.fullmatch(space), coarse, name.count("_"), name
 
 
-def without_side(visit: scan.VisitFolders) -> Iterator[scan.Ignored]:
+def without_side(visit: tree.VisitFolders) -> Iterator[tree.Ignored]:
     """List label images whose names have a ``hemi`` that is neither L nor R."""
     for folder in visit.folders:
         for name in folder.names:
@@ -182,7 +182,7 @@ def without_side(visit: scan.VisitFolders) -> Iterator[scan.Ignored]:
                 and pairs["extension"] in _IMAGES
             ):
                 reason = f"hemi-{hemi} is neither hemi-L nor hemi-R"
-                yield scan.Ignored(path=folder.path / name, reason=reason, subject=visit.subject)
+                yield tree.Ignored(path=folder.path / name, reason=reason, subject=visit.subject)
 
 
 def _choose(
@@ -208,7 +208,7 @@ def _choose(
         verdict.protocol,
         [best.path],
         "".join(verdict.explanation),
-        passed_over=[(file.path.name, order) for file, _ in group[1:]],
+        passed_over=[(file.path, order) for file, _ in group[1:]],
         problem=problem,
         notes=(f"the file's name says {'_'.join(mismatches)}",) if mismatches else (),
     )

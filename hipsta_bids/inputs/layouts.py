@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from hipsta_bids.errors import InputError, ProtocolError
-from hipsta_bids.inputs import ashs, freesurfer, generic, scan
+from hipsta_bids.inputs import ashs, freesurfer, generic, scan, tree
 from hipsta_bids.inputs.selection import Context, LabelFile, Verdict, rivals_problem
 from hipsta_bids.io.files import entities
 from hipsta_bids.protocols.load import load_protocol, protocol_names
@@ -84,7 +84,7 @@ class Layout:
 
     def reads(self, name: str, source: scan.Source) -> dict[str, str | None] | None:
         """Return what a file's name says, if it is one of this program's."""
-        match = self.pattern.fullmatch(name) if self.mark in name else None
+        match = self.pattern.fullmatch(name)
         if match is None or (
             self.generators
             and source.generators
@@ -95,6 +95,11 @@ class Layout:
             return None
         return (entities(name) if self.bids else {}) | {"hemi": None, **match.groupdict()}
 
+    def side(self, name: str) -> str | None:
+        """Return the hemisphere of a file by its name; None for both."""
+        match = self.pattern.fullmatch(name)
+        return _SIDES.get(((match and match.groupdict().get("hemi")) or "").lower())
+
     def files(self, context: Context) -> list[LabelFile]:
         """List the files of one visit, best first."""
         source, users = context.source, context.selection.protocol
@@ -104,9 +109,10 @@ class Layout:
         files = []
         for folder in freesurfer.each_once(context.visit.folders):
             marked = not self.beside or not self.beside.isdisjoint(folder.names)
-            for name in folder.names if named or (self.distinct and marked) else ():
-                traits = self.reads(name, source)
-                path = folder.path / name
+            if not (named or (self.distinct and marked)):
+                continue
+            for name in [name for name in folder.names if self.mark in name]:
+                traits, path = self.reads(name, source), folder.path / name
                 if traits is None or (self.bids and not context.selection.wants_file(path)):
                     continue
                 side = (traits.get("hemi") or "").lower()
@@ -124,7 +130,10 @@ class Layout:
 def find(layout: Layout, context: Context) -> Iterator[scan.HemisphereInput]:
     """Find the segmentations of one program in one visit."""
     all_files = layout.files(context)
-    for hemi in context.selection.wanted_hemis() if all_files else ():
+    if not all_files:
+        return
+    context = replace(context, longitudinal=freesurfer.is_longitudinal(all_files))
+    for hemi in context.selection.wanted_hemis():
         files = [file for file in all_files if file.hemi in (hemi, None)]
         if layout.choose is not None:
             yield from layout.choose(files, context, hemi) if files else ()
@@ -145,7 +154,7 @@ def _best(
         [best.path],
         note.join(verdict.explanation),
         bilateral=best.hemi is None,
-        passed_over=[(file.path.name, layout.reason(file, best)) for file in files[1:]],
+        passed_over=[(file.path, layout.reason(file, best)) for file in files[1:]],
         problem=rivals_problem(files) or verdict.problem,
         notes=verdict.notes,
     )
@@ -285,8 +294,8 @@ def atlas_finder(context: Context) -> ashs.AtlasFinder:
 
     def sample() -> Iterator[ashs.Image]:
         """List some of the dataset's segmentations, the same whoever is processed."""
-        folders = scan.sort_folders(root, any_name=context.source.any_name)[0]
-        for visit in scan.list_visits(folders[:: max(len(folders) // _SAMPLE, 1)]):
+        folders = tree.sort_folders(root, any_name=context.source.any_name)[0]
+        for visit in tree.list_visits(folders[:: max(len(folders) // _SAMPLE, 1)]):
             files = _BY_NAME["ashs"].files(replace(context, visit=visit))
             for hemi in scan.HEMIS:
                 best = next((file for file in files if file.hemi in (hemi, None)), None)
@@ -377,3 +386,13 @@ LAYOUTS = (
     ),
 )
 _BY_NAME = {layout.name: layout for layout in LAYOUTS}
+
+#: What all names of labels have in part.
+_MARKS = re.compile("|".join(re.escape(layout.mark) for layout in LAYOUTS))
+
+
+def layout_of(name: str) -> Layout | None:
+    """Find the layout whose files have such a name."""
+    if not _MARKS.search(name):
+        return None
+    return next((layout for layout in LAYOUTS if layout.pattern.fullmatch(name)), None)

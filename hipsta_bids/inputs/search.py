@@ -18,29 +18,26 @@ A picture of labels on an image from another space misleads, so pages show only 
 import os
 import re
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from hipsta_bids.derivatives.dataset import read_description
 from hipsta_bids.errors import InputError, NothingToDoError, UsageError
+from hipsta_bids.inputs import tree
+from hipsta_bids.inputs.account import looked_into, unused_of_visit
 from hipsta_bids.inputs.ashs import choose_atlas
 from hipsta_bids.inputs.edits import EditedFile, attach_edits, each_once, edits_of_visit, list_edits
-from hipsta_bids.inputs.freesurfer import same_labels, without_labels
+from hipsta_bids.inputs.freesurfer import same_labels
 from hipsta_bids.inputs.generic import forget_tables, without_side
 from hipsta_bids.inputs.layouts import LAYOUTS, atlas_finder, find, volume_table
 from hipsta_bids.inputs.scan import (
     HEMIS,
     HemisphereInput,
-    Ignored,
     InputRequest,
     Source,
-    SubjectFolder,
-    list_folder,
     list_participants,
     list_sources,
-    list_visits,
-    sort_folders,
 )
 from hipsta_bids.inputs.selection import Context, Selection, make_selection
 from hipsta_bids.io.files import entities
@@ -55,9 +52,7 @@ __all__ = [
     "dataset_notes",
     "find_hemispheres",
     "find_inputs",
-    "ignored_table",
     "list_subjects",
-    "selection_table",
 ]
 
 _LOOKED_FOR = (
@@ -65,8 +60,6 @@ _LOOKED_FOR = (
     "*_desc-subfields*_dseg, HSF's *_hippocampus_seg, NextBrain's seg*, and *_hemi-*_dseg with a "
     "table"
 )
-
-_NO_LABELS = "its mri folder holds no hippocampal subfields"
 
 #: How many names an error message lists.
 _LISTED_NAMES = 6
@@ -80,8 +73,10 @@ class Findings:
     """Sorted by subject, session, hemisphere, protocol. Some may have a ``problem``."""
     notes: tuple[str, ...] = ()
     """One line for each edited file that is not used, and for what is named anew or ignored."""
-    ignored: tuple[Ignored, ...] = ()
-    """What was not used though it seems meant to be, sorted by path."""
+    ignored: tuple[tree.Ignored, ...] = ()
+    """What was not used though it seems meant to be, and templates, sorted by path."""
+    other_entries: tuple[tree.Ignored, ...] = ()
+    """All other entries: nothing in them is a segmentation."""
 
 
 def find_hemispheres(request: InputRequest) -> tuple[HemisphereInput, ...]:
@@ -119,7 +114,25 @@ def find_inputs(request: InputRequest) -> Findings:
     results.edited = list_edits(request, selection, results.ignored)
     for source in sources:
         _search(source, selection, option, results)
-    ignored = tuple(filter(selection.misses, results.unused()))
+    unused = results.unused(sources)
+    unused += [
+        tree.Ignored(path=Path(folder), reason="named in --participants-map, but no dataset has it")
+        for folder in tree.read_people(request.participants_map)
+        if not any((source.path / folder).is_dir() for source in sources)
+    ]
+    unused = [entry for entry in unused if selection.misses(entry)]
+    ignored = tuple(entry for entry in unused if not entry.quiet)
+    other_entries = (*(entry for entry in unused if entry.quiet), *results.other_entries)
+    accounted = {item.subject for item in results.items} | {entry.subject for entry in ignored}
+    missing = [
+        tree.Ignored(
+            path=f.path, subject=f.subject, reason="no dataset has labels of it", quiet=True
+        )
+        for f in (() if request.bids_database_dir else tree.sort_folders(request.bids_dir)[0])
+        if f.subject not in accounted and selection.wants_folder(f)
+    ]
+    without = {entry.path for entry in missing}
+    other_entries = tuple(entry for entry in other_entries if entry.path not in without)
     if not results.items:
         error = _nothing(request, sources, ignored)
         for entry in ignored:
@@ -131,13 +144,19 @@ def find_inputs(request: InputRequest) -> Findings:
     )
     subjects = {item.subject for item in items}
     renamed = [
-        f"{f.path.name} as sub-{f.subject}" for f in results.renamed if f.subject in subjects
+        f"{f.path.name} as sub-{f.subject}{f'_ses-{f.session}' if f.session else ''}"
+        for f in results.renamed
+        if f.subject in subjects
     ]
     if renamed:
-        notes += (f"renamed: {_count(renamed, 'FreeSurfer folder')}",)
-    if unused := _unused(ignored):
-        notes += (f"not used: {unused}; --dry-run and the log say why",)
-    return Findings(items=items, notes=notes, ignored=ignored)
+        notes += (f"renamed: {_count(renamed, 'folder')}",)
+    if sides := [f"{e.inside.name} {e.hemi}" for e in ignored if e.hemi and e.inside]:
+        notes += (f"labels of one hemisphere only, none of {_count(sides, 'other')}",)
+    if text := _unused(ignored):
+        notes += (f"not used: {text}; --dry-run and the log say why",)
+    return Findings(
+        items=items, notes=notes, ignored=ignored, other_entries=(*other_entries, *missing)
+    )
 
 
 @dataclass(kw_only=True)
@@ -146,41 +165,51 @@ class _Found:
 
     items: list[HemisphereInput] = field(default_factory=list)
     edited: list[EditedFile] = field(default_factory=list)
-    ignored: list[Ignored] = field(default_factory=list)
-    strays: list[Ignored] = field(default_factory=list)
+    ignored: list[tree.Ignored] = field(default_factory=list)
+    strays: list[tree.Ignored] = field(default_factory=list)
     """Entries that are no subject's by their names, unless an option says otherwise."""
-    renamed: list[SubjectFolder] = field(default_factory=list)
+    renamed: list[tree.SubjectFolder] = field(default_factory=list)
     """Folders of wanted subjects whose names are not their labels."""
 
-    def unused(self) -> list[Ignored]:
+    other_entries: list[tree.Ignored] = field(default_factory=list)
+    """What else lies in subjects' folders."""
+
+    def unused(self, sources: Sequence[Source]) -> list[tree.Ignored]:
         """List each entry that was not used once, sorted by path."""
-        renamed_paths = {_place(folder.path) for folder in self.renamed} if self.strays else set()
-        entry_of = {_place(entry.path): entry for entry in reversed(self.strays)}
-        entry_of = {path: entry for path, entry in entry_of.items() if path not in renamed_paths}
-        entry_of |= {_place(entry.path): entry for entry in reversed(self.ignored)}
-        return sorted(entry_of.values(), key=lambda entry: entry.path)
+        searched = {os.path.realpath(source.path) for source in sources}
+        searched |= {_place(folder.path) for folder in self.renamed} if self.strays else set()
+        entry_of: dict[tuple[str, str | None], tree.Ignored] = {}
+        for entry in (*self.ignored, *self.strays):
+            entry_of.setdefault((_place(entry.path), entry.hemi), entry)
+        claims = [place for (place, _), entry in entry_of.items() if not entry.quiet]
+        above = {str(parent) for path in (*searched, *claims) for parent in Path(path).parents}
+        strays = set(map(id, self.strays))
+        return sorted(
+            (
+                looked_into(entry)
+                for (place, _), entry in entry_of.items()
+                # What holds other entries, or is used by an option, has no row of its own.
+                if not (entry.quiet and place in above)
+                and not (id(entry) in strays and place in searched)
+            ),
+            key=lambda entry: (entry.path, entry.hemi or ""),
+        )
 
 
-def _renaming(folders: Iterable[SubjectFolder]) -> dict[tuple[str, str | None], str]:
+def _renaming(folders: Iterable[tree.SubjectFolder]) -> dict[tuple[str, str | None], str]:
     """Write a note for each visit whose folders have names that are not its labels."""
     names: dict[tuple[str, str | None], list[str]] = {}
     for folder in folders:
         if folder.renamed:
             names.setdefault((folder.subject, folder.session), []).append(folder.path.name)
     return {
-        key: f"FreeSurfer's name of sub-{key[0]} is {' and '.join(known)}"
-        for key, known in names.items()
+        key: f"the folder of sub-{key[0]} is {' and '.join(known)}" for key, known in names.items()
     }
 
 
 def _place(path: Path) -> str:
     """Where an entry is, however its folder was reached; the entry itself may be any link."""
     return os.path.join(os.path.realpath(path.parent), path.name)  # noqa: PTH118 (many of them)
-
-
-def ignored_table(ignored: Iterable[Ignored]) -> list[dict[str, str]]:
-    """Describe what was not used, one row per folder."""
-    return [{"not used": str(entry.path), "why": entry.reason} for entry in ignored]
 
 
 def list_subjects(request: InputRequest) -> tuple[str, ...]:
@@ -191,30 +220,11 @@ def list_subjects(request: InputRequest) -> tuple[str, ...]:
             {
                 folder.subject
                 for source in list_sources(request)
-                for folder in sort_folders(source.path, any_name=source.any_name)[0]
+                for folder in source.folders()[0]
                 if selection.wants_folder(folder)
             }
         )
     )
-
-
-def selection_table(items: Iterable[HemisphereInput]) -> list[dict[str, str]]:
-    """Describe what was found and why, one row per hemisphere and protocol."""
-    return [
-        {
-            "subject": item.subject,
-            "session": item.session or "n/a",
-            "hemisphere": item.hemi,
-            "file": " + ".join(_relative(path, item.source_path) for path in item.files),
-            "scheme": item.protocol.name,
-            "why": "; ".join((f"{item.source}: {item.explanation}", *item.notes))
-            + (f"; NOT USABLE: {item.problem}" if item.problem else ""),
-            "edited": " + ".join(_relative(edit.path, edit.source_path) for edit in item.edits)
-            or "n/a",
-            "passed over": "; ".join(f"{name}: {why}" for name, why in item.passed_over) or "n/a",
-        }
-        for item in items
-    ]
 
 
 def dataset_notes(request: InputRequest, items: Iterable[HemisphereInput]) -> tuple[str, ...]:
@@ -234,7 +244,7 @@ def dataset_notes(request: InputRequest, items: Iterable[HemisphereInput]) -> tu
 
 def _search(source: Source, selection: Selection, option: Protocol | None, results: _Found) -> None:
     """Search one dataset for all kinds of segmentations, and add the edited files beside them."""
-    all_folders, strays = sort_folders(source.path, any_name=source.any_name)
+    all_folders, strays = source.folders()
     refused = same_labels(all_folders)
     folders = list(filter(selection.wants_folder, all_folders))
     results.strays += strays
@@ -243,18 +253,19 @@ def _search(source: Source, selection: Selection, option: Protocol | None, resul
     context = Context(source=source, selection=selection, atlas=option)
     context = replace(context, atlases=atlas_finder(context))
     searched = [layout for layout in LAYOUTS if layout.kind in source.layouts]
-    for visit in filter(selection.wants_visit, list_visits(folders, results.ignored)):
+    visits = list(filter(selection.wants_visit, tree.list_visits(folders, results.ignored)))
+    # Folders that cannot be listed have rows of their own, and the parents of sessions need none.
+    explained = {entry.subject for entry in results.ignored if entry.inside}
+    explained |= {visit.subject for visit in visits if visit.session}
+    for visit in visits:
         results.edited += edits_of_visit(visit, source.path, source.name, beside=True)
-        items = [i for layout in searched for i in find(layout, replace(context, visit=visit))]
+        visit_context = replace(context, visit=visit)
+        items = [item for layout in searched for item in find(layout, visit_context)]
         results.ignored += without_side(visit) if "named" in source.layouts else ()
-        used_files = [file for item in items for file in item.files]
-        results.ignored += [
-            Ignored(path=path, reason=_NO_LABELS, subject=visit.subject)
-            for path in (without_labels(visit) if "freesurfer" in source.layouts else ())
-            if not any(file.is_relative_to(path) for file in used_files)
-        ]
+        for entry in unused_of_visit(visit_context, items, explain=visit.subject not in explained):
+            (results.other_entries if entry.template else results.ignored).append(entry)
         for item in items:
-            problem = item.problem or refused.get(item.subject)
+            problem = refused.get(item.subject) or item.problem
             note = renaming.get((item.subject, item.session))
             notes = item.notes if note is None else (*item.notes, note)
             results.items.append(replace(item, problem=problem, notes=notes))
@@ -294,7 +305,7 @@ def _check_analysis(items: list[HemisphereInput], request: InputRequest) -> None
 
 
 def _nothing(
-    request: InputRequest, sources: tuple[Source, ...], ignored: tuple[Ignored, ...]
+    request: InputRequest, sources: tuple[Source, ...], ignored: tuple[tree.Ignored, ...]
 ) -> NothingToDoError:
     """Describe what was looked for, and where, and what was not used."""
     searched = ", ".join(str(source.path) for source in sources)
@@ -316,11 +327,7 @@ def _nothing(
             f"name the dataset with the segmentations: -d NAME=PATH{unused}"
         )
     if restricted:
-        subjects = {
-            folder.subject
-            for source in sources
-            for folder in sort_folders(source.path, any_name=source.any_name)[0]
-        }
+        subjects = {folder.subject for source in sources for folder in source.folders()[0]}
         return NothingToDoError(
             f"no hippocampal segmentation matches {' '.join(restricted)} in {searched} "
             f"(which hold {_count(sorted(subjects), 'subject')}; looked for {_LOOKED_FOR}){unused}"
@@ -331,9 +338,9 @@ def _nothing(
     )
 
 
-def _unused(ignored: Iterable[Ignored]) -> str:
+def _unused(ignored: Iterable[tree.Ignored]) -> str:
     """Count and name what somebody may miss; empty if there is nothing."""
-    missed = [entry for entry in ignored if not entry.template]
+    missed = [entry for entry in ignored if not (entry.template or entry.hemi)]
     kinds = {entry.path.is_file() for entry in missed}
     noun = "name" if len(kinds) > 1 else "file" if kinds == {True} else "folder"
     return _count([entry.name for entry in missed], noun) if missed else ""
@@ -344,10 +351,6 @@ def _count(names: list[str], noun: str) -> str:
     plural = "" if len(names) == 1 else "s"
     listed = f" ({', '.join(names[:_LISTED_NAMES])}{ellipsis})" if names else ""
     return f"{len(names)} {noun}{plural}{listed}"
-
-
-def _relative(path: Path, root: Path) -> str:
-    return str(path.relative_to(root)) if path.is_relative_to(root) else str(path)
 
 
 _FREESURFER = ("norm.mgz", "brain.mgz")
@@ -423,6 +426,6 @@ def _named(labels: Path, hemisphere: Hemisphere, folders: tuple[Path, ...]) -> I
 def _names(folder: Path) -> tuple[str, ...]:
     """List the files of a folder by name; none where it cannot be listed."""
     try:
-        return tuple(sorted(list_folder(folder)[1]))
+        return tuple(sorted(tree.list_folder(folder)[1]))
     except InputError:
         return ()

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hipsta_bids.errors import HipstaError, InputError, ProtocolError, UsageError
-from hipsta_bids.inputs import scan
+from hipsta_bids.inputs import scan, tree
 from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.protocols.protocol import Protocol
 
@@ -43,7 +43,7 @@ class Selection:
         """Check whether the user's protocol is one for the files of a tool."""
         return self.protocol is not None and self.protocol.tool in ("", tool)
 
-    def wants_folder(self, folder: scan.SubjectFolder) -> bool:
+    def wants_folder(self, folder: tree.SubjectFolder) -> bool:
         """Check whether a subject's folder has to be looked into."""
         return (
             (not self.subjects or folder.subject in self.subjects)
@@ -52,14 +52,14 @@ class Selection:
             and self._passes("subject", folder.subject)
         )
 
-    def misses(self, entry: scan.Ignored) -> bool:
+    def misses(self, entry: tree.Ignored) -> bool:
         """Check whether an entry that was not used belongs to a subject that is wanted."""
         subject = entry.subject
         return subject is None or (
             (not self.subjects or subject in self.subjects) and subject not in self.excluded
         )
 
-    def wants_visit(self, visit: scan.VisitFolders) -> bool:
+    def wants_visit(self, visit: tree.VisitFolders) -> bool:
         """Check whether a session of a subject is wanted."""
         is_selected = not self.sessions or visit.session in self.sessions
         return is_selected and self._passes("session", visit.session)
@@ -122,8 +122,10 @@ class Context:
     selection: Selection
     atlas: Protocol | None
     """Of ``--ashs-atlas``."""
-    visit: scan.VisitFolders = scan.NO_VISIT
+    visit: tree.VisitFolders = tree.NO_VISIT
     atlases: "AtlasFinder | None" = None
+    longitudinal: bool = False
+    """Which of FreeSurfer's runs the visit is represented by."""
 
     def input(
         self,
@@ -134,7 +136,7 @@ class Context:
         *,
         parts_protocol: Protocol | None = None,
         bilateral: bool = False,
-        passed_over: Iterable[tuple[str, str]] = (),
+        passed_over: Iterable[tuple[Path, str]] = (),
         problem: HipstaError | None = None,
         notes: tuple[str, ...] = (),
     ) -> scan.HemisphereInput:
@@ -150,7 +152,10 @@ class Context:
             source=self.source.name,
             source_path=self.source.path,
             explanation=explanation,
-            passed_over=tuple(passed_over),
+            passed_over=tuple(
+                (path.name if path.parent == paths[0].parent else str(path), reason)
+                for path, reason in passed_over
+            ),
             problem=problem,
             notes=notes,
         )
@@ -202,7 +207,7 @@ def measurable(protocol: Protocol) -> Protocol:
 
 def _plain(request: scan.InputRequest, labels: tuple[str, ...]) -> tuple[str, ...]:
     """Read names of FreeSurfer's folders as labels, where these may have any name."""
-    return labels if request.freesurfer_dir is None else tuple(map(scan.plain_label, labels))
+    return labels if request.freesurfer_dir is None else tuple(map(tree.plain_label, labels))
 
 
 def _labels(labels: Iterable[str], prefix: str, option: str) -> frozenset[str]:

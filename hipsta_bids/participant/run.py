@@ -5,7 +5,7 @@ import logging
 import math
 import time
 from collections import Counter
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -223,6 +223,10 @@ class RunOptions:
     """The command line, for the log."""
     notes: tuple[str, ...] = ()
     """What the search for inputs had to say, for the log."""
+    inputs: tuple[Mapping[str, str], ...] = ()
+    """Rows of ``inputs.tsv``."""
+    is_whole: bool = True
+    """Whether these are about all participants."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -335,6 +339,7 @@ def _run(
         for note in options.notes:
             _LOGGER.info("note: %s", note)
         table = StatusTable(out_dir, shard)
+        _write_inputs(out_dir, options, ())
         # Closed at once, whatever ends the loop, so that no worker outlives it.
         with (
             _pages_after(jobs, out_dir, options, log) as pages,
@@ -351,6 +356,7 @@ def _run(
                     break  # the next one would fail just so
                 if options.stop_on_first_crash and outcome.status == Status.FAILED:
                     break
+            _write_inputs(out_dir, options, outcomes)
             if pages.enabled and shard is None:
                 table.close()
                 copies += _find_copies(jobs, out_dir)
@@ -363,6 +369,24 @@ def _run(
         )
         _LOGGER.info("done: %s, exit code %d", dict(result.counts), result.exit_code)
     return result
+
+
+def _write_inputs(out_dir: Path, options: RunOptions, outcomes: Sequence[Outcome]) -> None:
+    """Write what became of all that was found."""
+    if not options.inputs:
+        return
+    failed = {
+        row_key(identity(outcome.job.result.name))[:-1]: outcome.message or ""
+        for outcome in outcomes
+        if outcome.status == Status.FAILED
+    }
+    rows = []
+    for row in options.inputs:
+        message = failed.get(tuple(row.get(key, files.MISSING) for key in dataset.KEY))
+        is_lost = message is not None and row["status"] == "used"
+        rows.append({**row, "status": "failed", "reason": str(message)} if is_lost else row)
+    is_whole = options.is_whole and options.shard is None
+    dataset.write_inputs(out_dir, rows, is_whole=is_whole)
 
 
 def _find_copies(jobs: Sequence[Job], out_dir: Path) -> Iterator[str]:

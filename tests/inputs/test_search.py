@@ -9,14 +9,14 @@ import pytest
 from input_cases import by_key, describe, find, save_values, touch
 
 from hipsta_bids.errors import InputError, NothingToDoError, ProtocolError, UsageError
-from hipsta_bids.inputs import scan
+from hipsta_bids.inputs import tree
+from hipsta_bids.inputs.account import selection_table
 from hipsta_bids.inputs.labels import read_label_volume
 from hipsta_bids.inputs.search import (
     HemisphereInput,
     InputRequest,
     dataset_notes,
     find_hemispheres,
-    selection_table,
 )
 
 LEFT, RIGHT = (f"mri/{side}h.hippoAmygLabels-T1.v22.mgz" for side in "lr")
@@ -135,14 +135,14 @@ def test_a_folder_that_cannot_be_listed(tmp_path, monkeypatch):
     freesurfer(tmp_path / "derivatives" / "fs", "sub-01")
     closed = tmp_path / "sourcedata"
     closed.mkdir()
-    real = scan.os.scandir
+    real = tree.os.scandir
 
     def scandir(path):
         if Path(path) == closed:
             raise PermissionError(13, "Permission denied")
         return real(path)
 
-    monkeypatch.setattr(scan.os, "scandir", scandir)
+    monkeypatch.setattr(tree.os, "scandir", scandir)
     # By default nobody asked for it; named by the user, it has to be readable.
     assert len(find(tmp_path)) == 2
     with pytest.raises(InputError, match=r"cannot list the folder.*Permission denied"):
@@ -438,8 +438,8 @@ def test_large_trees_are_listed_once_per_folder(tmp_path, monkeypatch):
     for index in range(50):
         touch(tmp_path / "derivatives" / "fs" / f"sub-{index:03d}", "surf/lh.white", "label/x/y")
     listed = []
-    real = scan.os.scandir
-    monkeypatch.setattr(scan.os, "scandir", lambda path: listed.append(str(path)) or real(path))
+    real = tree.os.scandir
+    monkeypatch.setattr(tree.os, "scandir", lambda path: listed.append(str(path)) or real(path))
     assert len(find(tmp_path)) == 100
     folders = [path for path in listed if "sub-" in path]
     assert len(folders) == len(set(folders)) == 100  # each subject and its mri

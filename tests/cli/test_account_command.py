@@ -1,0 +1,107 @@
+"""The account of inputs on the command line: the line of counts, --dry-run and inputs.tsv."""
+
+import sys
+
+import pytest
+from stand_ins import stand_in_job
+
+from hipsta_bids.cli import main
+from hipsta_bids.errors import ExitCode
+from hipsta_bids.io import files
+from hipsta_bids.participant import run as runner
+
+
+@pytest.fixture(autouse=True)
+def _measured(monkeypatch):
+    """Take no time to measure."""
+    for name in ("hipsta_bids.inputs.labels", "hipsta_bids.participant.measure"):
+        monkeypatch.setitem(sys.modules, name, None)  # put back afterwards
+    monkeypatch.setattr(
+        runner, "run_jobs", lambda _, jobs: ((job, stand_in_job(job)) for job in jobs)
+    )
+
+
+@pytest.fixture
+def study(tmp_path):
+    """ASHS's folders as laboratories call them; the files say what the stand-in does."""
+    for name, act in (
+        ("P001", "ok"),
+        ("AD_05", "ok"),
+        ("20230117_1203", "bad-input"),
+        ("sub-04", "ok"),
+    ):
+        for side in ("left", "right"):
+            path = tmp_path / "ashs" / name / "final" / f"x_{side}_lfseg_corr_usegray.nii.gz"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(f"{act} {name} {side}")
+    (tmp_path / "ashs" / "P009" / "bootstrap").mkdir(parents=True)
+    (tmp_path / "ashs" / "README").touch()
+    (tmp_path / "bids").mkdir()
+    return tmp_path
+
+
+def call(capsys, study, *more, code=ExitCode.OK):
+    arguments = [study / "bids", study / "out", "participant", "--no-reports", *more]
+    arguments += ["--ashs-dir", study / "ashs", "--ashs-atlas", "ashsPMC"]
+    assert main.main([str(word) for word in arguments]) == code
+    return capsys.readouterr()
+
+
+def table(study):
+    rows = files.read_tsv(study / "out" / "inputs.tsv")
+    return {(row["subject"], row["hemi"], row["path"].rpartition("/")[2]): row for row in rows}
+
+
+def test_every_folder_is_accounted_for(study, capsys):
+    said = call(capsys, study, "--dry-run").out
+    assert "inputs: 8 used, 0 failed, 1 not used, 1 not a segmentation" in said
+    for name in ("P001", "AD_05", "20230117_1203", "sub-04", "P009", "README"):
+        assert f"{name} " in said or f"{name}/" in said
+    assert "ASHS has not finished" in said
+    assert not (study / "out").exists()
+
+    call(capsys, study, code=ExitCode.SOME_FAILED)
+    rows = table(study)
+    assert len(rows) == 10
+    left = "x_left_lfseg_corr_usegray.nii.gz"
+    assert rows["sub-AD05", "L", left]["status"] == "used"
+    lost = rows["sub-202301171203", "L", left]
+    assert (lost["status"], lost["seg"]) == ("failed", "ashsPMC")
+    assert rows["sub-P009", "n/a", "P009"]["status"] == "not used"
+    assert rows["n/a", "n/a", "README"]["status"] == "not a segmentation"
+    described = files.read_json(study / "out" / "inputs.json")
+    assert set(described) == set(lost)
+
+    # Who is not asked for keeps the rows of the run before.
+    call(capsys, study, "--participant-label", "sub-04")
+    assert table(study).keys() == rows.keys()
+    assert table(study)["sub-202301171203", "L", left] == lost
+
+
+def test_a_table_of_people(study, capsys):
+    people = study / "people.tsv"
+    people.write_text(
+        "folder\tparticipant_id\tsession_id\nP001\tsub-01\tses-1\nAD_05\tsub-01\tses-2\nX\t9\tn/a\n"
+    )
+    said = call(capsys, study, "--participants-map", people, "--dry-run").out
+    assert "inputs: 4 used, 0 failed, 4 not used, 1 not a segmentation" in said
+    assert said.count("not named in --participants-map") == 3
+    assert "named in --participants-map, but no dataset has it" in said
+    for text, message in (
+        ("folder\tparticipant_id\nP001\tsub_01\n", "line 2: needs folder and participant_id"),
+        ("folder\tparticipant_id\nP1\t01\nP1\t02\n", "line 3: folder P1 occurs twice"),
+        ("participant_id\n01\n", "line 2: needs folder"),
+    ):
+        people.write_text(text)
+        said = call(capsys, study, "--participants-map", people, code=ExitCode.BAD_DATA).err
+        assert message in said
+        assert said.count("\n") == 1
+
+
+def test_two_folders_of_one_visit_in_the_table_are_refused(study, capsys):
+    people = study / "people.tsv"
+    people.write_text(
+        "folder\tparticipant_id\nP001\t01\nAD_05\t01\n20230117_1203\t02\nsub-04\t04\n"
+    )
+    said = call(capsys, study, "--participants-map", people, code=ExitCode.SOME_FAILED).err
+    assert said.count("[same-label] AD_05 and P001 would all be sub-01;") == 2
