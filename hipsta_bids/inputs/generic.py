@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from functools import cache, lru_cache
 from pathlib import Path
 
+from hipsta_bids import opening
 from hipsta_bids.errors import HipstaError, InputError, ProtocolError
 from hipsta_bids.inputs import scan, tree
 from hipsta_bids.inputs.selection import Context, LabelFile, Verdict
@@ -53,7 +54,7 @@ def table_protocol(path: Path, name: str) -> Protocol:
 def read_table(path: Path) -> tuple[NamedCode, ...]:
     """Read a label table."""
     try:
-        text = path.read_text("utf-8-sig")
+        text = opening.read_text(path, opening.SETTINGS, encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(
             f"{path}: cannot read the label table ({error}); it has to be UTF-8 text",

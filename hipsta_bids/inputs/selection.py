@@ -9,6 +9,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from hipsta_bids import opening
 from hipsta_bids.errors import HipstaError, InputError, ProtocolError, UsageError
 from hipsta_bids.inputs import scan, tree
 from hipsta_bids.protocols.load import load_protocol
@@ -224,7 +225,7 @@ def _labels(labels: Iterable[str], prefix: str, option: str) -> frozenset[str]:
 def _rules(path: Path) -> dict[str, _Rule]:
     """Read a filter file: ``{"dseg": {"session": "01", "space": ["T1w", "T2w"]}}``."""
     try:
-        contents = json.loads(path.read_text("utf-8"))
+        contents = json.loads(opening.read_text(path, opening.SETTINGS))
     except OSError as error:
         raise InputError(
             f"{path}: cannot read the filter file ({error.strerror}); check the path"

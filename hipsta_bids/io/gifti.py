@@ -35,6 +35,7 @@ from numpy.typing import ArrayLike, NDArray
 from hipsta_bids.errors import InputError
 from hipsta_bids.io import files
 from hipsta_bids.io.files import entities
+from hipsta_bids.opening import open_regular
 from hipsta_bids.types import Float, Int, Mesh
 
 #: Ending of the names of CIFTI files with one number per vertex.
@@ -297,6 +298,7 @@ def _unreadable(path: Path, format_name: str, error: Exception) -> InputError:
 def _load(path: Path, kind: type[Image]) -> Image:
     format_name = "GIFTI" if kind is GiftiImage else "CIFTI"
     try:
+        open_regular(path).close()  # a pipe would be waited for
         image = nib.load(path)
     except _DAMAGE as error:
         raise _unreadable(path, format_name, error) from error

@@ -13,6 +13,7 @@ import numpy as np
 
 from hipsta_bids.errors import InputError, UsageError
 from hipsta_bids.io import files, gifti
+from hipsta_bids.opening import open_regular
 from hipsta_bids.types import Coordinates, Float, Mesh, TetMesh
 
 #: Endings of surfaces that meshio reads and writes.
@@ -50,6 +51,7 @@ def read_surface(path: Path) -> Mesh:
     if path.suffix not in ENDINGS:
         return gifti.read_mesh(path)
     try:  # meshio.read ends the process where a file is damaged
+        open_regular(path).close()
         mesh = importlib.import_module(f"meshio.{path.suffix[1:]}").read(path)
         points, triangles = mesh.points, mesh.get_cells_type("triangle")
     except Exception as error:  # of any kind: meshio checks little

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from hipsta_bids import opening
 from hipsta_bids.errors import InputError, NothingToDoError, UsageError
 from hipsta_bids.geometry.catalog import MAPS, why_impossible
 from hipsta_bids.group.cohort.collect import SheetRecord
@@ -374,7 +375,7 @@ _BESIDE: Mapping[str, Callable[[Path], Path | None]] = {
 def read_volumes(path: Path) -> Volumes:
     """Read one table of any program."""
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        text = opening.read_text(path, opening.SETTINGS, encoding="utf-8-sig")
         volumes: dict[str, dict[str, float]] = {}
         for hemi, structure, volume in _entries(path, text):
             volumes.setdefault(hemi, {})[re.sub(r"\W+", "_", structure)] = volume
