@@ -19,7 +19,7 @@ _SYSTEM = ("/proc/", "/sys/", "/dev/")
 _POINTERS = (b"/annex/objects/", b"version https://git-lfs.github.com/")
 
 #: Pointers are not larger than this, bytes.
-_POINTER_SIZE = 1024
+POINTER_SIZE = 1024
 
 
 def not_fetched(path: Path) -> str | None:
@@ -43,7 +43,7 @@ def open_regular(path: Path) -> BufferedReader:
             raise fetch from None
         raise
     status = os.fstat(file.fileno())
-    is_pointer = 0 < status.st_size < _POINTER_SIZE and file.peek(1).startswith(_POINTERS)
+    is_pointer = 0 < status.st_size < POINTER_SIZE and file.peek(1).startswith(_POINTERS)
     # Files of the system say that they are empty.
     is_system = not status.st_size and os.path.realpath(path).startswith(_SYSTEM)
     if not stat.S_ISREG(status.st_mode) or is_system or is_pointer:

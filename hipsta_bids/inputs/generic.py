@@ -9,7 +9,7 @@ from pathlib import Path
 from hipsta_bids import opening
 from hipsta_bids.errors import HipstaError, InputError, ProtocolError
 from hipsta_bids.inputs import scan, tree
-from hipsta_bids.inputs.selection import Context, LabelFile, Verdict
+from hipsta_bids.inputs.selection import Context, LabelFile, Verdict, rivals_problem
 from hipsta_bids.io.files import entities
 from hipsta_bids.protocols.load import NamedCode, protocol_from_names
 from hipsta_bids.protocols.protocol import Protocol
@@ -152,7 +152,8 @@ def choose_described(
     """
     described = [(file, verdict) for file in files if (verdict := _describe(file, context))]
     groups: dict[str, list[tuple[LabelFile, Verdict]]] = {}
-    for file, verdict in sorted(described, key=lambda pair: _rank(*pair)):
+    ranked = [(file.ranked(_rank(file, verdict)), verdict) for file, verdict in described]
+    for file, verdict in sorted(ranked, key=lambda pair: (pair[0].rank, pair[0].path.name)):
         name = "" if verdict.problem else verdict.protocol.name
         groups.setdefault(name, []).append((file, verdict))
     for name, group in groups.items():
@@ -161,12 +162,12 @@ def choose_described(
             yield _choose(group, context, hemi)
 
 
-def _rank(file: LabelFile, verdict: Verdict) -> tuple[bool, bool, bool, int, str]:
+def _rank(file: LabelFile, verdict: Verdict) -> tuple[bool, bool, bool, int]:
     """Rank files in the subject's space, cropped or in no named space, with fewest entities."""
     space, name = file.traits.get("space") or "", file.path.name
     coarse = bool(space) and not space.startswith("crop")
     problem = verdict.problem is not None
-    return problem, not _OWN_SPACE.fullmatch(space), coarse, name.count("_"), name
+    return problem, not _OWN_SPACE.fullmatch(space), coarse, name.count("_")
 
 
 def without_side(visit: tree.VisitFolders) -> Iterator[tree.Ignored]:
@@ -192,6 +193,7 @@ def _choose(
     """Take the first of several files of one protocol."""
     (best, verdict), visit = group[0], context.visit
     problem, space = verdict.problem, best.traits.get("space") or ""
+    problem = problem or rivals_problem([file for file, _ in group])
     if problem is None and not _OWN_SPACE.fullmatch(space):
         problem = InputError(
             f"{best.path}: space {space} is a template's, which changes thickness; "

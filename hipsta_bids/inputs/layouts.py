@@ -203,7 +203,7 @@ def _unfold_rank(file: LabelFile, _: Context) -> tuple[Any, ...]:
     """Rank the finest grid in the subject's own space (``space-crop*``), then the image's own."""
     atlas = file.traits.get("atlas")
     index = _ATLASES.index(atlas) if atlas in _ATLASES else len(_ATLASES)
-    return _scaled(file), index, not _cropped(file), file.path.name
+    return _scaled(file), index, not _cropped(file)
 
 
 def _unfold_reason(file: LabelFile, best: LabelFile) -> str:
@@ -214,7 +214,7 @@ def _unfold_reason(file: LabelFile, best: LabelFile) -> str:
         return f"atlas {atlas} comes first; a --bids-filter-file selects another one"
     if _cropped(best) and not _cropped(file):
         return f"coarser grid than space {_space(best)}"
-    return "as good as the first one; a --bids-filter-file selects it"
+    return "as good as the first one"
 
 
 def _unfold_protocol(layout: Layout, file: LabelFile, context: Context, _: str) -> Verdict:

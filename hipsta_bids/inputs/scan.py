@@ -171,6 +171,8 @@ class Source:
     path: Path
     explicit: bool
     """Given by the user, not found by default."""
+    origin: str = ""
+    """Where it was found by default: ``derivatives`` or ``sourcedata``."""
     layouts: tuple[str, ...] = LAYOUTS
     """Kinds of segmentation to look for here."""
     generators: frozenset[str] = frozenset()
@@ -227,7 +229,7 @@ def _candidates(request: InputRequest, ignored: list[tree.Ignored]) -> Iterator[
     for folder in ("derivatives", "sourcedata"):
         if folder in top:
             path = request.bids_dir / folder
-            source = Source(name=folder, path=path, explicit=False, people=people)
+            source = Source(name=folder, path=path, explicit=False, origin=folder, people=people)
             for root in _datasets(source, 2, ignored):
                 yield replace(source, name=root.name, path=root)
     # A dataset without a description may be a bare folder of subjects.

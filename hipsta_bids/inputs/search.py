@@ -15,8 +15,10 @@ A picture of labels on an image from another space misleads, so pages show only 
   grid of voxels.
 """
 
+import contextlib
 import os
 import re
+import stat
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -41,6 +43,7 @@ from hipsta_bids.inputs.scan import (
 )
 from hipsta_bids.inputs.selection import Context, Selection, make_selection
 from hipsta_bids.io.files import entities
+from hipsta_bids.opening import POINTER_SIZE, not_fetched
 from hipsta_bids.protocols.protocol import Protocol
 from hipsta_bids.types import Hemisphere
 
@@ -265,10 +268,21 @@ def _search(source: Source, selection: Selection, option: Protocol | None, resul
         for entry in unused_of_visit(visit_context, items, explain=visit.subject not in explained):
             (results.other_entries if entry.template else results.ignored).append(entry)
         for item in items:
-            problem = refused.get(item.subject) or item.problem
+            problem = refused.get(item.subject) or item.problem or _not_fetched(item.files)
             note = renaming.get((item.subject, item.session))
             notes = item.notes if note is None else (*item.notes, note)
             results.items.append(replace(item, problem=problem, notes=notes))
+
+
+def _not_fetched(paths: Sequence[Path]) -> InputError | None:
+    """Tell that the content of a file is elsewhere; links and small files alone are looked into."""
+    for path in paths:
+        with contextlib.suppress(OSError):
+            status = path.lstat()
+            may_point = stat.S_ISLNK(status.st_mode) or 0 < status.st_size < POINTER_SIZE
+            if may_point and (message := not_fetched(path)):
+                return InputError(f"{path}: {message}", reason="not-fetched")
+    return None
 
 
 def _without_clashes(
@@ -276,6 +290,7 @@ def _without_clashes(
 ) -> tuple[HemisphereInput, ...]:
     """Keep one input per hemisphere and protocol."""
     order = {source.path: index for index, source in enumerate(sources)}
+    origin = {source.path: source.origin for source in sources}
     items: dict[tuple[str, str, str, str], HemisphereInput] = {}
     for item in sorted(
         candidates, key=lambda item: (item.problem is not None, order[item.source_path])
@@ -283,10 +298,18 @@ def _without_clashes(
         first = items.setdefault(item.key, item)
         if first is not item:
             reason = f"same hemisphere and protocol as in {first.source}, which comes first"
+            problem = first.problem
             if item.problem is not None and first.problem is None:
                 reason = f"not usable ({item.problem.reason})"
+            elif origin[item.source_path] and origin[item.source_path] == origin[first.source_path]:
+                problem = problem or InputError(
+                    f"{first.source} and {item.source} both have labels of {item.protocol.name};"
+                    f" choose one: -d {first.source}={first.source_path}",
+                    reason="several-pipelines",
+                )
             rejected = (str(item.files[0]), reason)
-            items[item.key] = replace(first, passed_over=(*first.passed_over, rejected))
+            passed_over = (*first.passed_over, rejected)
+            items[item.key] = replace(first, passed_over=passed_over, problem=problem)
     return tuple(items[key] for key in sorted(items))
 
 

@@ -2,6 +2,7 @@
 
 import difflib
 import json
+import os
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -78,7 +79,11 @@ class Selection:
         from bids.layout import parse_file_entities  # noqa: PLC0415 (takes seconds)
 
         file_entities = parse_file_entities(str(path), entities=list(_entities().values()))
-        texts = {key: str(value) for key, value in file_entities.items()}
+        texts = {
+            # Numbers keep their zeros in pybids, but are compared as numbers.
+            key: str(int(value)) if isinstance(value, int) else str(value)
+            for key, value in file_entities.items()
+        }
         return all(rule(texts.get(key)) for key, rule in self.rules.items())
 
     def _passes(self, entity: str, value: str | None) -> bool:
@@ -164,12 +169,18 @@ class Context:
 
 def rivals_problem(files: Sequence[LabelFile]) -> InputError | None:
     """Refuse to choose between files of which none is better."""
-    names = [file.path.name for file in files if file.rank == files[0].rank]
-    if len(names) == 1:
+    rivals = [file.path for file in files if file.rank == files[0].rank]
+    if len(rivals) == 1:
         return None
+    folder = Path(os.path.commonpath([path.parent for path in rivals]))
+    names = " and ".join(str(path.relative_to(folder)) for path in rivals)
+    remedy = "keep one of them in the subject's folder"
+    if len({path.name for path in rivals}) < len(rivals):
+        remedy = "name the folder to use with --participants-map"
+    elif files[0].traits.get("suffix") == "dseg":
+        remedy = "choose by entities with --bids-filter-file"
     return InputError(
-        f"{files[0].path.parent}: {' and '.join(names)} are equally good; "
-        "keep one of them in the subject's folder",
+        f"{folder}: {names} are equally good; {remedy}",
         reason="several-files",
     )
 
@@ -233,6 +244,11 @@ def _rules(path: Path) -> dict[str, _Rule]:
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: the filter file is not JSON ({error})") from error
     query = contents.get(_QUERY, {}) if isinstance(contents, dict) else None
+    if query == {}:
+        raise UsageError(
+            f"{path}: restricts nothing: segmentations are under {_QUERY!r}"
+            f" (found {', '.join(map(repr, contents)) or 'nothing'}); leave --bids-filter-file out"
+        )
     if not isinstance(query, dict):
         raise UsageError(
             f'{path}: the filter file is not of the form {{"{_QUERY}": {{ENTITY: VALUE}}}}'
@@ -243,10 +259,13 @@ def _rules(path: Path) -> dict[str, _Rule]:
             near = difflib.get_close_matches(key, known_keys, n=1)
             hint = f"; did you mean {near[0]!r}?" if near else ""
             raise UsageError(f"{path}: {key!r} in {_QUERY!r} is not a BIDS entity{hint}")
-    return {key: _rule(value) for key, value in query.items()}
+    return {
+        key: _rule(value, is_number=issubclass(known_keys[key].dtype, int))
+        for key, value in query.items()
+    }
 
 
-def _rule(value: Any) -> _Rule:  # noqa: ANN401 (JSON)
+def _rule(value: Any, *, is_number: bool) -> _Rule:  # noqa: ANN401 (JSON)
     """Make one entity's test; null, ``*`` and ``Query.…`` mean what they mean in fMRIPrep."""
     if value is None or value == "Query.NONE":
         return lambda text: text is None
@@ -255,8 +274,10 @@ def _rule(value: Any) -> _Rule:  # noqa: ANN401 (JSON)
     if value == "Query.OPTIONAL":
         return lambda _: True
     values = value if isinstance(value, list) else [value]
-    rules = [_rule(entry) for entry in values] if isinstance(value, list) else []
-    texts = {str(entry) for entry in values}
+    rules = [_rule(v, is_number=is_number) for v in values] if isinstance(value, list) else []
+    texts = {str(v) for v in values}
+    if is_number:
+        texts = {str(int(text)) if text.isdecimal() else text for text in texts}
     return lambda text: text in texts or any(rule(text) for rule in rules)
 
 
