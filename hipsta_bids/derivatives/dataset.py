@@ -63,12 +63,16 @@ def read_description(root: Path) -> dict[str, Any] | None:
         return {} if path.exists() else None
 
 
-def generated_by(description: Mapping[str, Any] | None) -> list[str]:
-    """Names of the software that a dataset description says it was made by."""
+def generated_by(description: Mapping[str, Any] | None) -> dict[str, str]:
+    """Names of the software that a dataset description says it was made by, with versions."""
     entries = (description or {}).get("GeneratedBy")
     if not isinstance(entries, list):
         entries = [(description or {}).get("PipelineDescription")]  # BIDS before 1.4
-    return [str(e["Name"]) for e in entries if isinstance(e, Mapping) and "Name" in e]
+    return {
+        str(entry["Name"]): str(entry.get("Version") or "")
+        for entry in entries
+        if isinstance(entry, Mapping) and "Name" in entry
+    }
 
 
 def settle_settings(root: Path, settings: Settings) -> str:
@@ -535,12 +539,34 @@ def write_sidecar(root: Path) -> None:
     files.write_json(root / DATASET_FILES["status_sidecar"], described)
 
 
+#: Where the labels of a hemisphere come from: keys of ``provenance`` in its quality record.
+PROVENANCE: dict[str, str] = {
+    "tool": "program that made the labels",
+    "version": "its version; of FreeSurfer's subfields without one (v22), that of FreeSurfer",
+    "analysis": "images that it was given (T1, T1-T2, T2w), or ASHS's step (corr_usegray)",
+    "atlas": "atlas, where the program has several",
+    "hierarchy": "FreeSurfer's hierarchy of labels, and that of the parts (FS60+HBT)",
+    "space": "space in the name of the file",
+    "design": "cross-sectional or longitudinal",
+    "edited": "what a person corrected: labels, mask, joined by +",
+    "voxel_size": "edges of a voxel of the labels, mm",
+}
+
+
+def provenance_of(record: Mapping[str, Any]) -> dict[str, str]:
+    """Return where the labels of a quality record come from; ``n/a`` where it does not say."""
+    entry = record.get("provenance")
+    fields = entry if isinstance(entry, Mapping) else {}
+    return {key: str(fields.get(key) or files.MISSING) for key in PROVENANCE}
+
+
 #: Columns of ``inputs.tsv``, with their meaning.
 INPUT_COLUMNS: dict[str, str] = {
     "path": "file or folder; a folder stands for all in it that has no row of its own",
     **{name: COLUMNS[name] for name in KEY},
     "status": "used; failed; not used, though it seems meant to be; or not a segmentation",
     "reason": "why it was chosen, failed, or was not used",
+    **PROVENANCE,
 }
 
 

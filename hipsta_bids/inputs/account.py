@@ -99,7 +99,7 @@ def input_table(
         status, reason = (
             (tree.FAILED, str(item.problem)) if item.problem else (tree.IS_USED, item.explanation)
         )
-        of_item = [row(item.files[0], item, status, reason)]
+        of_item = [item.origin | row(item.files[0], item, status, reason)]
         beside = "head, body and tail of the same labels"
         of_item += [row(path, item, status, beside) for path in item.files[1:]]
         of_item += [

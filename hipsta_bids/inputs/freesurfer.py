@@ -7,15 +7,17 @@ the analysis, ``.long`` in longitudinal folders, and otherwise nothing. It also 
 folders, which have the same layout.
 """
 
+import contextlib
 import os
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from hipsta_bids import opening
 from hipsta_bids.errors import HipstaError, InputError
 from hipsta_bids.inputs import scan, tree
-from hipsta_bids.inputs.selection import Context, LabelFile
+from hipsta_bids.inputs.selection import DESIGNS, Context, LabelFile
 from hipsta_bids.protocols.load import load_protocol
 
 NAME = re.compile(
@@ -160,7 +162,26 @@ def choose_run(
         passed_over=_passed_over(runs, run, paths),
         problem=None if best else _problem(runs, matching, analysis),
         notes=(coarse,) if best and run.coarse else (),
+        provenance={
+            "tool": "freesurfer",
+            "version": _version(run),
+            "analysis": "-".join(run.analysis.scans) or _UNNAMED,
+            "hierarchy": "+".join(name for name in (subfields, parts) if name),
+            "space": "FSvoxelSpace" if run.coarse else None,
+            "design": DESIGNS[run.longitudinal],
+        },
     )
+
+
+def _version(run: _Run) -> str | None:
+    """Read the version of the subfields in the file's name, or else that of FreeSurfer itself."""
+    if run.analysis.version is not None:
+        return f"v{run.analysis.version}"
+    stamp = next(iter(run.files.values())).parent.parent / "scripts" / "build-stamp.txt"
+    with contextlib.suppress(OSError, ValueError):
+        match = re.search(r"\d+\.\d+(?:\.\d+)?", opening.read_text(stamp, opening.SETTINGS))
+        return match[0] if match else None
+    return None
 
 
 def is_longitudinal(files: Iterable[LabelFile]) -> bool:

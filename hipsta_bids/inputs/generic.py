@@ -200,6 +200,7 @@ def _choose(
             "use labels in the subject's own space",
             reason="template-space",
         )
+    tool = next(iter(context.source.generators), "")
     order = "the subject's own space, the finest grid and the shortest name come first"
     mismatches = [
         f"{key}-{best.traits[key]}"
@@ -214,6 +215,7 @@ def _choose(
         passed_over=[(file.path, order) for file, _ in group[1:]],
         problem=problem,
         notes=(f"the file's name says {'_'.join(mismatches)}",) if mismatches else (),
+        provenance=context.provenance(tool, best) | {"atlas": verdict.protocol.name},
     )
 
 

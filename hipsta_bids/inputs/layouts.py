@@ -157,6 +157,7 @@ def _best(
         passed_over=[(file.path, layout.reason(file, best)) for file in files[1:]],
         problem=rivals_problem(files) or verdict.problem,
         notes=verdict.notes,
+        provenance=context.provenance(layout.name, best) | verdict.provenance,
     )
 
 
@@ -281,7 +282,12 @@ def _ashs_protocol(_: Layout, file: LabelFile, context: Context, hemi: str) -> V
             reason="unknown-hemisphere",
         )
     explanations = (file.traits["kind"] or "", f"; {explanation}")
-    return Verdict(protocol=protocol, explanation=explanations, problem=problem)
+    return Verdict(
+        protocol=protocol,
+        explanation=explanations,
+        problem=problem,
+        provenance={"atlas": protocol.name},
+    )
 
 
 #: Subjects whose files are opened to find out a dataset's atlas, spread over the dataset.

@@ -10,9 +10,10 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from hipsta_bids.derivatives.dataset import NAME, generated_by, read_description
+from hipsta_bids.derivatives.dataset import NAME, PROVENANCE, generated_by, read_description
 from hipsta_bids.errors import HipstaError, InputError
 from hipsta_bids.inputs import tree
+from hipsta_bids.io.files import MISSING
 from hipsta_bids.protocols.protocol import Protocol
 from hipsta_bids.types import GivenEnd, Hemisphere
 
@@ -122,6 +123,8 @@ class HemisphereInput(Hemisphere):
     """Found, but not usable: this hemisphere fails, the others go on."""
     notes: tuple[str, ...] = ()
     """What a reader should know about this choice."""
+    provenance: Mapping[str, str] = field(default_factory=dict)
+    """Tool, version and so on, as far as names tell (``PROVENANCE`` of ``derivatives``)."""
     edits: tuple[Edit, ...] = ()
     """Corrections by a person that take the place of what the files say."""
     ends: tuple[GivenEnd, ...] = ()
@@ -139,6 +142,13 @@ class HemisphereInput(Hemisphere):
     def edited(self) -> tuple[str, ...]:
         """Kinds of edits, each once."""
         return tuple(dict.fromkeys(edit.kind for edit in self.edits))
+
+    @property
+    def origin(self) -> dict[str, str]:
+        """Where the labels come from, as far as is known before they are read."""
+        return {**dict.fromkeys(PROVENANCE, MISSING), **self.provenance} | {
+            "edited": "+".join(self.edited) or MISSING
+        }
 
     @property
     def code_offset(self) -> int:
@@ -175,8 +185,8 @@ class Source:
     """Where it was found by default: ``derivatives`` or ``sourcedata``."""
     layouts: tuple[str, ...] = LAYOUTS
     """Kinds of segmentation to look for here."""
-    generators: frozenset[str] = frozenset()
-    """Software named in its ``dataset_description.json``."""
+    generators: Mapping[str, str] = field(default_factory=dict)
+    """Software named in its ``dataset_description.json``, with versions."""
 
     people: tree.People = field(default_factory=dict)
     """Of ``--participants-map``."""
@@ -206,7 +216,7 @@ def list_sources(
     sources: dict[Path, Source] = {}
     for source in _candidates(request, [] if ignored is None else ignored):
         description = read_description(source.path)
-        made_by = frozenset(name.lower() for name in generated_by(description))
+        made_by = {name.lower(): version for name, version in generated_by(description).items()}
         key = Path(os.path.realpath(source.path))  # also where links go round in circles
         if NAME not in {name.replace("-", "_") for name in made_by} and key not in sources:
             sources[key] = replace(source, generators=made_by)

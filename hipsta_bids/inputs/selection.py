@@ -118,6 +118,8 @@ class Verdict:
     """Before and after a remark about the hemispheres in the file."""
     problem: HipstaError | None = None
     notes: tuple[str, ...] = ()
+    provenance: dict[str, str | None] = field(default_factory=dict)
+    """What the file's name does not tell."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -145,6 +147,7 @@ class Context:
         passed_over: Iterable[tuple[Path, str]] = (),
         problem: HipstaError | None = None,
         notes: tuple[str, ...] = (),
+        provenance: Mapping[str, str | None],
     ) -> scan.HemisphereInput:
         """Make the input of one hemisphere of the visit."""
         return scan.HemisphereInput(
@@ -164,7 +167,28 @@ class Context:
             ),
             problem=problem,
             notes=notes,
+            provenance={key: text for key, text in provenance.items() if text},
         )
+
+    def provenance(self, tool: str, file: LabelFile) -> dict[str, str | None]:
+        """Tell where a file comes from by its name and place."""
+        versions = [text for name, text in self.source.generators.items() if tool in name]
+        parts, image = file.path.parts, re.search(r"(?<![A-Za-z])(?:crop)?(T[12]w)", file.path.name)
+        analysis = file.traits.get("kind") or (image and image[1])
+        if "HippUnfold" in parts[:-2]:  # the Human Connectome Project's folder of each contrast
+            analysis = parts[parts.index("HippUnfold") + 1]
+        return {
+            "tool": tool,
+            "version": versions[0] if versions else None,
+            "analysis": analysis,
+            "atlas": file.traits.get("atlas"),
+            "space": file.traits.get("space"),
+            "design": DESIGNS[file.longitudinal],
+        }
+
+
+#: Kinds of runs: each visit by itself, or all of a person's together.
+DESIGNS = ("cross-sectional", "longitudinal")
 
 
 def rivals_problem(files: Sequence[LabelFile]) -> InputError | None:

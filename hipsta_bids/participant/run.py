@@ -28,7 +28,7 @@ from hipsta_bids.derivatives.dataset import (
     update_status,
     write_sidecar,
 )
-from hipsta_bids.derivatives.hemisphere import ResultPlace
+from hipsta_bids.derivatives.hemisphere import ResultPlace, read_record
 from hipsta_bids.derivatives.names import DATASET_FILES, HemisphereName, write_shared
 from hipsta_bids.errors import ExitCode, HipstaError, InputError, OutputError, ProtocolError
 from hipsta_bids.inputs.scan import HemisphereInput
@@ -375,16 +375,17 @@ def _write_inputs(out_dir: Path, options: RunOptions, outcomes: Sequence[Outcome
     """Write what became of all that was found."""
     if not options.inputs:
         return
-    failed = {
-        row_key(identity(outcome.job.result.name))[:-1]: outcome.message or ""
-        for outcome in outcomes
-        if outcome.status == Status.FAILED
-    }
+    endings: dict[tuple[str, ...], dict[str, str]] = {}
+    for outcome in outcomes:
+        with contextlib.suppress(InputError):
+            ending = dataset.provenance_of(read_record(outcome.job.result))
+            if outcome.status == Status.FAILED:
+                ending |= {"status": "failed", "reason": outcome.message or ""}
+            endings[row_key(identity(outcome.job.result.name))[:-1]] = ending
     rows = []
     for row in options.inputs:
-        message = failed.get(tuple(row.get(key, files.MISSING) for key in dataset.KEY))
-        is_lost = message is not None and row["status"] == "used"
-        rows.append({**row, "status": "failed", "reason": str(message)} if is_lost else row)
+        key = tuple(row.get(name, files.MISSING) for name in dataset.KEY)
+        rows.append({**row, **endings.get(key, {})} if row["status"] == "used" else row)
     is_whole = options.is_whole and options.shard is None
     dataset.write_inputs(out_dir, rows, is_whole=is_whole)
 

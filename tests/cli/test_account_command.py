@@ -5,6 +5,7 @@ import sys
 import pytest
 from stand_ins import stand_in_job
 
+from hipsta_bids.api.maps import load
 from hipsta_bids.cli import main
 from hipsta_bids.errors import ExitCode
 from hipsta_bids.io import files
@@ -105,3 +106,44 @@ def test_two_folders_of_one_visit_in_the_table_are_refused(study, capsys):
     )
     said = call(capsys, study, "--participants-map", people, code=ExitCode.SOME_FAILED).err
     assert said.count("[same-label] AD_05 and P001 would all be sub-01;") == 2
+
+
+def test_where_labels_come_from(tmp_path, capsys):
+    bids, out = tmp_path / "bids", tmp_path / "out"
+    fs = bids / "derivatives" / "fs"
+    places = {
+        "sub-01/mri/lh.hippoAmygLabels-T1-T2.v21.mgz": "freesurfer v21 T1-T2 n/a full n/a cross",
+        "sub-02/mri/lh.hippoAmygLabels.FS60.mgz": "freesurfer 8.1.0 unnamed n/a FS60+HBT n/a cross",
+        "sub-03_ses-1.long.sub-03/mri/lh.hippoAmygLabels-T1.v22.FSvoxelSpace.mgz": (
+            "freesurfer v22 T1 n/a full FSvoxelSpace long"
+        ),
+        "sub-04/final/x_left_lfseg_corr_nogray.nii.gz": (
+            "ashs n/a corr_nogray ashsPMC n/a n/a cross"
+        ),
+        "sub-05/anat/sub-05_hemi-L_space-cropT2w_desc-subfields_atlas-bigbrain_dseg.nii.gz": (
+            "hippunfold n/a T2w bigbrain n/a cropT2w cross"
+        ),
+    }
+    for place in (*places, "sub-02/mri/lh.hippoAmygLabels.HBT.mgz"):
+        path = fs / place
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(f"ok {place}")
+    stamp = fs / "sub-02" / "scripts" / "build-stamp.txt"
+    stamp.parent.mkdir()
+    stamp.write_text("freesurfer-linux-ubuntu22_x86_64-8.1.0-20250806-aaaaaaa\n")
+    arguments = [bids, out, "participant", "--no-reports", "--ashs-atlas", "ashsPMC"]
+    assert main.main([str(word) for word in arguments]) == ExitCode.OK
+    capsys.readouterr()
+    names = ("tool", "version", "analysis", "atlas", "hierarchy", "space", "design")
+    rows = {row["path"]: row for row in files.read_tsv(out / "inputs.tsv")}
+    records = [files.read_json(path)["provenance"] for path in out.rglob("*_desc-qc_metrics.json")]
+    frame = load(out, protocol="freesurfer").table.set_index("participant_id")
+    for place, expected in places.items():
+        row = rows[f"derivatives/fs/{place}"]
+        cells = [row[name] for name in names]
+        cells[-1] = cells[-1].removesuffix("-sectional").removesuffix("itudinal")
+        assert " ".join(cells) == expected
+        assert (row["edited"], row["voxel_size"]) == ("n/a", "0.4 x 0.4 x 1.2")
+        assert {name: row[name] for name in records[0]} in records
+        if row["seg"] == "freesurfer":
+            assert [frame.loc[row["subject"], name] for name in names] == [row[n] for n in names]
