@@ -270,8 +270,10 @@ def _search(source: Source, selection: Selection, option: Protocol | None, resul
         for item in items:
             problem = refused.get(item.subject) or item.problem or _not_fetched(item.files)
             note = renaming.get((item.subject, item.session))
-            notes = item.notes if note is None else (*item.notes, note)
-            results.items.append(replace(item, problem=problem, notes=notes))
+            if problem is not item.problem or note is not None:
+                notes = item.notes if note is None else (*item.notes, note)
+                item = replace(item, problem=problem, notes=notes)  # noqa: PLW2901 (the same one)
+            results.items.append(item)
 
 
 def _not_fetched(paths: Sequence[Path]) -> InputError | None:

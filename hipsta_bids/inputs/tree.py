@@ -309,7 +309,7 @@ def _tools_inside(path: Path, *, if_closed: str) -> frozenset[str]:
         inner = {"HippUnfold": "T1w/HippUnfold", f"{path.name}/mri": "mri"}
         names |= {mark for name, mark in inner.items() if (path / "T1w" / name).is_dir()}
     tools = {tool for tool, marks in _MARKS.items() if not marks.isdisjoint(names)}
-    if any("lfseg_" in name for name in names):
+    if path.name not in _MARKS["ashs"] and any("lfseg_" in name for name in names):
         tools.add("ashs")
     return frozenset(tools | ({"base"} if "base-tps" in names else set()))
 
