@@ -499,13 +499,14 @@ def input_request(options: "Namespace") -> "InputRequest":
 
 
 def _settle_labels(options: "Namespace") -> None:
-    """Read names of FreeSurfer's folders as labels where they have their option, else refuse."""
+    """Read names of folders as labels where these have their option, else refuse."""
     from hipsta_bids.inputs.tree import plain_label  # noqa: PLC0415  (heavy)
 
     for option in ("participant_label", "exclude_participant_label"):
         labels = getattr(options, option)
         wrong = [label for label in labels if label != plain_label(label)]
-        if wrong and options.freesurfer_dir is None:
+        folders = (options.freesurfer_dir, options.ashs_dir, options.hippunfold_dir)
+        if wrong and not any(folders):
             raise UsageError(
                 f"--{option.replace('_', '-')}: {wrong[0]!r} is not a BIDS label (letters and"
                 " digits)"

@@ -58,6 +58,11 @@ class InputRequest:
     """Table with the participant and session of each folder."""
 
     @property
+    def any_name(self) -> bool:
+        """Whether an option takes folders of any name."""
+        return any((self.freesurfer_dir, self.ashs_dir, self.hippunfold_dir))
+
+    @property
     def is_whole(self) -> bool:
         """Whether all participants and sessions are asked for."""
         limits = (self.participant_labels, self.excluded_labels, self.session_labels)

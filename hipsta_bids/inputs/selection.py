@@ -242,8 +242,8 @@ def measurable(protocol: Protocol) -> Protocol:
 
 
 def _plain(request: scan.InputRequest, labels: tuple[str, ...]) -> tuple[str, ...]:
-    """Read names of FreeSurfer's folders as labels, where these may have any name."""
-    return labels if request.freesurfer_dir is None else tuple(map(tree.plain_label, labels))
+    """Read names of folders as labels, where these may have any name."""
+    return tuple(map(tree.plain_label, labels)) if request.any_name else labels
 
 
 def _labels(labels: Iterable[str], prefix: str, option: str) -> frozenset[str]:

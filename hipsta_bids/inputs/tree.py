@@ -20,6 +20,8 @@ from hipsta_bids.types import Visit
 #: ``sub-X``, ``sub-X_ses-Y``, and FreeSurfer's longitudinal ``sub-X_ses-Y.long.BASE``.
 _SUBJECT = re.compile(r"sub-(?P<subject>[A-Za-z0-9+]+)(?:_ses-(?P<session>[A-Za-z0-9+]+))?")
 
+_LABEL = re.compile("[A-Za-z0-9+]+")
+
 #: The same for folders of any name.
 _ANY_NAME = re.compile(r"(?:sub-)?(?P<subject>.+?)(?:_ses-(?P<session>[A-Za-z0-9+]+))?")
 
@@ -318,15 +320,12 @@ def read_people(path: Path | None) -> People:
     """Read ``--participants-map``: columns ``folder``, ``participant_id`` and ``session_id``."""
     people: dict[str, tuple[str, str | None]] = {}
     for number, row in enumerate(read_tsv(path) if path else (), start=2):
-        folder = row.get("folder", "").strip("/")
+        folder = os.path.normpath(row.get("folder") or "..").strip("/")
         subject = row.get("participant_id", "").removeprefix("sub-")
-        session = row.get("session_id", MISSING).removeprefix("ses-")
-        session = "" if session == MISSING else session
-        if (
-            not folder
-            or not re.fullmatch("[A-Za-z0-9+]+", subject)
-            or plain_label(session) != (session)
-        ):
+        session = row.get("session_id", MISSING).removeprefix("ses-").replace(MISSING, "")
+        # Nothing outside of a dataset, nor the dataset itself.
+        is_inside = not folder.startswith(".")
+        if not (is_inside and _LABEL.fullmatch(subject) and (_LABEL.fullmatch(session or "0"))):
             raise InputError(
                 f"{path}: line {number}: needs folder and participant_id (and session_id), labels"
                 " of letters and digits"

@@ -92,11 +92,20 @@ def test_a_table_of_people(study, capsys):
         ("folder\tparticipant_id\nP001\tsub_01\n", "line 2: needs folder and participant_id"),
         ("folder\tparticipant_id\nP1\t01\nP1\t02\n", "line 3: folder P1 occurs twice"),
         ("participant_id\n01\n", "line 2: needs folder"),
+        ("folder\tparticipant_id\n../ashs/P001\t01\n", "line 2: needs folder"),
+        ("folder\tparticipant_id\n.\t01\n", "line 2: needs folder"),
+        ("folder\tparticipant_id\tsession_id\nP001\t01\ta_1\n", "line 2: needs folder"),
     ):
         people.write_text(text)
         said = call(capsys, study, "--participants-map", people, code=ExitCode.BAD_DATA).err
         assert message in said
         assert said.count("\n") == 1
+
+
+@pytest.mark.parametrize("label", ["AD05", "AD_05", "sub-AD_05"])
+def test_participants_by_the_name_of_the_folder(study, capsys, label):
+    said = call(capsys, study, "--participant-label", label, "--dry-run").out
+    assert "inputs: 2 used, 0 failed, 0 not used, 1 not a segmentation" in said
 
 
 def test_two_folders_of_one_visit_in_the_table_are_refused(study, capsys):
@@ -147,3 +156,50 @@ def test_where_labels_come_from(tmp_path, capsys):
         assert {name: row[name] for name in records[0]} in records
         if row["seg"] == "freesurfer":
             assert [frame.loc[row["subject"], name] for name in names] == [row[n] for n in names]
+
+
+def said_of(capsys, *arguments, code=ExitCode.OK):
+    assert main.main([str(word) for word in arguments]) == code
+    said = capsys.readouterr()
+    return said.out + said.err
+
+
+def test_what_a_name_must_not_decide_is_a_question(tmp_path, capsys):
+    command = (tmp_path / "bids", tmp_path / "out", "participant", "--no-reports")
+    for dataset in ("a", "b"):
+        path = tmp_path / "bids/derivatives" / dataset / "sub-01/mri/lh.hippoAmygLabels-T1.v22.mgz"
+        path.parent.mkdir(parents=True)
+        path.write_text(f"ok {dataset}")
+    said = said_of(capsys, *command, code=ExitCode.BAD_DATA)
+    first = tmp_path / "bids" / "derivatives" / "a"
+    assert (
+        f"[several-pipelines] a and b both have labels of freesurfer; choose one: -d a={first}"
+        in said
+    )
+    assert "1 ok" in said_of(capsys, *command, "-d", f"a={first}")
+    unfolded = tmp_path / "bids/derivatives/h/sub-02/anat"
+    unfolded.mkdir(parents=True)
+    for run in ("01", "02"):
+        name = f"sub-02_run-{run}_hemi-L_space-cropT1w_desc-subfields_dseg.nii.gz"
+        (unfolded / name).write_text(f"ok {run}")
+    options = ("--participant-label", "02", "--bids-filter-file", tmp_path / "filter.json")
+    said = said_of(capsys, *command, *options[:2], code=ExitCode.BAD_DATA)
+    assert "[several-files]" in said
+    assert "choose by entities with --bids-filter-file" in said
+    options[-1].write_text('{"dseg": {"run": 1}}')
+    assert "run-01_hemi-L" in said_of(capsys, *command, *options, "--dry-run")
+    options[-1].write_text('{"t1w": {"run": 1}}')
+    said = said_of(capsys, *command, *options, code=ExitCode.USAGE)
+    assert "restricts nothing" in said
+
+
+def test_content_that_was_not_fetched(tmp_path, capsys):
+    path = tmp_path / "bids" / "derivatives/fs/sub-01/mri/rh.hippoAmygLabels.mgz"
+    path.parent.mkdir(parents=True)
+    path.symlink_to("../.git/annex/objects/x")
+    command = (tmp_path / "bids", tmp_path / "out", "participant", "--no-reports")
+    assert f"run `datalad get {path}`" in said_of(capsys, *command, "--dry-run")
+    said = said_of(capsys, *command, code=ExitCode.BAD_DATA)
+    assert f"[not-fetched] {path}: its content was not fetched; run `datalad get {path}`" in said
+    (row,) = (r for r in files.read_tsv(tmp_path / "out" / "inputs.tsv") if r["hemi"] == "R")
+    assert (row["status"], row["tool"]) == ("failed", "freesurfer")
