@@ -22,6 +22,13 @@ _POINTERS = (b"/annex/objects/", b"version https://git-lfs.github.com/")
 POINTER_SIZE = 1024
 
 
+class UnfitFileError(OSError):
+    """A file that is not read; its message has no number of the system."""
+
+    def __str__(self) -> str:
+        return str(self.strerror)
+
+
 def not_fetched(path: Path) -> str | None:
     """Tell what to do if the content of a file is elsewhere: DataLad's and Git LFS' pointers."""
     try:
@@ -33,11 +40,11 @@ def not_fetched(path: Path) -> str | None:
 
 def open_regular(path: Path) -> BufferedReader:
     """Open a file for reading, if it is a regular one and its content is here."""
-    fetch = OSError(errno.ENODATA, f"its content was not fetched; run `datalad get {path}`")
+    fetch = UnfitFileError(errno.ENODATA, f"its content was not fetched; run `datalad get {path}`")
     try:
         file = os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb")
     except IsADirectoryError as error:
-        raise OSError(errno.EINVAL, "no regular file") from error
+        raise UnfitFileError(errno.EINVAL, "no regular file") from error
     except FileNotFoundError:
         if path.is_symlink() and "annex/objects" in str(path.readlink()):
             raise fetch from None
@@ -48,7 +55,7 @@ def open_regular(path: Path) -> BufferedReader:
     is_system = not status.st_size and os.path.realpath(path).startswith(_SYSTEM)
     if not stat.S_ISREG(status.st_mode) or is_system or is_pointer:
         file.close()
-        raise fetch if is_pointer else OSError(errno.EINVAL, "no regular file")
+        raise fetch if is_pointer else UnfitFileError(errno.EINVAL, "no regular file")
     return file
 
 
@@ -57,7 +64,7 @@ def read_bounded(path: Path, limit: float) -> bytes:
     with open_regular(path) as file:
         content = file.read(int(limit) + 1)
     if len(content) > limit:
-        raise OSError(errno.EFBIG, f"larger than {limit / 1e6:g} MB")
+        raise UnfitFileError(errno.EFBIG, f"larger than {limit / 1e6:g} MB")
     return content
 
 
