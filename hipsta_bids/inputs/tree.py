@@ -241,10 +241,10 @@ def read_names(
     entries: dict[str, SubjectFolder | Ignored | None] = {}
     for name, stem in stems.items():
         path, match = root / name, _SUBJECT.fullmatch(stem) if name not in inside else None
-        before = [
-            b for b in bases if stem.startswith(b) and not stem[len(b) : len(b) + 1].isalnum()
-        ]
-        base = base_of.get(stem) or ("" if match else max(before, key=len, default=""))
+        # A time point begins with the name of its base, and goes on with no letter or digit.
+        heads = (stem[:n] for n, letter in enumerate(stem) if not letter.isalnum())
+        before = "" if match else max((h for h in heads if h in bases), key=len, default="")
+        base = base_of.get(stem) or before
         if name in bases and name not in base_of:
             entries[name] = no_segmentation(path, "the base of longitudinal runs, no visit")
         elif match and (match["session"] or visits_of[base] < 2):  # noqa: PLR2004 (two visits)
