@@ -371,8 +371,9 @@ def _run(options: "Namespace", arguments: Sequence[str]) -> ExitCode:
     inputs = account.input_table(items, unused, options.bids_dir)
     for note in notes:
         console.echo(f"note: {note}")
-    console.echo(f"inputs: {account.count_inputs(inputs)}")
+    counts = f"inputs: {account.count_inputs(inputs)}"
     if options.dry_run:
+        console.echo(counts)
         console.echo_table(account.selection_table(items))
         console.echo_table(account.ignored_table(findings.ignored))
         console.echo_table(account.other_entries_table(findings.other_entries))
@@ -383,6 +384,7 @@ def _run(options: "Namespace", arguments: Sequence[str]) -> ExitCode:
     notes += tuple(f"not used: {entry.path}: {entry.reason}" for entry in findings.ignored)
     out, run_options = options.output_dir, _run_options(options, arguments, notes)
     run_options = replace(run_options, inputs=tuple(inputs), is_whole=request.is_whole)
+    console.echo(counts)
     with console.Progress(-1 if options.quiet else options.verbose) as progress:
         if collects:
             result = collect(items, out, settings, run_options)
