@@ -154,7 +154,7 @@ def find_inputs(request: InputRequest) -> Findings:
     if renamed:
         notes += (f"renamed: {_count(renamed, 'folder')}",)
     if sides := [f"{e.inside.name} {e.hemi}" for e in ignored if e.hemi and e.inside]:
-        notes += (f"labels of one hemisphere only, none of {_count(sides, 'other')}",)
+        notes += (f"no labels of one hemisphere: {_count(sides, 'visit')}",)
     if text := _unused(ignored):
         notes += (f"not used: {text}; --dry-run and the log say why",)
     return Findings(

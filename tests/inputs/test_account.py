@@ -92,7 +92,7 @@ def test_a_missing_hemisphere_has_a_row_and_a_note(tmp_path):
     put_freesurfer(dataset / "sub-01")
     touch(dataset / "sub-02" / "mri", FS.format("r"))
     found = find_inputs(InputRequest(bids_dir=tmp_path))
-    assert found.notes == ("labels of one hemisphere only, none of 1 other (sub-02 L)",)
+    assert found.notes == ("no labels of one hemisphere: 1 visit (sub-02 L)",)
     row = account(tmp_path)["derivatives/fs/sub-02/mri", "L", None]
     assert (row["status"], row["subject"]) == ("not used", "sub-02")
     # Nobody misses what was not asked for.

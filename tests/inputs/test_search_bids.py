@@ -167,7 +167,7 @@ def test_a_side_that_is_misspelled_is_noted(tmp_path):
     (item,) = found.items
     assert (item.hemi, item.problem) == ("L", None)
     assert found.notes == (
-        "labels of one hemisphere only, none of 1 other (sub-01 R)",
+        "no labels of one hemisphere: 1 visit (sub-01 R)",
         "not used: 1 file (sub-01_hemi-r_dseg.nii.gz); --dry-run and the log say why",
     )
     assert [entry.reason for entry in found.ignored] == [
