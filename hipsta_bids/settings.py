@@ -5,7 +5,9 @@ What does not change a result (jobs, verbosity, folders) is in
 :class:`hipsta_bids.participant.run.RunOptions`.
 """
 
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
@@ -35,6 +37,12 @@ class BodySettings(toml.SettingsTable):
     plane_reach: PositiveFloat = 3.0
     """End planes are fitted to labels within this distance of the interface, mm; head and tail
     labels that lie up to it on the wrong side get the subfield of a neighbor."""
+    end_rule: Literal["graded", "last-slice"] = "graded"
+    """Ends without labels of head or tail: a mean over graded evidence, or ``last-slice`` (the last
+    slice with CA1 and CA2 or CA3 posteriorly, with CA2 or CA3 anteriorly; Diers et al. 2023)."""
+    mending: Literal["gaps", "closing"] = "gaps"
+    """Before the surface: ``gaps`` (slits, pits and cavities that match no fold are filled), or
+    ``closing`` (the mask is dilated and eroded by a voxel; Diers et al. 2023)."""
     end_margin: NonNegativeFloat = 0.0
     """Taken off either end where head or tail labels are missing, mm."""
     slit_area: NonNegativeFloat = 2.5
@@ -117,11 +125,18 @@ class BoundarySettings(toml.SettingsTable):
 
     solver: Literal["two-level", "lapy"] = "two-level"
     """What solves Laplace's equation, for boundaries and coordinates; ``lapy`` is slower."""
+    operator: Literal["sharp-bends", "published"] = "sharp-bends"
+    """What slows diffusion on the wall: convex bends beyond ``sharp_bend``, or ``published``: both
+    principal curvatures, without a threshold (Diers et al. 2023, appendix A)."""
+    edges: Literal["faces", "zero-lines"] = "faces"
+    """Where x is fixed: on the end faces of the sheet, or ``zero-lines``: on the zero lines of the
+    eigenfunction as they are (Diers et al. 2023)."""
     sharp_bend: NonNegativeFloat = 0.5
     """Convex bends with less curvature than this do not slow diffusion, 1/mm."""
     anisotropy: NonNegativeFloat = 8.0
     """Diffusion across sharper ones, of curvature k, is slowed by exp(-anisotropy (k -
-    sharp_bend)), mm."""
+    sharp_bend)), mm. By the operator ``published`` exp(-anisotropy |k|) in both directions, k in
+    LaPy's units, which grow with the mesh's edges; Hipsta takes 40."""
 
 
 class SheetSettings(toml.SettingsTable):
@@ -212,9 +227,9 @@ class CheckSettings(toml.SettingsTable):
     """Flag rows without their edge's subfield over more than this, mm (1.2 at most in 128)."""
     flag_edge: toml.Numbers = (1.8, 2.2, 2.7)
     """Flag an edge that recedes behind both by more than this, one per distance, mm."""
-    flag_ridge: toml.Numbers = (0.85, 1.4, 1.3)
+    flag_ridge: toml.Numbers = (1.4, 2.3, 2.15)
     """Flag a band that is thicker than both by more than this, one per distance, mm."""
-    flag_groove: toml.Numbers = (0.55, 0.75, 0.75)
+    flag_groove: toml.Numbers = (0.62, 0.85, 0.85)
     """Flag a band that is thinner than both by more than this, one per distance, mm."""
     uncus_reach: NonNegativeFloat = 2.0
     """Warn of an uncus that begins farther than this behind the anterior plane, mm."""
@@ -226,8 +241,9 @@ class CheckSettings(toml.SettingsTable):
     """Flag a gap of more voxels than this (from the population, coarse or fine)."""
     flag_loose_part: NonNegativeFloat = 0.15
     """Flag a second piece of voxels, connected by faces, above this share of the sheet."""
-    flag_doubt: NonNegativeFloat = 0.3
-    """Flag if other operators lead to a medial or lateral boundary this far away, mm."""
+    flag_rival: NonNegativeFloat = 0.12
+    """Flag if a second choice that is as likely, or a second group of copies (`--uncertainty`),
+    moves the map by more than this (RMS), mm."""
 
 
 class MapSettings(toml.SettingsTable):
@@ -242,12 +258,17 @@ class MapSettings(toml.SettingsTable):
 class UncertaintySettings(toml.SettingsTable):
     """Perturbed copies of the labels; their spread says how certain a map is (`--uncertainty`)."""
 
+    relabeling: NonNegativeFloat = 0.3
+    """Boundaries are drawn elsewhere by this in all, mm: SD along each axis."""
+    correlation: toml.Lengths = (1.0, 3.0)
+    """Distances over which these errors correlate by 1/e, mm, in equal shares of the variance that
+    ``jitter`` leaves."""
+    end_shift: NonNegativeFloat = 0.5
+    """End planes are placed elsewhere by this, slices: SD along the normal. An end without a label
+    moves by its standard error if that is larger."""
     jitter: NonNegativeFloat = 0.5
-    """Boundaries may be drawn this far away, voxels along each axis of the voxels, evenly
-    distributed: SD is this over the root of 3. 0: perfect labels, but for their voxels."""
-    correlation: PositiveFloat = 1.0
-    """Points this far apart move alike with a correlation of 1/e, voxels: 1 if voxels are labeled
-    one by one. Errors that reach farther make maps less certain."""
+    """Part of these errors is independent from voxel to voxel, evenly distributed up to this,
+    voxels along each axis of the voxels. 0, with ``relabeling`` 0: labels without errors."""
     rotation: Annotated[float, Field(ge=0, le=45)] = 5.0
     """Voxels are turned by up to this about each axis, degrees, and shifted by up to half of one:
     as if the body had lain elsewhere in the scanner."""
@@ -266,6 +287,17 @@ class SurrogateSettings(toml.SettingsTable):
     """Standard deviation of the Gaussian that rounds the voxels' corners, in-plane voxels."""
 
 
+#: Settings of ``--method published``: what Diers et al. 2023 describe. Topology is repaired in any
+#: case, where the original stops.
+PUBLISHED: Mapping[str, Mapping[str, str | float]] = MappingProxyType(
+    {
+        "body": {"end_rule": "last-slice", "mending": "closing"},
+        "boundaries": {"operator": "published", "anisotropy": 40.0, "edges": "zero-lines"},
+        "sheet": {"x_coordinate": "volume"},
+    }
+)
+
+
 class Settings(toml.SettingsTable):
     """All settings of the participant level."""
 
@@ -282,6 +314,15 @@ class Settings(toml.SettingsTable):
     maps: MapSettings = Field(default_factory=MapSettings)
     uncertainty: UncertaintySettings = Field(default_factory=UncertaintySettings)
     surrogate: SurrogateSettings = Field(default_factory=SurrogateSettings)
+
+    def as_published(self) -> list[str]:
+        """List the settings of ``--method published`` that hold here, as ``group.name``."""
+        return [
+            f"{group}.{name}"
+            for group, values in PUBLISHED.items()
+            for name, value in values.items()
+            if getattr(getattr(self, group), name) == value
+        ]
 
 
 def load_settings(path: Path | None) -> Settings:

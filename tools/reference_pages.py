@@ -29,7 +29,7 @@ from hipsta_bids.errors import EXIT_MEANINGS
 from hipsta_bids.geometry.catalog import MAPS, PER_SUBFIELD, SECTIONS, SUMMARY, Column
 from hipsta_bids.group.design.settings import GroupSettings
 from hipsta_bids.group.output.tables import COLUMNS, JOINT_COLUMNS
-from hipsta_bids.reports.page import reason_actions, reason_sections
+from hipsta_bids.reports.page import read_table
 from hipsta_bids.settings import Settings
 
 NOTE = "<!-- Written by `tools/make-docs`; do not edit, run it again. -->"
@@ -112,9 +112,10 @@ _DATASET_FILES = {
 
 def outputs_page() -> str:
     """Write the page of files and columns."""
-    place = [(name, unit, words) for name, (words, unit) in (NODES | POSITION).items()]
-    state = [(name, unit, words) for name, (words, unit) in STATE.items()]
-    layers = [(name, unit, words) for name, (words, unit) in LAYERS.items()]
+    place, state, layers = (
+        [(name, about[1] if about[1:] else None, about[0]) for name, about in columns.items()]
+        for columns in (NODES | POSITION, STATE, LAYERS)
+    )
     columns = ("column", "unit", "what it is")
     parts = [
         "# Outputs",
@@ -211,21 +212,23 @@ def _words(text: str | None) -> str:
 
 def reasons_page() -> str:
     """Write the page of flags, refusals and what to do about them."""
-    sections = reason_sections()
-    where = ((section.title, " ".join(section.text.split())) for section in sections)
+    table = read_table("reasons.toml")
+    sections = table["section"]
+    where = ((section["title"], " ".join(section["text"].split())) for section in sections)
     parts = [
         "# Flags and refusals",
         REASONS_TEXT,
         _table(("where a reason is given", "what it says"), where),
     ]
-    for action, title in reason_actions().items():
+    for action, title in table["actions"].items():
         parts.append(f"## {title}")
         for section in sections:
-            own = {name: row for name, row in section.reasons.items() if row.action == action}
-            parts += [f"**{section.title}**"] if own else []
+            rows = section["reasons"].items()
+            reasons = {name: row for name, row in rows if row["action"] == action}
+            parts += [f"**{section['title']}**"] if reasons else []
             # A heading for each, so that it can be searched for and linked to.
-            for name, reason in sorted(own.items()):
-                parts += [f"#### `{name}`", f"{reason.meaning}\n**Try:** {reason.remedy}"]
+            for name, row in sorted(reasons.items()):
+                parts += [f"#### `{name}`", f"{row['meaning']}\n**Try:** {row['remedy']}"]
     codes = ((str(int(code)), words) for code, words in EXIT_MEANINGS.items())
     return _page([*parts, "## Exit codes", _table(("code", "meaning"), codes)])
 

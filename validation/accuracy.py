@@ -11,22 +11,8 @@ from scipy.stats import linregress
 from hipsta_bids.phantom import PhantomSpec
 from hipsta_bids.settings import GridSettings
 from hipsta_bids.types import Float
-from validation.cases import (
-    CURVATURES,
-    EDGE,  # noqa: F401  (in texts)
-    GAUSSIAN_CURVATURES,
-    Case,
-    Measured,
-    Refusal,
-    along_slices,
-    any_pose,
-    measure_case,
-    refusal_notes,
-    rms,
-    run_cases,
-    run_groups,
-    without_edges,
-)
+from validation import cases
+from validation.cases import CURVATURES, GAUSSIAN_CURVATURES, Case, Measured, Refusal
 from validation.report import Cell, Cells, Content, picture, show_map, suite, table
 
 if TYPE_CHECKING:
@@ -111,7 +97,9 @@ Results = Mapping[Row, Sequence[Measured | Refusal]]
 def run(full: bool) -> Iterator[Content]:
     """Measure every row in several poses."""
     poses = POSES_FULL if full else POSES_QUICK
-    results = run_groups(measure_case, {r: _poses(n, r, poses) for n, r in enumerate(ROWS)})
+    results = cases.run_groups(
+        cases.measure_case, {r: _poses(n, r, poses) for n, r in enumerate(ROWS)}
+    )
     yield _thickness_table(results)
     yield _curvature_table(results)
     yield _gaussian_table(results)
@@ -124,14 +112,16 @@ def run(full: bool) -> Iterator[Content]:
 def _poses(number: int, row: Row, count: int) -> list[Case]:
     """Draw poses; the first ones are the same whatever the count."""
     generator = np.random.default_rng((SEED, number))
-    cases = []
+    drawings = []
     for _ in range(count):
         if row.tilt is None:
-            pose, turn = any_pose(generator), None
+            pose, turn = cases.any_pose(generator), None
         else:
-            pose, turn = along_slices(generator, tilt=row.tilt)
-        cases.append(Case(spec=row.spec, voxel_size=row.voxel_size, pose=pose, grid_rotation=turn))
-    return cases
+            pose, turn = cases.along_slices(generator, tilt=row.tilt)
+        drawings.append(
+            Case(spec=row.spec, voxel_size=row.voxel_size, pose=pose, grid_rotation=turn)
+        )
+    return drawings
 
 
 def _measured(results: Results) -> dict[Row, list[Measured]]:
@@ -150,18 +140,20 @@ def _thickness_table(results: Results) -> Iterator[Cells | str]:
         good = False
         if errors:
             bias = np.array([np.nanmean(error) for error in errors])
-            sd = rms([np.nanstd(error) for error in errors])
+            sd = cases.rms([np.nanstd(error) for error in errors])
             good = bool(abs(bias.mean()) <= row.bias and sd <= row.sd and refused == 0)
             cells |= {"bias": f"{bias.mean():+.3f}", "SD": sd}
         cells |= {"target |bias|": f"≤ {row.bias:g}", "target SD": f"≤ {row.sd:g}"}
         if errors:
             cells |= {
                 "bias, pose by pose": f"{bias.min():+.3f} to {bias.max():+.3f}",
-                "SD without edges": rms([np.nanstd(without_edges(error)) for error in errors]),
+                "SD without edges": cases.rms(
+                    [np.nanstd(cases.without_edges(error)) for error in errors]
+                ),
                 "SD of the mean map": float(np.nanstd(np.mean(errors, axis=0))),
             }
         yield {**cells, "refused": refused, "met": good}
-    yield refusal_notes({f"{row.name}, {row.voxels}": g for row, g in results.items()})
+    yield cases.refusal_notes({f"{row.name}, {row.voxels}": g for row, g in results.items()})
 
 
 @table("accuracy.curvature")
@@ -176,7 +168,7 @@ def _curvature_table(results: Results) -> Iterator[Cells]:
             "true mean": float(np.nanmean(true)),
             "measured mean": float(np.nanmean(found)),
             "error of the mean": f"{percent:+.1f} %",
-            "RMS error of points": rms(found - true),
+            "RMS error of points": cases.rms(found - true),
             "target": f"≤ {MAX_CURVATURE_ERROR:g} %" if target else None,
             "met": bool(abs(percent) <= MAX_CURVATURE_ERROR) if target else None,
         }
@@ -186,7 +178,7 @@ def _curvature_table(results: Results) -> Iterator[Cells]:
 def _gaussian_table(results: Results) -> Iterator[Cells]:
     """Compare the middle half of each row's sheet, over all poses."""
     for row, surface, true, found in _middles(results, GAUSSIAN_CURVATURES):
-        error = rms(found - true)
+        error = cases.rms(found - true)
         yield {
             "phantom, 0.4 mm voxels": row.name,
             "surface": surface,
@@ -275,7 +267,7 @@ WHOLE = "whole"
 #: Parts of the sheet whose error is followed.
 ZONES: Mapping[str, Callable[[Float], Float]] = {
     WHOLE: lambda error: error,
-    "without edges": without_edges,
+    "without edges": cases.without_edges,
 }
 
 Key = tuple[str, str]
@@ -287,12 +279,12 @@ def run_convergence(full: bool) -> Iterator[Content]:
     poses = CONVERGENCE_FULL if full else CONVERGENCE_QUICK
     names = list(SPECS) if full else list(SPECS)[:1]
     keys = [(name, grid) for name in names for grid in GRIDS]
-    cases = {
+    drawings = {
         (key, size): [_case(key, size, pose) for pose in range(poses)]
         for key in keys
         for size in VOXEL_SIZES
     }
-    results = run_groups(measure_case, cases)
+    results = cases.run_groups(cases.measure_case, drawings)
     errors = {key: [_errors(results[key, size]) for size in VOXEL_SIZES] for key in keys}
     yield _table(errors)
     yield _picture(errors)
@@ -312,7 +304,7 @@ def _case(key: Key, size: float, pose: int) -> Case:
     return Case(
         spec=SPECS[name],
         voxel_size=(size, size, size),
-        pose=any_pose(np.random.default_rng((CONVERGENCE_SEED, pose))),
+        pose=cases.any_pose(np.random.default_rng((CONVERGENCE_SEED, pose))),
         spacing=None if step is None else step * size,
     )
 
@@ -333,18 +325,18 @@ def _errors(group: Sequence[Measured | Refusal]) -> dict[str, float]:
 def _table(errors: Mapping[Key, Sequence[Mapping[str, float]]]) -> Iterator[Cells]:
     for (name, grid), values in errors.items():
         for zone in ZONES:
-            rms = [value[zone] for value in values]
-            slope, standard_error = rate(VOXEL_SIZES, rms)
+            roots = [value[zone] for value in values]
+            slope, standard_error = rate(VOXEL_SIZES, roots)
             bias = [f"{v['bias']:+.3f} / " if zone == WHOLE else "" for v in values]
             sizes = [f"{size:g} mm" for size in VOXEL_SIZES]
             yield {
                 "phantom": name,
                 "working grid": grid,
                 "part": zone,
-                **{s: f"{b}{r:.3f}" for s, b, r in zip(sizes, bias, rms, strict=True)},
+                **{s: f"{b}{r:.3f}" for s, b, r in zip(sizes, bias, roots, strict=True)},
                 "rate": f"{slope:.2f} ± {standard_error:.2f}",
                 "target": "falls",
-                "met": all(finer < coarser for coarser, finer in pairwise(rms)),
+                "met": all(finer < coarser for coarser, finer in pairwise(roots)),
             }
 
 
@@ -355,8 +347,8 @@ def _picture(figure: "Figure", errors: Mapping[Key, Sequence[Mapping[str, float]
     for (name, grid), values in errors.items():
         style = "o-" if GRIDS[grid] is None else "s--"
         for zone, alpha in zip(ZONES, (1.0, 0.45), strict=True):
-            rms, label = [v[zone] for v in values], f"{name}, {grid}, {zone}"
-            axis.loglog(VOXEL_SIZES, rms, style, color=colors[name], alpha=alpha, label=label)
+            roots, label = [v[zone] for v in values], f"{name}, {grid}, {zone}"
+            axis.loglog(VOXEL_SIZES, roots, style, color=colors[name], alpha=alpha, label=label)
     reach = np.array([min(VOXEL_SIZES), max(VOXEL_SIZES)])
     start = min(v[zone] for values in errors.values() for v in values for zone in ZONES)
     axis.loglog(reach, 0.8 * start * reach / reach[0], color="0.6", label="rate 1")
@@ -373,21 +365,23 @@ def run_limits(full: bool) -> Iterator[Content]:
     """Measure sheets that are too thin for their voxels: refused or flagged, not silently wrong."""
     sizes = (0.4, 0.6, 0.8, 1.0) if full else (0.5, 1.0)
     walls = (0.8, 1.2, 1.6, 3.0) if full else (0.8, 1.6)
-    cases = [
+    drawings = [
         Case(
             spec=PhantomSpec(kind="spiral", thickness=wall, curvature=(0.02, 0.35)),
             voxel_size=(size, size, size),
-            pose=any_pose(np.random.default_rng((LIMITS_SEED, i, j))),
+            pose=cases.any_pose(np.random.default_rng((LIMITS_SEED, i, j))),
         )
         for i, wall in enumerate(walls)
         for j, size in enumerate(sizes)
     ]
-    yield _limits_table(cases, run_cases(measure_case, cases))
+    yield _limits_table(drawings, cases.run_cases(cases.measure_case, drawings))
 
 
 @table("limits.thin")
-def _limits_table(cases: Sequence[Case], results: Sequence[Measured | Refusal]) -> Iterator[Cells]:
-    for case, result in zip(cases, results, strict=True):
+def _limits_table(
+    drawings: Sequence[Case], results: Sequence[Measured | Refusal]
+) -> Iterator[Cells]:
+    for case, result in zip(drawings, results, strict=True):
         cells: dict[str, Cell] = {
             "thickness, mm": f"{case.spec.thickness:g}",
             "voxels, mm": f"{case.voxel_size[0]:g}",

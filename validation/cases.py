@@ -268,10 +268,11 @@ def run_cases(
 
 
 def run_groups(
-    work: Callable[[Any], Any], groups: Mapping[Key, Sequence[Any]]
+    work: Callable[[Any], Any], groups: Mapping[Key, Sequence[Any]], *, timeout: float = 60.0
 ) -> dict[Key, list[Any]]:
     """Run the cases of all groups together, and return the results by group."""
-    results = iter(run_cases(work, [case for cases in groups.values() for case in cases]))
+    every = [case for cases in groups.values() for case in cases]
+    results = iter(run_cases(work, every, timeout=timeout))
     return {key: [next(results) for _ in cases] for key, cases in groups.items()}
 
 

@@ -10,14 +10,8 @@ from scipy.spatial import cKDTree
 
 from hipsta_bids.phantom import PhantomSpec
 from hipsta_bids.types import Float, HemisphereMaps, Status
-from validation.cases import (
-    Refusal,
-    ValidationBody,
-    fine_segmentations,
-    measure_body,
-    measure_reference,
-    run_cases,
-)
+from validation import cases
+from validation.cases import Refusal, ValidationBody
 from validation.damage import Injury, Position, Site, make_defect
 from validation.report import Cell, Cells, Content, suite, table
 
@@ -152,13 +146,13 @@ def run(full: bool, labels: Path | None = None) -> Iterator[Content]:
     """Damage bodies in many ways and measure them."""
     bodies: list[ValidationBody] = [
         *SPECS[: None if full else 1],
-        *fine_segmentations(labels, VOXEL)[::2],
+        *cases.fine_segmentations(labels, VOXEL)[::2],
     ]
     plan = PLAN if full else PLAN[::3]
     trials = [Trial(body=body, injury=injury) for body in bodies for injury in plan]
     results = [
         refused(result) if isinstance(result, Refusal) else result
-        for result in run_cases(measure_trial, trials, timeout=TIMEOUT)
+        for result in cases.run_cases(measure_trial, trials, timeout=TIMEOUT)
     ]
     yield _cases(trials, results)
     yield _totals(results)
@@ -166,15 +160,15 @@ def run(full: bool, labels: Path | None = None) -> Iterator[Content]:
 
 def measure_trial(trial: Trial) -> Damage:
     """Measure one damaged body and compare it with the undamaged one."""
-    _, hemi, reference = measure_reference(trial.body, VOXEL)
+    _, hemi, reference = cases.measure_reference(trial.body, VOXEL)
     defect = make_defect(site_of(trial.body), *trial.injury)
-    return compare(measure_body(defect.volume, hemi), reference, defect.changed)
+    return compare(cases.measure_body(defect.volume, hemi), reference, defect.changed)
 
 
 @lru_cache(maxsize=2)
 def site_of(body: ValidationBody) -> Site:
     """Measure a body as it is, to damage it; the cases of one body should follow each other."""
-    volume, _, reference = measure_reference(body, VOXEL)
+    volume, _, reference = cases.measure_reference(body, VOXEL)
     return Site(volume, reference.sheet)
 
 

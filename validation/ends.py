@@ -16,17 +16,8 @@ from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.protocols.protocol import Part, Tissue
 from hipsta_bids.settings import BodySettings, Settings
 from hipsta_bids.types import End, Float, LabelVolume
-from validation.cases import (
-    Refusal,
-    ValidationBody,
-    left_out,
-    load_body,
-    measure_body,
-    refusal_notes,
-    rms,
-    run_cases,
-    truth_at,
-)
+from validation import cases
+from validation.cases import Refusal, ValidationBody
 from validation.population import find_bodies, is_fine
 from validation.report import Cell, Cells, Content, suite, table
 from validation.thick_slices import FULL_VOXEL, PHANTOMS, PIXEL, reslice
@@ -99,26 +90,10 @@ class Found:
     own: Mapping[str, tuple[float, float]]
     """Both ends in the body's own voxels, by variant; empty without labels that say where."""
 
-    @property
-    def longer(self) -> Float:
-        """(N,) by how much a copy is too long, mm."""
-        return np.asarray(self.copies[:, 1] - self.copies[:, 0])
 
-    @property
-    def spread(self) -> Float:
-        """SD (3,) over the copies of both ends and of the length, mm."""
-        both = np.column_stack([self.copies[:, :2], self.longer])
-        return np.asarray(both.std(axis=0, ddof=1))
-
-
-@dataclass(frozen=True, kw_only=True)
-class Oblique:
-    """A phantom whose head and tail labels end obliquely."""
-
-    spec: PhantomSpec
-    degrees: float
-    about: str
-    """Direction that the planes are tilted about: across the sheet, or through it."""
+Oblique = tuple[PhantomSpec, float, str]
+"""A phantom whose head and tail labels end at planes, their tilt in degrees, and the direction that
+they are tilted about: across the sheet, or through it."""
 
 
 @suite("ends")
@@ -126,28 +101,26 @@ def run(full: bool, labels: Path | None = None) -> Iterator[Content]:
     """Find ends without labels on copies of bodies; measure bodies between oblique end planes."""
     bodies: list[ValidationBody] = [*PHANTOMS[: None if full else 1]]
     if labels:
-        fine = [body for body in find_bodies(labels) if is_fine(load_body(body, FULL_VOXEL)[0])]
+        fine = [
+            body for body in find_bodies(labels) if is_fine(cases.load_body(body, FULL_VOXEL)[0])
+        ]
         bodies += fine if full else fine[:2]
     plan = (STEPS, OFFSETS, TILTS) if full else (STEPS[-1:], OFFSETS[::2], TILTS[:1])
     copies = tuple(product(*plan))
     jobs = [Job(body=body, copies=copies) for body in bodies]
-    found = dict(zip(jobs, run_cases(find_ends, jobs, timeout=120.0), strict=True))
-    cases = [
-        Oblique(spec=spec, degrees=degrees, about=about)
-        for spec in (OBLIQUE if full else OBLIQUE[:1])
-        for degrees in (DEGREES if full else DEGREES[-1:])
-        for about in (ABOUT if full else ABOUT[:1])
-    ]
+    found = dict(zip(jobs, cases.run_cases(find_ends, jobs, timeout=120.0), strict=True))
+    choices = (OBLIQUE, DEGREES, ABOUT) if full else (OBLIQUE[:1], DEGREES[-1:], ABOUT[:1])
+    tilted = list(product(*choices))
     yield _copies_table(found)
     yield _places_table(found)
-    yield _oblique_table(cases, run_cases(measure_oblique, cases))
-    yield left_out(labels)
+    yield _oblique_table(tilted, cases.run_cases(measure_oblique, tilted))
+    yield cases.left_out(labels)
 
 
 def find_ends(job: Job) -> Found:
     """Find the ends of a body, and of its copies, whose head and tail labels are taken away."""
     settings = Settings().body
-    volume, _ = load_body(job.body, FULL_VOXEL)
+    volume, _ = cases.load_body(job.body, FULL_VOXEL)
     body = extract_body(volume, settings)
     points = body.inside_points()[1]
     near = {end: points[np.abs(body.ends.height(points, end)) < _NEAR] for end in ENDS}
@@ -205,10 +178,11 @@ def cut_obliquely(phantom: Phantom, volume: LabelVolume, degrees: float, about: 
 
 def measure_oblique(case: Oblique) -> tuple[str, Float]:
     """Measure a phantom between oblique planes: status, and error of thickness (Nx, Ny), mm."""
-    phantom = Phantom(case.spec)
+    spec, degrees, about = case
+    phantom = Phantom(spec)
     volume = phantom.label_volume(load_protocol("freesurfer"))
-    maps = measure_body(cut_obliquely(phantom, volume, case.degrees, case.about), "L")
-    truth, inside = truth_at(phantom, maps.sheet.points[:, :, maps.sheet.middle])
+    maps = cases.measure_body(cut_obliquely(phantom, volume, degrees, about), "L")
+    truth, inside = cases.truth_at(phantom, maps.sheet.points[:, :, maps.sheet.middle])
     return maps.status, np.where(inside, maps.thickness - truth.thickness, np.nan)
 
 
@@ -235,7 +209,7 @@ def _copies_table(results: Mapping[Job, Found | Refusal]) -> Iterator[Cells | st
             targets = ", ".join(f"{limit:g}" for limit in MAX_SPREAD)
             mean = {"body": f"{kind}, mean", **mean, "refused": refused, "targets": targets}
             yield {**mean, "met": met and not refused}
-    yield refusal_notes({job.name: [result] for job, result in results.items()})
+    yield cases.refusal_notes({job.name: [result] for job, result in results.items()})
 
 
 _COLUMNS = (
@@ -253,8 +227,10 @@ def _numbers(job: Job, found: Found) -> list[float]:
     """Compute a row of the table, by ``_COLUMNS``."""
     # An edge between two slices may be anywhere between them: the SD of a uniform distribution.
     alone = np.sqrt(np.mean([step**2 / 12 for step, _, _ in job.copies]))
-    both = [*found.spread, np.ptp(found.longer), alone, *found.copies[:, 2:].mean(axis=0)]
-    return [float(number) for number in both]
+    longer = found.copies[:, 1] - found.copies[:, 0]
+    spread = np.column_stack([found.copies[:, :2], longer]).std(axis=0, ddof=1)
+    row = [*spread, np.ptp(longer), alone, *found.copies[:, 2:].mean(axis=0)]
+    return [float(number) for number in row]
 
 
 @table("ends.places")
@@ -267,7 +243,7 @@ def _places_table(results: Mapping[Job, Found | Refusal]) -> Iterator[Cells]:
             off = [ends[k] for ends in group]
             if variant == FOUND:
                 row = _place_row(kind, f"{end} {variant}", off)
-                yield {**row, "target": f"RMS ≤ {limits[k]:g}", "met": rms(off) <= limits[k]}
+                yield {**row, "target": f"RMS ≤ {limits[k]:g}", "met": cases.rms(off) <= limits[k]}
             elif end == ENDS[0]:
                 yield _place_row(kind, f"{end} {variant}", off)
     sides: dict[str, list[float]] = {}
@@ -283,15 +259,15 @@ def _places_table(results: Mapping[Job, Found | Refusal]) -> Iterator[Cells]:
 def _place_row(kind: str, what: str, off: Sequence[float]) -> Cells:
     mean, largest = f"{np.mean(off):+.2f}", float(np.abs(off).max())
     cells: Cells = {"bodies": kind, "number": len(off), "what": what}
-    return {**cells, "mean": mean, "RMS": rms(off), "largest": largest}
+    return {**cells, "mean": mean, "RMS": cases.rms(off), "largest": largest}
 
 
 @table("ends.oblique")
 def _oblique_table(
-    cases: Sequence[Oblique], results: Sequence[tuple[str, Float] | Refusal]
+    tilted: Sequence[Oblique], results: Sequence[tuple[str, Float] | Refusal]
 ) -> Iterator[Cells | str]:
     """Error of thickness beside oblique end planes."""
-    names = [f"{c.spec.kind}, {c.degrees:g}° about the {c.about}" for c in cases]
+    names = [f"{spec.kind}, {degrees:g}° about the {about}" for spec, degrees, about in tilted]
     for name, result in zip(names, results, strict=True):
         cells: dict[str, Cell] = {"planes": name}
         met = False
@@ -307,4 +283,4 @@ def _oblique_table(
                 "largest of a column": float(np.nanmax(np.abs(error))),
             }
         yield {**cells, "target": f"≤ {MAX_ROW:g}", "met": met}
-    yield refusal_notes({name: [result] for name, result in zip(names, results, strict=True)})
+    yield cases.refusal_notes({name: [result] for name, result in zip(names, results, strict=True)})

@@ -19,7 +19,7 @@ from hipsta_bids.group.stats.arrays import SideMaps
 from hipsta_bids.group.stats.clusters import sheet_edges
 from hipsta_bids.group.stats.exchangeability import Visits
 from hipsta_bids.group.stats.glm import RowModel, fit_maps
-from hipsta_bids.group.stats.inference import JointPart, MapKey, PermutationPart, correct, permute
+from hipsta_bids.group.stats.inference import MapKey, PermutationPart, correct, permute
 from hipsta_bids.group.stats.mixed import fit_mixed
 from hipsta_bids.group.stats.registration import mean_profiles, register
 from hipsta_bids.group.stats.warps import warp_values
@@ -91,13 +91,10 @@ AMPLITUDES = {
     "lateral bend twice as large": (1.0, 1.0, 1.0, 2.0),
 }
 
-#: Ways to register, by alignment and whether each curve is standardized; the first is the default.
+#: Ways to register, by whether each curve is standardized; the first is the default.
 WAYS = {
-    f"{align}, {'each standardized' if own else 'as measured'}": GroupSettings().changed(
-        registration={"align": align, "standardize": own}
-    )
-    for own in (True, False)
-    for align in ("registr", "penalized")
+    f"registr, {title}": GroupSettings().changed(registration={"standardize": standardize})
+    for title, standardize in (("each standardized", True), ("as measured", False))
 }
 DEFAULT = next(iter(WAYS))
 
@@ -117,7 +114,6 @@ _CORRECTIONS = {
 }
 _METHODS = {
     "registr": "registered, registr (default)",
-    "penalized": "registered, penalized",
     "none": "not registered",
 }
 _GROUP = "group"
@@ -397,8 +393,8 @@ def joint_findings(effects: tuple[float, float], seed: int) -> dict[str, Bool]:
     )
     single = how.changed(method="permutation-max")
     one, two = (permute([part], contrast, settings=single)[0].p_max for part in parts)
-    (tippett,) = permute([JointPart(parts, "tippett")], contrast, settings=single)
-    (fisher,) = permute([JointPart(parts, "fisher")], contrast, settings=how)
+    (tippett,) = permute([parts], contrast, settings=single, combine="tippett")
+    (fisher,) = permute([parts], contrast, settings=how, combine="fisher")
     found = {
         "first measure alone, largest t": one <= LEVEL,
         "either, each at half the level": np.minimum(one, two) <= LEVEL / 2,

@@ -46,41 +46,25 @@ class SitesPlan:
     """Share of the variance between participants, with repeated sessions."""
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class SitesCohort:
-    """Values with effects of sites, and the truth."""
+def simulate_sites(
+    plan: SitesPlan, seed: int, *, repeated: bool = False
+) -> tuple[Float, Visits, Float, Float]:
+    """Draw one cohort; with repeated sessions of three each, all at one site.
 
-    values: Float
-    """(visits, points)"""
-    site: Int
-    columns: Float
-    """(visits, columns) that are kept: group, age; with repeated sessions also time and their
-    product."""
-    person: Int
-    shift: Float
-    """(sites, points)"""
-    scale: Float
-    """(sites, points)"""
-
-    def visits(self, *, repeated: bool) -> Visits:
-        """Rows for ComBat."""
-        person = self.person if repeated else None
-        return Visits(site=self.site, columns=self.columns, participant=person)
-
-
-def simulate_sites(plan: SitesPlan, seed: int, *, repeated: bool = False) -> SitesCohort:
-    """Draw one cohort; with repeated sessions of three each, all at one site."""
+    Returns values (visits, points), visits, and the true shift and scale (sites, points). Columns
+    that are kept are group and age, with repeated sessions also time and its product with group.
+    """
     random = np.random.default_rng(seed)
     sites, n = len(plan.sizes), sum(plan.sizes)
     site: Int = np.repeat(np.arange(sites), plan.sizes).astype(np.int64)
     group = (random.random(n) < np.take(plan.cases, site)).astype(np.float64)
     age = random.normal(0.0, 1.0, n) + 0.5 * group
-    person: Int = np.arange(n)
+    person: Int | None = None
     base = _noise(random, n, plan)
     columns: Float = np.column_stack([group, age])
     if repeated:
         times = np.tile(np.linspace(-1, 1, _VISITS), n) / 2
-        site, person = np.repeat(site, _VISITS), np.repeat(person, _VISITS)
+        site, person = np.repeat(site, _VISITS), np.repeat(np.arange(n), _VISITS)
         columns = np.repeat(columns, _VISITS, axis=0)
         columns = np.column_stack([columns, times, columns[:, 0] * times])
         own = _noise(random, len(site), plan) * np.sqrt(1 - plan.person)
@@ -94,9 +78,7 @@ def simulate_sites(plan: SitesPlan, seed: int, *, repeated: bool = False) -> Sit
     # With repeated sessions the scale is that of differences within participants.
     values = (columns @ slopes)[:, None] + base + shift[site] + scale[site] * own
     values[random.random(values.shape) < plan.missing] = np.nan
-    return SitesCohort(
-        values=values, site=site, columns=columns, person=person, shift=shift, scale=scale
-    )
+    return values, Visits(site=site, columns=columns, participant=person), shift, scale
 
 
 def _noise(random: np.random.Generator, n: int, plan: SitesPlan) -> Float:
@@ -114,13 +96,12 @@ def left_over(plan: SitesPlan, seeds: Sequence[int], settings: GroupSettings) ->
     """
     left, planted = np.zeros((2, 4))
     for seed in seeds:
-        cohort = simulate_sites(plan, seed)
-        visits = cohort.visits(repeated=False)
+        values, visits, shift, scale = simulate_sites(plan, seed)
         effects, _ = fit_effects(
-            cohort.values, visits, len(plan.sizes), settings.longitudinal, pooled=True
+            values, visits, len(plan.sizes), settings.longitudinal, pooled=True
         )
         weights = np.array(plan.sizes) / sum(plan.sizes)
-        truth = np.stack([cohort.shift, np.log(cohort.scale)])
+        truth = np.stack([shift, np.log(scale)])
         taken = np.stack([effects.shift * effects.sd, np.log(effects.scale * effects.sd)])
         # Only differences between sites can be known; what all have in common is the mean.
         truth, taken = (one - (weights @ one)[:, None] for one in (truth, taken))
@@ -145,22 +126,20 @@ def analyze_sites(
     """Fit the model to cohorts: mean estimate, and share of points with p below the level."""
     estimates, rejected = [], []
     for seed in seeds:
-        cohort = simulate_sites(plan, seed, repeated=repeated)
-        values = cohort.values
+        values, visits, *_ = simulate_sites(plan, seed, repeated=repeated)
         if with_combat:
-            visits = cohort.visits(repeated=repeated)
             effects, _ = fit_effects(
                 values, visits, len(plan.sizes), settings.longitudinal, pooled=True
             )
             values = harmonize(values, visits, effects)
-        member = np.eye(len(plan.sizes))[cohort.site]
+        member = np.eye(len(plan.sizes))[visits.site]
         means = member if with_site else np.ones((len(member), 1))
-        matrix = np.hstack([means, cohort.columns])
+        matrix = np.hstack([means, visits.columns])
         weights = np.zeros(matrix.shape[1])
         weights[-1 if repeated else means.shape[1]] = 1.0
         contrast = [Contrast("effect", weights)]
-        if repeated:
-            names = cohort.person.astype(np.str_)
+        if visits.participant is not None:
+            names = visits.participant.astype(np.str_)
             fit = fit_mixed(values, matrix, names, contrast, settings.longitudinal)
         else:
             fit = fit_points(values, matrix, contrast, settings.glm)

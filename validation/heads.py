@@ -1,7 +1,7 @@
 """Phantoms with a head and digitations: thickness, and whether folds that touch are found."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -45,14 +45,6 @@ _UNEVEN = tuple(
 )
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class _Head:
-    error: Float
-    """(N,) of the head's columns with values, mm."""
-    places: int
-    """Where banks were found to touch."""
-
-
 @suite("heads")
 def run(full: bool) -> Iterator[Content]:
     """Measure heads with open clefts, with narrow ones, with banks that touch, and uneven walls."""
@@ -65,22 +57,22 @@ def run(full: bool) -> Iterator[Content]:
             yield table(f"heads.{name}")(_rows)(group, results)
 
 
-def _rows(group: Sequence[HeadSpec], results: Iterator[_Head | Refusal]) -> Iterator[Cells]:
+def _rows(
+    group: Sequence[HeadSpec], results: Iterator[tuple[Float, int] | Refusal]
+) -> Iterator[Cells]:
     yield from (_row(spec, next(results)) for spec in group)
 
 
-def _measure(spec: HeadSpec) -> _Head:
+def _measure(spec: HeadSpec) -> tuple[Float, int]:
+    """Error (N,) of the head's columns with values, mm, and how many places of banks touch."""
     settings = Settings().changed(body={"region": "whole"})
     maps = measure_body(draw_head(spec), "L", settings)
     head = maps.thickness[:, _HEAD + 1 :]
     reasons = [flag.reason for flag in maps.flags]
-    return _Head(
-        error=head[np.isfinite(head)] - spec.thickness,
-        places=reasons.count("fused-digitation"),
-    )
+    return head[np.isfinite(head)] - spec.thickness, reasons.count("fused-digitation")
 
 
-def _row(spec: HeadSpec, result: _Head | Refusal) -> Cells:
+def _row(spec: HeadSpec, result: tuple[Float, int] | Refusal) -> Cells:
     """Bias where all clefts are wide, no wrong column where they are narrow; found elsewhere."""
     clefts = f"{spec.interior:g} / {spec.exterior:g}"
     if spec.filled:
@@ -95,24 +87,25 @@ def _row(spec: HeadSpec, result: _Head | Refusal) -> Cells:
     }
     if isinstance(result, Refusal):
         return {**what, "target": str(result), "met": False}
+    error, places = result
     if spec.uneven:
-        found: Cells = {"found": result.places, "target": "none", "met": not result.places}
+        found: Cells = {"found": places, "target": "none", "met": not places}
         return {**what, "uneven": f"{spec.uneven:+.0%}", **found}
-    off = float(np.mean(np.abs(result.error) > WRONG))
-    bias = float(result.error.mean())
+    off = float(np.mean(np.abs(error) > WRONG))
+    bias = float(error.mean())
     if not spec.interior * spec.exterior or spec.filled:
-        target, met = "found", result.places > 0
+        target, met = "found", places > 0
     elif spec.exterior < _FOLDS.exterior:
         target, met = "off 0 %", off == 0
     else:
         target = f"bias within {MAX_BIAS:g}, none found"
-        met = abs(bias) <= MAX_BIAS and not result.places
+        met = abs(bias) <= MAX_BIAS and not places
     return {
         **what,
         "bias": f"{bias:+.3f}",
-        "SD": float(result.error.std()),
+        "SD": float(error.std()),
         "off": f"{off:.1%}",
-        "found": result.places,
+        "found": places,
         "target": target,
         "met": met,
     }

@@ -1,7 +1,7 @@
 """Thickness of HippUnfold's labels beside HippUnfold's own, and beside walls that it drew."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import nibabel as nib
@@ -20,13 +20,8 @@ from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.protocols.protocol import translate
 from hipsta_bids.settings import Settings
 from hipsta_bids.types import Float, HemisphereMaps, LabelVolume
-from validation.cases import (
-    Refusal,
-    fine_segmentations,
-    hippunfold_beside,
-    measure_body,
-    run_cases,
-)
+from validation import cases
+from validation.cases import Refusal
 from validation.report import Cell, Cells, Content, suite, table
 
 VOXEL = 0.4
@@ -66,20 +61,14 @@ Source = HemisphereInput | tuple[Path, str]
 """A person's labels, or a template's folder and side."""
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Pair:
-    """One hemisphere measured twice."""
-
-    maps: HemisphereMaps
-    """Ours."""
-    theirs: Float
-    """(Nx, Ny) HippUnfold's thickness where our mid-surface is, mm."""
+Pair = tuple[Float, Float]
+"""Thickness (Nx, Ny), mm: ours, and HippUnfold's where our mid-surface is."""
 
 
 @suite("hippunfold")
 def run(full: bool, labels: Path | None = None) -> Iterator[Content]:
     """Measure HippUnfold's labels, and labels that are drawn between its surfaces."""
-    folders = hippunfold_beside(labels) if labels else []
+    folders = cases.hippunfold_beside(labels) if labels else []
     persons: list[HemisphereInput] = []
     templates: list[tuple[Path, str]] = []
     for folder in folders:
@@ -91,22 +80,22 @@ def run(full: bool, labels: Path | None = None) -> Iterator[Content]:
         yield _LEFT_OUT
         return
     yield _thickness_table(persons, templates)
-    cases: list[Source] = [*templates, *persons]
+    sources: list[Source] = [*templates, *persons]
     if templates and labels:
-        yield _alone_table([*cases, *fine_segmentations(labels, MAX_VOXEL)])
+        yield _alone_table([*sources, *cases.fine_segmentations(labels, MAX_VOXEL)])
     if templates:
-        yield _whole_table(cases)
+        yield _whole_table(sources)
     flat = [path for folder in folders for path in sorted(folder.rglob(_UNFOLDED))][:1]
     if flat and templates:
-        yield _places_table(cases, flat[0])
+        yield _places_table(sources, flat[0])
 
 
 @table("hippunfold.thickness")
 def _thickness_table(
     persons: Sequence[HemisphereInput], templates: Sequence[tuple[Path, str]]
 ) -> Iterator[Cells]:
-    known = run_cases(measure_template, templates, timeout=120.0)
-    own = run_cases(measure_person, persons)
+    known = cases.run_cases(measure_template, templates, timeout=120.0)
+    own = cases.run_cases(measure_person, persons)
     for person, result in zip(persons, own, strict=True):
         yield _row(_name(person), OWN, result)
     for template, result in zip(templates, known, strict=True):
@@ -114,40 +103,40 @@ def _thickness_table(
 
 
 @table("hippunfold.alone")
-def _alone_table(cases: Sequence[Source]) -> Iterator[Cells]:
-    results = run_cases(measure_alone, cases, timeout=120.0)
-    yield from (_alone_row(_name(c), r) for c, r in zip(cases, results, strict=True))
+def _alone_table(sources: Sequence[Source]) -> Iterator[Cells]:
+    results = cases.run_cases(measure_alone, sources, timeout=120.0)
+    yield from (_alone_row(_name(c), r) for c, r in zip(sources, results, strict=True))
 
 
 @table("hippunfold.whole")
-def _whole_table(cases: Sequence[Source]) -> Iterator[Cells]:
-    results = run_cases(measure_whole_sheet, cases, timeout=120.0)
-    for case, result in zip(cases, results, strict=True):
+def _whole_table(sources: Sequence[Source]) -> Iterator[Cells]:
+    results = cases.run_cases(measure_whole_sheet, sources, timeout=120.0)
+    for case, result in zip(sources, results, strict=True):
         for row in _whole_rows(result, known=isinstance(case, tuple)):
             yield {"hemisphere": _name(case), **row}
 
 
 @table("hippunfold.places")
-def _places_table(cases: Sequence[Source], flat: Path) -> Iterator[Cells]:
-    results = run_cases(measure_places, [(case, flat) for case in cases], timeout=120.0)
-    for case, row in zip(cases, results, strict=True):
+def _places_table(sources: Sequence[Source], flat: Path) -> Iterator[Cells]:
+    results = cases.run_cases(measure_places, [(case, flat) for case in sources], timeout=120.0)
+    for case, row in zip(sources, results, strict=True):
         refused: Cells = {"target": str(row), "met": False}
         yield {"hemisphere": _name(case), **(refused if isinstance(row, Refusal) else row)}
 
 
 def measure_person(item: HemisphereInput) -> Pair:
     """Measure a person's labels; HippUnfold's own thickness is in ``surf`` beside their folder."""
-    name = str(item.files[0].parent.parent / f"surf/*_hemi-{item.hemi}_*_label-hipp_")
+    name = _surfaces(item)
     subfield = _values(f"{name}*subfields.label.gii")
     points = _values(f"{name}midthickness.surf.gii", "pointset")[subfield <= LAST]
     thickness = _values(f"{name}thickness.shape.gii")[subfield <= LAST]
-    return _pair(measure_body(read_label_volume(item), item.hemi), points, thickness)
+    return _pair(cases.measure_body(read_label_volume(item), item.hemi), points, thickness)
 
 
 def measure_template(case: tuple[Path, str]) -> Pair:
     """Measure labels that are drawn between a template's walls."""
     volume, points, thickness = draw_template(*case)
-    return _pair(measure_body(volume, case[1]), points, thickness)
+    return _pair(cases.measure_body(volume, case[1]), points, thickness)
 
 
 def measure_whole_sheet(case: Source) -> Parts:
@@ -157,21 +146,18 @@ def measure_whole_sheet(case: Source) -> Parts:
     where they do by more than 26 degrees, their distance is not the thickness.
     """
     volume, hemi = _volume(case)
-    maps = measure_body(volume, hemi, Settings().changed(body={"region": "whole"}))
-    if isinstance(case, tuple):
-        name = str(case[0] / f"*_hemi-{hemi}_*_label-hipp_")
-        inner, outer = (_values(f"{name}{w}.surf.gii", "pointset") for w in ("inner", "outer"))
-        across = outer - inner
-        theirs = np.linalg.norm(across, axis=1)
-    else:
-        name = str(case.files[0].parent.parent / f"surf/*_hemi-{hemi}_*_label-hipp_")
-        theirs = _values(f"{name}thickness.shape.gii")
+    maps = cases.measure_body(volume, hemi, Settings().changed(body={"region": "whole"}))
+    name = _surfaces(case)
     points = _values(f"{name}midthickness.surf.gii", "pointset")
-    upright = np.ones(len(points), dtype=bool)
     if isinstance(case, tuple):
+        inner, outer = (_values(f"{name}{w}.surf.gii", "pointset") for w in ("inner", "outer"))
+        theirs = np.linalg.norm(outer - inner, axis=1)
         triangles = _values(f"{name}midthickness.surf.gii", "triangle").astype(np.int32)
-        facing = np.abs((vertex_normals(points, triangles) * across).sum(axis=1))
+        facing = np.abs((vertex_normals(points, triangles) * (outer - inner)).sum(axis=1))
         upright = facing > _UPRIGHT * theirs
+    else:
+        theirs = _values(f"{name}thickness.shape.gii")
+        upright = np.ones(len(points), dtype=bool)
     valid = maps.sheet.valid
     away, nearest = cKDTree(points).query(maps.sheet.points[:, :, maps.sheet.middle][valid])
     nearest = np.asarray(nearest, dtype=np.intp)
@@ -193,18 +179,10 @@ def measure_places(case: tuple[Source, Path]) -> Cells:
     lies at which `resample` takes HippUnfold's map.
     """
     source, flat = case
-    if isinstance(source, tuple):
-        folder, hemi = source
-        volume = draw_template(folder, hemi)[0]
-    else:
-        folder, hemi = source.files[0].parent.parent / "surf", source.hemi
-        volume = read_label_volume(source)
     settings = Settings().changed(body={"region": "whole"})
-    maps = measure_body(volume, hemi, settings)
+    maps = cases.measure_body(*_volume(source), settings)
     sheet = maps.sheet
-    vertices = _values(
-        str(folder / f"*_hemi-{hemi}_*_label-hipp_midthickness.surf.gii"), "pointset"
-    )
+    vertices = _values(f"{_surfaces(source)}midthickness.surf.gii", "pointset")
     between = Correspondence(read_mesh(flat), settings.sheet, maps.maps["proximodistal"])
     points = sheet.points[:, :, sheet.middle]
     off = np.linalg.norm(between.to_nodes(vertices) - points, axis=-1)[sheet.valid]
@@ -251,7 +229,7 @@ def measure_alone(case: Source) -> tuple[Float, Float, Float]:
     volume = replace(volume, protocol=volume.protocol.model_copy(update={"layer": ()}))
     with_tail = volume.protocol.name == "hippunfold"
     maps, alone = (
-        measure_body(volume, hemi, Settings().changed(body={"region": region}))
+        cases.measure_body(volume, hemi, Settings().changed(body={"region": region}))
         for region in ("whole" if with_tail else "headbody", "body")
     )
     first = _BODY_ROWS[0] if with_tail else 0
@@ -266,6 +244,14 @@ def _volume(case: Source) -> tuple[LabelVolume, str]:
     if isinstance(case, tuple):
         return draw_template(*case)[0], case[1]
     return read_label_volume(case), case.hemi
+
+
+def _surfaces(case: Source) -> str:
+    """Pattern of the names of HippUnfold's surfaces, up to what they are."""
+    folder, hemi = (
+        case if isinstance(case, tuple) else (case.files[0].parent.parent / "surf", case.hemi)
+    )
+    return str(folder / f"*_hemi-{hemi}_*_label-hipp_")
 
 
 def _name(case: Source) -> str:
@@ -298,7 +284,7 @@ def _pair(maps: HemisphereMaps, points: Float, thickness: Float) -> Pair:
     """Take thickness at the one of (N, 3) vertices that is nearest to each mid-surface node."""
     middle = maps.sheet.points[:, :, maps.sheet.middle]
     nearest = cKDTree(points).query(middle.reshape(-1, 3))[1]
-    return Pair(maps=maps, theirs=thickness[nearest].reshape(maps.thickness.shape))
+    return maps.thickness, thickness[nearest].reshape(maps.thickness.shape)
 
 
 def draw_template(folder: Path, hemi: str) -> tuple[LabelVolume, Float, Float]:
@@ -307,7 +293,7 @@ def draw_template(folder: Path, hemi: str) -> tuple[LabelVolume, Float, Float]:
     Also the vertices (N, 3) of its sheet, RAS mm, and their thickness (N,), mm: the distance of
     corresponding vertices. What lies within the sheet keeps the template's own labels.
     """
-    name = str(folder / f"*_hemi-{hemi}_*_label-hipp_")
+    name = _surfaces((folder, hemi))
     inner, outer, middle = (
         _values(f"{name}{wall}.surf.gii", "pointset") for wall in ("inner", "outer", "midthickness")
     )
@@ -363,8 +349,8 @@ def _row(name: str, walls: str, result: Pair | Refusal) -> Cells:
     """Compare two maps; of a person by SD and correlation, of a template by the mean."""
     cells: dict[str, Cell] = {"hemisphere": name, "labels": walls}
     met = False
-    if isinstance(result, Pair):
-        ours, theirs = result.maps.thickness, result.theirs
+    if not isinstance(result, Refusal):
+        ours, theirs = result
         both = [_two(ours[part], theirs[part]) for part in ((slice(None),) * 2, _INNER)]
         bias = float((ours - theirs).mean())
         of_rows = (ours - theirs).mean(axis=0)

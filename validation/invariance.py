@@ -11,22 +11,8 @@ from hipsta_bids.inputs.labels import read_label_volume
 from hipsta_bids.inputs.search import HemisphereInput
 from hipsta_bids.phantom import PhantomSpec
 from hipsta_bids.types import Float, LabelVolume
-from validation.cases import (
-    MIRROR,
-    Case,
-    Measured,
-    Refusal,
-    any_pose,
-    fine_segmentations,
-    left_out,
-    measure_body,
-    measure_case,
-    random_motion,
-    refusal_notes,
-    rms,
-    run_cases,
-    run_groups,
-)
+from validation import cases
+from validation.cases import MIRROR, Case, Measured, Refusal
 from validation.report import Cell, Cells, Content, picture, show_map, suite, table
 
 if TYPE_CHECKING:
@@ -53,32 +39,34 @@ AXES = ("RAS", "PIR", "ASL")
 
 SPEC = PhantomSpec(kind="spiral", thickness=2.0, variation=0.15)
 
-MOTIONS = {"any rotation": random_motion, "up to 25° about each axis": any_pose}
+MOTIONS = {"any rotation": cases.random_motion, "up to 25° about each axis": cases.any_pose}
 
 
 @suite("invariance")
 def run(full: bool, labels: Path | None = None) -> Iterator[Content]:
     """Measure a phantom in many positions, and equal voxels, also real ones, in another form."""
     count, pairs = (MOTIONS_FULL, PAIRS_FULL) if full else (MOTIONS_QUICK, PAIRS_QUICK)
-    cases = {}
+    drawings = {}
     for number, (name, motion) in enumerate(MOTIONS.items()):
         generator = np.random.default_rng((SEED, number))
-        cases[name] = [Case(spec=SPEC, pose=motion(generator)) for _ in range(count)]
-    results = run_groups(measure_case, cases | {f"pair {n}": _pair(n) for n in range(pairs)})
+        drawings[name] = [Case(spec=SPEC, pose=motion(generator)) for _ in range(count)]
+    results = cases.run_groups(
+        cases.measure_case, drawings | {f"pair {n}": _pair(n) for n in range(pairs)}
+    )
     motions = {name: results[name] for name in MOTIONS}
-    real = fine_segmentations(labels, FINE) if labels else []
+    real = cases.fine_segmentations(labels, FINE) if labels else []
     real = real if full else real[:1]
     yield _motion_table(motions)
     yield _pair_table([results[f"pair {number}"] for number in range(pairs)])
     if labels:
-        yield _real_table(run_cases(measure_forms, real))
+        yield _real_table(cases.run_cases(measure_forms, real))
     yield _picture(motions)
-    yield left_out(labels)
+    yield cases.left_out(labels)
 
 
 def _pair(number: int) -> list[Case]:
     """Cases of one pose: as it is, mirrored, and with other voxel axes."""
-    pose = any_pose(np.random.default_rng((SEED, 100, number)))
+    pose = cases.any_pose(np.random.default_rng((SEED, 100, number)))
     return [
         Case(spec=SPEC, pose=pose),
         Case(spec=SPEC, pose=pose, mirrored=True),
@@ -100,10 +88,13 @@ def measure_forms(item: HemisphereInput) -> tuple[float, float]:
         protocol=volume.protocol,
     )
     mirrored = replace(volume, affine=MIRROR @ volume.affine)
-    reference = measure_body(volume, item.hemi).thickness
+    reference = cases.measure_body(volume, item.hemi).thickness
     other = "LR"[item.hemi == "L"]
-    maps = measure_body(mirrored, other).thickness, measure_body(stored, item.hemi).thickness
-    first, second = (rms(map_ - reference) for map_ in maps)
+    maps = (
+        cases.measure_body(mirrored, other).thickness,
+        cases.measure_body(stored, item.hemi).thickness,
+    )
+    first, second = (cases.rms(map_ - reference) for map_ in maps)
     return first, second
 
 
@@ -121,7 +112,7 @@ def _real_table(results: Sequence[tuple[float, float] | Refusal]) -> Iterator[Ce
             "target, largest": f"≤ {MAX_RMS:g}",
             "met": met,
         }
-    yield refusal_notes({"labels": results})
+    yield cases.refusal_notes({"labels": results})
 
 
 def _maps(group: Sequence[Measured | Refusal]) -> Float | None:
@@ -140,7 +131,7 @@ def _motion_table(motions: Mapping[str, Sequence[Measured | Refusal]]) -> Iterat
         if maps is not None:
             of_mean = float(maps.mean(axis=(1, 2)).std(ddof=1))
             at_points = maps.std(axis=0, ddof=1)
-            overall = rms(at_points)
+            overall = cases.rms(at_points)
             good = of_mean <= MAX_SD_OF_MEAN and overall <= MAX_POINTWISE_SD and not refused
             cells |= {
                 "SD of the mean": of_mean,

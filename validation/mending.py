@@ -11,28 +11,10 @@ import numpy as np
 from hipsta_bids.phantom import Phantom, PhantomSpec
 from hipsta_bids.protocols.protocol import CORE, Tissue
 from hipsta_bids.types import GivenEnd, HemisphereMaps, LabelVolume, Status
-from validation.cases import (
-    Refusal,
-    ValidationBody,
-    fine_segmentations,
-    left_out,
-    measure_body,
-    measure_reference,
-    refusal_notes,
-    run_groups,
-    truth_at,
-)
+from validation import cases
+from validation.cases import Refusal, ValidationBody
 from validation.damage import Injury, make_defect
-from validation.defects import (
-    MAX_SHIFT,
-    MAX_WRONG,
-    VOXEL,
-    WRONG,
-    Damage,
-    Trial,
-    compare,
-    site_of,
-)
+from validation.defects import MAX_SHIFT, MAX_WRONG, VOXEL, WRONG, Damage, Trial, compare, site_of
 from validation.report import Cell, Cells, Content, suite, table
 
 LAYERED = tuple(
@@ -85,7 +67,7 @@ class Outcome:
 @suite("mending")
 def run(full: bool, labels: Path | None = None) -> Iterator[Content]:
     """Plant what has to be mended into phantoms and segmentations, and measure them."""
-    fine = fine_segmentations(labels, VOXEL)
+    fine = cases.fine_segmentations(labels, VOXEL)
     some = slice(None if full else -1, None)
     bodies: list[ValidationBody] = [*LAYERED[: None if full else 1]]
     bodies += fine[::2] if full else fine[:1]
@@ -98,22 +80,24 @@ def run(full: bool, labels: Path | None = None) -> Iterator[Content]:
     ragged = [Trial(body=body, injury=injury) for body in bodies for injury in RAGGED[some]]
     front = PLAIN if full else LAYERED[:1]
     beside = [Trial(body=body, injury=injury) for body in front for injury in UNCUS[some]]
-    results = run_groups(measure_trial, {"hollow": hollow, "ragged": ragged, "beside": beside})
+    results = cases.run_groups(
+        measure_trial, {"hollow": hollow, "ragged": ragged, "beside": beside}
+    )
     yield _cavities(hollow, results["hollow"])
     yield _ragged(ragged, results["ragged"])
     yield _uncus(beside, results["beside"])
-    yield left_out(labels)
+    yield cases.left_out(labels)
 
 
 def measure_trial(trial: Trial) -> Outcome:
     """Measure a body with something planted, and compare it with the one as it was."""
-    volume, hemi, reference = measure_reference(trial.body, VOXEL)
+    volume, hemi, reference = cases.measure_reference(trial.body, VOXEL)
     defect = make_defect(site_of(trial.body), *trial.injury)
     labels = defect.volume
     if not trial.mended:
         hole = labels.tissue != volume.tissue
         labels = replace(labels, tissue=np.where(hole, np.uint8(Tissue.OTHER), labels.tissue))
-    maps = measure_body(labels, hemi)
+    maps = cases.measure_body(labels, hemi)
     voxel = abs(float(np.linalg.det(volume.affine[:3, :3])))
     kind = trial.injury[0]
     found = {"ragged-end": voxel * maps.qc["end_voxels_inside"]}
@@ -141,7 +125,7 @@ def _same_plane(volume: LabelVolume, hemi: str, maps: HemisphereMaps) -> float:
     plane = maps.qc["posterior_plane"]
     point, normal = (tuple(plane[name]) for name in ("point_ras_mm", "normal_ras"))
     given = GivenEnd(end="posterior", point=point, normal=normal)
-    same = measure_body(replace(volume, given_ends=(given,)), hemi)
+    same = cases.measure_body(replace(volume, given_ends=(given,)), hemi)
     return float((np.abs(maps.thickness - same.thickness) > WRONG).mean())
 
 
@@ -150,7 +134,7 @@ def _truth(trial: Trial, reference: HemisphereMaps) -> HemisphereMaps:
     if not (isinstance(trial.body, PhantomSpec) and trial.injury in CAVITIES):
         return reference
     middle = reference.sheet.points[:, :, reference.sheet.middle]
-    truth, inside = truth_at(Phantom(trial.body), middle)
+    truth, inside = cases.truth_at(Phantom(trial.body), middle)
     thickness = np.where(inside, truth.thickness, reference.thickness)
     return replace(reference, maps={**reference.maps, "thickness": thickness})
 
@@ -168,7 +152,7 @@ def _name(trial: Trial) -> dict[str, Cell]:
 def _lost(trials: Sequence[Trial], results: Sequence[Outcome | Refusal]) -> str:
     """List refusals, but for what some labels have no room for."""
     pairs = zip(trials, results, strict=True)
-    return refusal_notes({f"{t.name}, {t.injury[0]}": [r] for t, r in pairs if not _empty(r)})
+    return cases.refusal_notes({f"{t.name}, {t.injury[0]}": [r] for t, r in pairs if not _empty(r)})
 
 
 @table("mending.cavities")

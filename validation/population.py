@@ -22,28 +22,10 @@ from hipsta_bids.geometry.digital import to_ras, voxel_points
 from hipsta_bids.phantom import PhantomSpec
 from hipsta_bids.settings import Settings
 from hipsta_bids.types import Float, LabelVolume, Status
-from validation.cases import (
-    MIRROR,
-    Refusal,
-    ValidationBody,
-    attempt,
-    hippunfold_beside,
-    load_body,
-    longest_edge,
-    measure_body,
-    refusal_notes,
-    run_cases,
-    segmentations,
-    turned,
-)
+from validation import cases, defects
+from validation.cases import MIRROR, Refusal, ValidationBody
 from validation.damage import Injury, Site, make_defect
-from validation.defects import (
-    PLAN,
-    WRONG,  # noqa: F401  (in texts)
-    Damage,
-    compare,
-    refused,
-)
+from validation.defects import PLAN, Damage
 from validation.report import Cell, Cells, Content, Suite, suite, table
 from validation.thick_slices import FULL_VOXEL, PHANTOMS, slice_frame
 
@@ -156,12 +138,12 @@ class Member:
 def run(full: bool, labels: Path | None = None) -> Suite:
     """Measure the population and count flags."""
     specimens = plan(find_bodies(labels), full)
-    return describe(specimens, run_cases(measure_specimen, specimens, timeout=TIMEOUT))
+    return describe(specimens, cases.run_cases(measure_specimen, specimens, timeout=TIMEOUT))
 
 
 def find_bodies(labels: Path | None) -> Sequence[ValidationBody]:
     """Find segmentations of a dataset, and of ``hippunfold`` beside it; phantoms without one."""
-    return segmentations(labels, *hippunfold_beside(labels)) if labels else PHANTOMS
+    return cases.segmentations(labels, *cases.hippunfold_beside(labels)) if labels else PHANTOMS
 
 
 def plan(bodies: Sequence[ValidationBody], full: bool) -> list[Specimen]:
@@ -170,7 +152,7 @@ def plan(bodies: Sequence[ValidationBody], full: bool) -> list[Specimen]:
     order = np.random.default_rng(SEED).permutation(len(PLAN))
     specimens: list[Specimen] = []
     for body in bodies:
-        sizes = SIZES if is_fine(load_body(body, FULL_VOXEL)[0]) else (None,)
+        sizes = SIZES if is_fine(cases.load_body(body, FULL_VOXEL)[0]) else (None,)
         ways = [(None, 0), *((size, 1 + n) for n in range(warps) for size in sizes)]
         for size, number in ways:
             injury = PLAN[order[len(specimens) % len(PLAN)]]
@@ -180,13 +162,13 @@ def plan(bodies: Sequence[ValidationBody], full: bool) -> list[Specimen]:
 
 def is_fine(volume: LabelVolume) -> bool:
     """Whether labels can be drawn anew in other voxels."""
-    return longest_edge(volume) <= FINE
+    return cases.longest_edge(volume) <= FINE
 
 
 def measure_specimen(specimen: Specimen) -> Member:
     """Measure one specimen as it is, and with each of its damages."""
     volume, hemi = make_labels(specimen)
-    maps = measure_body(volume, hemi)
+    maps = cases.measure_body(volume, hemi)
     site = Site(volume, maps.sheet)
     damages = []
     for injury in specimen.injuries:
@@ -194,15 +176,17 @@ def measure_specimen(specimen: Specimen) -> Member:
             defect = make_defect(site, *injury)
         except SettingsError:  # too small for these voxels, or nothing there to damage
             continue
-        found = attempt(lambda labels: measure_body(labels, hemi), defect.volume)
+        found = cases.attempt(lambda labels: cases.measure_body(labels, hemi), defect.volume)
         damages.append(
-            refused(found) if isinstance(found, Refusal) else compare(found, maps, defect.changed)
+            defects.refused(found)
+            if isinstance(found, Refusal)
+            else defects.compare(found, maps, defect.changed)
         )
     return Member(
         brain=specimen.brain,
         origin=specimen.origin,
         mean=float(np.nanmean(maps.thickness)),
-        spacing=longest_edge(volume),
+        spacing=cases.longest_edge(volume),
         margins=maps.qc["flag_margins"],
         damages=tuple(damages),
     )
@@ -210,7 +194,7 @@ def measure_specimen(specimen: Specimen) -> Member:
 
 def make_labels(specimen: Specimen) -> tuple[LabelVolume, str]:
     """Draw the labels of a specimen; its hemisphere."""
-    volume, hemi = load_body(specimen.body, FULL_VOXEL)
+    volume, hemi = cases.load_body(specimen.body, FULL_VOXEL)
     if specimen.number == 0:
         return volume, hemi
     seed = (SEED, specimen.number, *map(ord, specimen.brain))
@@ -265,7 +249,7 @@ def _grid(
 ) -> tuple[tuple[int, ...], Float]:
     """Shape and affine of a turned grid round all labels; slices lie across the long axis."""
     if max(voxel) <= FINE:
-        frame = turned(generator, TURN)
+        frame = cases.turned(generator, TURN)
     else:
         about = generator.uniform(0, np.pi)
         lean = np.deg2rad(TILT) * generator.standard_normal()
@@ -326,7 +310,7 @@ def describe(
     yield _counts(members)
     yield _curves(members)
     yield _quantiles(members)
-    yield _left_out(members, refusal_notes(names))
+    yield _left_out(members, cases.refusal_notes(names))
 
 
 def set_limits(members: Sequence[Member]) -> dict[str, float]:

@@ -14,15 +14,8 @@ from hipsta_bids.participant.surrogate import MATCH_REACH
 from hipsta_bids.phantom import Phantom, PhantomSpec
 from hipsta_bids.settings import Settings
 from hipsta_bids.types import Float
-from validation.cases import (
-    Refusal,
-    ValidationBody,
-    load_body,
-    measure_body,
-    run_cases,
-    segmentations,
-    truth_at,
-)
+from validation import cases
+from validation.cases import Refusal, ValidationBody
 from validation.report import Cell, Cells, Content, picture, suite, table
 
 if TYPE_CHECKING:
@@ -66,8 +59,8 @@ class Compared:
 def run(full: bool, labels: Path | None = None) -> Iterator[Content]:
     """Compare on phantoms and, where there are any, on real segmentations."""
     phantoms = PHANTOMS[: None if full else 1]
-    bodies: list[ValidationBody] = [*phantoms, *(segmentations(labels) if labels else ())]
-    results = run_cases(compare_body, bodies)
+    bodies: list[ValidationBody] = [*phantoms, *(cases.segmentations(labels) if labels else ())]
+    results = cases.run_cases(compare_body, bodies)
     shown = [(_name(b), r) for b, r in zip(bodies, results, strict=True) if isinstance(r, Compared)]
     pictured = [*shown[:2], *shown[len(phantoms) :][:2]]
     yield _table(bodies, results)
@@ -80,8 +73,8 @@ def compare_body(body: ValidationBody) -> Compared:
     """Measure one body both ways."""
     settings = Settings()
     phantom = Phantom(body) if isinstance(body, PhantomSpec) else None
-    volume, hemi = load_body(body, VOXEL)
-    maps = measure_body(volume, hemi)
+    volume, hemi = cases.load_body(body, VOXEL)
+    maps = cases.measure_body(volume, hemi)
     middle = maps.sheet.points[:, :, maps.sheet.middle].reshape(-1, 3)
     merged = extract_body(volume, settings.body)
     columns: list[tuple[Float, Float, Float, Float]] = []
@@ -104,7 +97,7 @@ def _truth(phantom: Phantom | None, points: Float) -> Float:
     """Look up true thickness (N,) beside points; NaN where it is not known."""
     if phantom is None:
         return np.full(len(points), np.nan)
-    truth, inside = truth_at(phantom, points)
+    truth, inside = cases.truth_at(phantom, points)
     return np.where(inside, truth.thickness, np.nan)
 
 

@@ -12,16 +12,8 @@ from hipsta_bids.geometry.body import extract_body
 from hipsta_bids.phantom import PhantomSpec
 from hipsta_bids.settings import Settings
 from hipsta_bids.types import Float, HemisphereMaps, LabelVolume, Status
-from validation.cases import (
-    Refusal,
-    ValidationBody,
-    fine_segmentations,
-    measure_body,
-    measure_reference,
-    refusal_notes,
-    rms,
-    run_cases,
-)
+from validation import cases
+from validation.cases import Refusal, ValidationBody
 from validation.report import Cell, Cells, Content, suite, table
 
 PIXEL = 0.4
@@ -110,7 +102,7 @@ def run(full: bool, labels: Path | None = None) -> Iterator[Content]:
     ways += [(offset, TILT) for offset in (OFFSETS[::2] if full else OFFSETS[:1])]
     bodies: list[ValidationBody] = [
         *PHANTOMS[: None if full else 1],
-        *fine_segmentations(labels, PIXEL),
+        *cases.fine_segmentations(labels, PIXEL),
     ]
     trials = [
         Trial(body=body, step=step, offset=offset, tilt=tilt)
@@ -118,18 +110,18 @@ def run(full: bool, labels: Path | None = None) -> Iterator[Content]:
         for step, plan in ((PIXEL, (ways[0], ways[-1])), *((step, ways) for step in steps))
         for offset, tilt in plan
     ]
-    results = run_cases(measure_trial, trials)
+    results = cases.run_cases(measure_trial, trials)
     yield _table(trials, results)
     yield _half_table(trials, results)
 
 
 def measure_trial(trial: Trial) -> Outcome:
     """Reslice a body, measure it and compare."""
-    volume, hemi, reference = measure_reference(trial.body, FULL_VOXEL)
+    volume, hemi, reference = cases.measure_reference(trial.body, FULL_VOXEL)
     axis = extract_body(volume, Settings().body).ends.axis
     size = (PIXEL, PIXEL, trial.step)
     thick = reslice(volume, axis, size, offset=trial.offset, tilt=trial.tilt)
-    return compare(measure_body(thick, hemi), reference, trial.step)
+    return compare(cases.measure_body(thick, hemi), reference, trial.step)
 
 
 def compare(maps: HemisphereMaps, reference: HemisphereMaps, step: float) -> Outcome:
@@ -146,7 +138,9 @@ def compare(maps: HemisphereMaps, reference: HemisphereMaps, step: float) -> Out
         change=float(pair[0].mean() - pair[1].mean()),
         correlation=float(np.corrcoef(*pair)[0, 1]),
         thickness=maps.thickness,
-        half_sampled=rms(_sampled_map(reference, step, 0.0) - _sampled_map(reference, step, 0.5)),
+        half_sampled=cases.rms(
+            _sampled_map(reference, step, 0.0) - _sampled_map(reference, step, 0.5)
+        ),
         sampled=tuple(sampled),
     )
 
@@ -242,7 +236,7 @@ def _table(trials: Sequence[Trial], results: Sequence[Outcome | Refusal]) -> Ite
             }
         targets = "{:g} / {:g}, {:g} / {:g}".format(*target) if target else None
         yield {**cells, "targets": targets, "met": met}
-    yield refusal_notes(
+    yield cases.refusal_notes(
         {
             f"{kind}, {step} mm, {'straight' if tilt == '0°' else 'tilted'}": group
             for (kind, step, tilt), group in groups.items()
@@ -267,7 +261,7 @@ def _half_table(trials: Sequence[Trial], results: Sequence[Outcome | Refusal]) -
         cells |= {"pairs": len(pairs), "one accepted only": flips}
         met = bool(both) and flips <= MAX_FLIPS * len(pairs)
         if both:
-            change = np.array([rms(a.thickness - b.thickness) for a, b in both])
+            change = np.array([cases.rms(a.thickness - b.thickness) for a, b in both])
             met &= bool(change.mean() <= MAX_HALF_CHANGE)
             cells |= {
                 "RMS change, mean": float(change.mean()),

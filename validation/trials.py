@@ -13,7 +13,7 @@ from hipsta_bids.group.cohort.data import SHEET, Cohort, layers
 from hipsta_bids.group.design.formula import Contrast
 from hipsta_bids.group.design.model import ModelRequest, VisitTime
 from hipsta_bids.group.design.settings import GroupSettings
-from hipsta_bids.group.questions.reference import Modeled, Retested, retest_cohort
+from hipsta_bids.group.questions.trials import Modeled, Retested
 from hipsta_bids.group.stats.mixed import fit_mixed
 from hipsta_bids.group.stats.trials import (
     SLOWING,
@@ -166,7 +166,7 @@ def _reference(design: TrialDesign, random: np.random.Generator) -> Reference:
     cohort = Cohort(table=table, sides={"L": side}, x=axes[0], y=axes[1], units={})
     source: Modeled | Retested
     if design.retest:
-        source = Retested(retest_cohort(cohort, 3), design.settings, has_visits=True)
+        source = Retested(cohort, design.settings, has_visits=True)
     else:
         time = VisitTime(table, "months", ()) if design.effect.visits else None
         source = Modeled(cohort, ModelRequest(), design.settings, time)

@@ -20,8 +20,7 @@ from hipsta_bids.group.cohort.collect import grid_of
 from hipsta_bids.group.cohort.read import node_coordinates
 from hipsta_bids.inputs.labels import MARGIN, label_volume
 from hipsta_bids.io import files
-from hipsta_bids.io.gifti import sheet_triangles
-from hipsta_bids.io.meshes import write_surface
+from hipsta_bids.io.gifti import sheet_triangles, write_surface
 from hipsta_bids.io.volumes import LabelImage, read_labels
 from hipsta_bids.participant.measure import measure_hemisphere
 from hipsta_bids.protocols import body_ends
@@ -29,7 +28,7 @@ from hipsta_bids.protocols.load import for_region, load_protocol
 from hipsta_bids.protocols.protocol import Protocol
 from hipsta_bids.reports.results import SIDES, Hemisphere, SheetTable, find_results
 from hipsta_bids.settings import Settings, SheetSettings, load_settings
-from hipsta_bids.types import Flag, Float, HemisphereMaps, LabelVolume, Mesh, Sheet
+from hipsta_bids.types import Flag, Float, HemisphereMaps, LabelVolume, Mesh
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -40,8 +39,8 @@ if TYPE_CHECKING:
 _LEVELS = {"interior": 0.0, "midthickness": 0.5, "exterior": 1.0}
 #: What is no column of the sheet's table: definition and unit.
 _EXTRA_VARIABLES = {
-    "position": ("position, scanner RAS", "mm"),
-    "depth": ("distance from the interior wall along the column", "mm"),
+    "position": ["position, scanner RAS", "mm"],
+    "depth": ["distance from the interior wall along the column", "mm"],
 }
 _NODES = {
     "x": {"long_name": "medial to lateral", "units": "1"},
@@ -164,7 +163,9 @@ class Measurement:
             row.name: (grid, self.maps[row.name], attributes(row.name)) for row in MAPS
         }
         variables |= {name: (grid, values, attributes(name)) for name, values in state.items()}
-        variables |= _three_dimensional(layers)
+        layered = ("x", "y", "layer")
+        variables["position"] = (*layered, "ras"), layers.points, attributes("position")
+        variables["depth"] = layered, layer_depth(layers), attributes("depth")
         coordinates = {
             **node_axes(self.settings.sheet, self.settings.body.region),
             "layer": (["layer"], np.linspace(0, 1, nz), {"long_name": "interior to exterior"}),
@@ -174,21 +175,12 @@ class Measurement:
         return make_dataset(variables, coordinates, about)
 
 
-def _three_dimensional(layers: Sheet) -> "dict[str, Variable]":
-    grid = ("x", "y", "layer")
-    return {
-        "position": ((*grid, "ras"), layers.points, attributes("position")),
-        "depth": (grid, layer_depth(layers), attributes("depth")),
-    }
-
-
 def attributes(name: str) -> dict[str, str]:
     """Describe a variable: unit, definition and source."""
     for row in MAPS:
         if row.name == name:
             return {"units": row.unit, "long_name": row.definition, "source": row.source}
-    words, unit = (_EXTRA_VARIABLES | STATE)[name]
-    return {"long_name": words, **({"units": unit} if unit else {})}
+    return dict(zip(("long_name", "units"), (_EXTRA_VARIABLES | STATE)[name], strict=False))
 
 
 def node_axes(grid: SheetSettings, region: str) -> dict[str, Any]:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hipsta_bids.api.maps import Measurement, attributes, check_choice
+from hipsta_bids.derivatives.hemisphere import STATE
 from hipsta_bids.geometry.catalog import MAPS
 from hipsta_bids.group.questions.models import GroupFit
 from hipsta_bids.io.gifti import sheet_triangles
@@ -22,7 +23,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from mpl_toolkits.mplot3d import Axes3D
 
-_STATE = ("subfield", "valid", "repaired")
 _MIDDLE = 0.5  # coordinate of the layer of the mid-surface
 _BEYOND = 0.12  # of the length, from an end to its letter
 _SHADE = 0.45  # of the light that depends on direction
@@ -81,10 +81,7 @@ def plot_sheet(
     columns, side = _columns(data, measure)
     sheet = _sheet(data, columns)
     kind = _kind(measure)
-    if ax is None:
-        from matplotlib import pyplot as plt  # noqa: PLC0415  (loads a window system)
-
-        ax = plt.gca()
+    ax = ax or _current_axes()
     extents = [float(np.nanmean(columns.get(f"extent_{axis}", np.nan))) for axis in "xy"]
     scale = limits or display.scale_of(kind, [columns[measure]])
     image = draw_sheet(ax, sheet, kind, scale, extents=extents, hemi=side)
@@ -240,31 +237,15 @@ def plot_group(
     effect, significant = fit.maps["effect"][at], fit.significant[at]
     if effect.ndim == 1:
         raise ValueError("maps on vertices are not on the sheet; draw fit.maps['effect'] instead")
-    if ax is None:
-        from matplotlib import pyplot as plt  # noqa: PLC0415  (as above)
-
-        ax = plt.gca()
+    ax = ax or _current_axes()
     finite = np.isfinite(effect)
     names = np.full(effect.shape, "") if subfield is None else np.asarray(subfield, dtype=np.str_)
-    kind = display.MapKind(
-        column="effect",
-        title=EFFECT_NAMES[fit.test(side, contrast).kind],
-        unit="",
-        colors=display.EFFECT_COLORS,
-        centered=True,
-        digits=2,
-    )
-    sheet = SheetTable(
-        columns={"effect": effect},
-        subfield=names,
-        valid=np.ones(effect.shape, dtype=bool),
-        repaired=np.zeros(effect.shape, dtype=bool),
-        points={},
-    )
+    test = fit.test(side, contrast).kind
+    colors = display.EFFECT_COLORS
+    kind = replace(_kind("effect"), title=EFFECT_NAMES[test], colors=colors, centered=True)
+    sheet = _bare_sheet({"effect": effect}, {"subfield": names})
     statistic, df = (fit.maps[name][at] for name in ("statistic", "df"))
-    reach = display.effect_reach(
-        [display.Effects(fit.test(side, contrast).kind, effect, statistic, df)]
-    )
+    reach = display.effect_reach([display.Effects(test, effect, statistic, df)])
     scale = limits or (-reach, reach)
     image = draw_sheet(ax, sheet, kind, scale, extents=(np.nan, np.nan), hemi=side)
     if significant.any() and not significant.all():
@@ -296,27 +277,36 @@ def _columns(data: Any, measure: str) -> tuple[dict[str, Float], str]:  # noqa: 
     return columns, str(side)
 
 
+def _current_axes() -> "Axes":
+    from matplotlib import pyplot as plt  # noqa: PLC0415  (loads a window system)
+
+    return plt.gca()
+
+
 def _sheet(data: Any, columns: dict[str, Float]) -> SheetTable:  # noqa: ANN401
     if isinstance(data, Measurement):
         return data.table
+    state = {name: data[name].transpose("x", "y").to_numpy() for name in STATE if name in data}
+    parts = display.parts_of(data.coords["y"].to_numpy()) if "y" in data.coords else None
+    body = np.flatnonzero(parts == "body").tolist() if parts is not None else []
+    return _bare_sheet(columns, state, (body[0], body[-1]) if body else None)
+
+
+def _bare_sheet(
+    columns: dict[str, Float],
+    state: dict[str, NDArray[Any]],
+    ends: tuple[int, int] | None = None,
+) -> SheetTable:
+    """Make a sheet without positions, whose columns are valid unless the state says otherwise."""
     shape = next(iter(columns.values())).shape
-    state = {name: data[name].transpose("x", "y").to_numpy() for name in _STATE if name in data}
     return SheetTable(
         columns=columns,
         subfield=state.get("subfield", np.full(shape, "")).astype(np.str_),
         valid=state.get("valid", np.ones(shape)).astype(np.bool_),
         repaired=state.get("repaired", np.zeros(shape)).astype(np.bool_),
         points={},
-        ends=_body_ends(data),
+        ends=ends,
     )
-
-
-def _body_ends(data: Any) -> tuple[int, int] | None:  # noqa: ANN401
-    parts = display.parts_of(data.coords["y"].to_numpy()) if "y" in data.coords else None
-    if parts is None:
-        return None
-    rows = np.flatnonzero(parts == "body")
-    return int(rows[0]), int(rows[-1])
 
 
 def _points(data: Any, level: str) -> Float:  # noqa: ANN401

@@ -6,202 +6,70 @@ from pathlib import Path
 
 from hipsta_bids.cli import participant
 from hipsta_bids.cli.console import echo, echo_table, warn
-from hipsta_bids.cli.parser import Parser, adder, from_namespace, given_settings
+from hipsta_bids.cli.parser import Parser, from_namespace, given_settings, parser_of
 from hipsta_bids.errors import ExitCode, UsageError
 
 _DEMO_PROTOCOL = "freesurfer"  # the layout that the demo dataset has
 
-PHANTOM_EPILOG = """\
-regions: presubiculum, subiculum, CA1, CA2-3 or all, alone or with -anterior or -posterior
-
-what is written:
-  derivatives/LAYOUT/       segmentations, for the participant level
-  participants.tsv          group, age, sex, intracranial volume, site
-  phantom_truth.tsv         true thickness, extents, areas and volume of each hemisphere
-                            and region
-  phantom_maps/             true maps of each hemisphere (without --head)
-  phantom_ends.tsv          ends of the body, for --ends (with --head)
-  phantom_effect.tsv        where the effect was planted, and how large it is
-"""
-
 
 def phantom_parser() -> Parser:
     """Describe ``hipsta-bids phantom``."""
-    parser = Parser(
-        prog="hipsta-bids phantom",
-        description="write a synthetic BIDS dataset of hippocampi with known truth",
-        epilog=PHANTOM_EPILOG,
-    )
-    add = adder(parser)
-    parser.add_argument(
-        "out", type=Path, metavar="OUT", help="new folder, or one of phantoms to replace"
-    )
-    add(
-        "--layout",
-        "NAME",
-        "freesurfer (default), hippunfold, ashs (the atlas ABC-3T) or ashsPMC",
-        default="freesurfer",
-    )
-    add("--n-subjects", "N", "in all groups (default: 20)", default=20)
-    add(
-        "--groups",
-        "NAME",
-        "the first has no effect, the second has it once, the third twice"
-        " (default: control patient)",
-        nargs="+",
-        default=["control", "patient"],
-    )
-    add(
-        "--thinning",
-        "MM",
-        "planted effect: by how much the wall is thinner in the region (default: 0.3)",
-        default=0.3,
-    )
-    add("--region", "NAME", "where (default: CA1-anterior, of a head: head), see below")
-    add(
-        "--shift",
-        "MM",
-        "planted shift along x, to lateral, of the wall's pattern and subfields (default: 0)",
-        default=0.0,
-    )
-    add("--site", "NAME", "site of all, which labels begin with (default: two sites)", default="")
-    add("--kind", "", "slab, arc, spiral (default), s-shape or tight", default="spiral")
-    add(
-        "--cortex",
-        "MM",
-        "neighboring cortex beside the subiculum, for --region extended and entorhinal"
-        " of the participant level; needs a layout of ASHS (default: 0)",
-        default=0.0,
-    )
-    add(
-        "--head",
-        "N",
-        "hippocampi with a tail and a head, which has N digitations (0 to 4), for --region headbody"
-        " of the participant level; with --layout hippunfold for --region whole",
-        type=int,
-    )
-    add("--thickness", "MM", "cohort mean (default: 1.8)", default=1.8)
-    add(
-        "--voxel-size",
-        "MM",
-        "left-right, superior-inferior, anterior-posterior (default: 0.4 0.4 0.4)",
-        nargs=3,
-        type=float,
-        default=[0.4, 0.4, 0.4],
-    )
-    add("--seed", "", "the same seed gives the same files (default: 0)", default=0)
+    parser, add = parser_of("phantom")
+    add("out", "OUT", type=Path)
+    add("--layout", "NAME", default=_DEMO_PROTOCOL)
+    add("--n-subjects", "N", default=20)
+    add("--groups", "NAME", nargs="+", default=["control", "patient"])
+    add("--thinning", "MM", default=0.3)
+    add("--region", "NAME")
+    add("--shift", "MM", default=0.0)
+    add("--site", "NAME", default="")
+    add("--kind", default="spiral")
+    add("--cortex", "MM", default=0.0)
+    add("--head", "N", type=int)
+    add("--thickness", "MM", default=1.8)
+    add("--voxel-size", "MM", nargs=3, type=float, default=[0.4, 0.4, 0.4])
+    add("--seed", default=0)
     return parser
 
 
 def surrogate_parser() -> Parser:
     """Describe ``hipsta-bids surrogate``."""
-    parser = Parser(
-        prog="hipsta-bids surrogate",
-        description="measure thickness in single slices, without a mesh, and compare it with"
-        " the\nsheet if OUT_DIR has one",
-        epilog="exit codes are those of the participant level; the setting surrogate.positions"
-        " says\nwhich slices are taken (default: the middle of the body)",
-    )
-    parser.add_argument("bids_dir", type=Path, metavar="BIDS_DIR", help="a BIDS dataset")
-    parser.add_argument(
-        "output_dir", type=Path, metavar="OUT_DIR", help="the output dataset, new or with results"
-    )
+    parser, add = parser_of("surrogate")
+    add("bids_dir", "BIDS_DIR", type=Path)
+    add("output_dir", "OUT_DIR", type=Path)
     participant.add_selection(parser)
     participant.add_segmentations(parser)
-    adder(parser)("--settings", "FILE.toml", "those of the results in OUT_DIR")
+    add("--settings", "FILE.toml")
     return parser
 
 
 def meta_parser() -> Parser:
     """Describe ``hipsta-bids meta``."""
-    parser = Parser(
-        prog="hipsta-bids meta",
-        description="combine the summaries of several sites, which `group --export-summary` writes:"
-        "\nfixed and random effects at each point and of summary measures",
-        epilog="results: OUT/meta/; begin with OUT/meta.html\n\nexit codes: 0 done; 64 wrong use;"
-        " 65 a summary cannot be read, or sites do not agree; 73 cannot write",
-    )
-    parser.add_argument(
-        "sites", nargs="+", metavar="SITE", help="summary.json of a site, or NAME=summary.json"
-    )
-    parser.add_argument("out", type=Path, metavar="OUT", help="folder for the results")
-    add = adder(parser)
-    add(
-        "--random",
-        "",
-        "variance between sites: restricted maximum likelihood with t tests (reml, the default),"
-        " or DerSimonian and Laird (dl)",
-        choices=["reml", "dl"],
-    )
-    add(
-        "--correction",
-        "",
-        "false discovery rate over points (default: fdr2)",
-        choices=["fdr2", "bh"],
-    )
-    add(
-        "--fdr-scope",
-        "",
-        "what is one family of tests (default: map)",
-        choices=["map", "hemispheres"],
-    )
-    add(
-        "--settings",
-        "FILE.toml",
-        "settings of the group level, of which meta and multiplicity count",
-    )
+    parser, add = parser_of("meta")
+    add("sites", "SITE", nargs="+")
+    add("out", "OUT", type=Path)
+    add("--random", choices=["reml", "dl"])
+    add("--correction", choices=["fdr2", "bh"])
+    add("--fdr-scope", choices=["map", "hemispheres"])
+    add("--settings", "FILE.toml")
     return parser
 
 
 def resample_parser() -> Parser:
     """Describe ``hipsta-bids resample``."""
-    parser = Parser(
-        prog="hipsta-bids resample",
-        description="move maps of the whole sheet (--region whole, experimental) to HippUnfold's"
-        " vertices,\nor maps of HippUnfold to the whole sheet, by the same share of the way between"
-        " the same sides",
-        epilog="exit codes: 0 done; 64 wrong use; 65 a file cannot be read or does not fit;"
-        " 73 cannot write",
-    )
-    parser.add_argument(
-        "maps",
-        nargs="+",
-        type=Path,
-        metavar="MAP",
-        help="of the whole sheet: _morph.tsv, .shape.gii or _map.tsv; or HippUnfold's: .shape.gii,"
-        " .func.gii or .dscalar.nii; one file of each side",
-    )
-    parser.add_argument(
-        "out",
-        type=Path,
-        metavar="OUT",
-        help=".shape.gii, .func.gii, .dscalar.nii (of one or both sides), or .tsv of a sheet",
-    )
-    add = adder(parser)
-    add(
-        "--surface",
-        "FILE",
-        "HippUnfold's own space-unfold_..._label-hipp_midthickness.surf.gii of the density of its"
-        " maps; one, or one of each side",
-        nargs="+",
-        required=True,
-    )
-    add(
-        "--sheet",
-        "FILE",
-        "the sheet's own desc-proximodistal_morph.shape.gii, which agrees better with HippUnfold's"
-        " coordinate than x does; one of each side",
-        nargs="+",
-        default=[],
-    )
-    add("--column", "NAME", "of a table (default: thickness)", default="thickness")
-    add("--settings", "FILE.toml", "those of the sheets, if not the defaults")
+    parser, add = parser_of("resample")
+    add("maps", "MAP", nargs="+", type=Path)
+    add("out", "OUT", type=Path)
+    add("--surface", "FILE", nargs="+", required=True)
+    add("--sheet", "FILE", nargs="+", default=[])
+    add("--column", "NAME", default="thickness")
+    add("--settings", "FILE.toml")
     return parser
 
 
 def list_protocols(arguments: Sequence[str]) -> ExitCode:
     """List the protocols that are known."""
-    Parser("hipsta-bids protocols", "list the segmentation protocols").parse_args(arguments)
+    parser_of("protocols")[0].parse_args(arguments)
     from hipsta_bids.protocols.load import protocol_table  # noqa: PLC0415  (heavy)
 
     echo_table(protocol_table())
@@ -210,8 +78,8 @@ def list_protocols(arguments: Sequence[str]) -> ExitCode:
 
 def print_settings(arguments: Sequence[str]) -> ExitCode:
     """Print the default settings of a level as TOML."""
-    parser = Parser("hipsta-bids settings", "print all settings with their meaning, as TOML")
-    parser.add_argument("level", nargs="?", choices=["group"], help="whose settings")
+    parser, add = parser_of("settings")
+    add("level", nargs="?", choices=["group"])
     group = parser.parse_args(arguments).level == "group"
     from hipsta_bids.group.design.settings import GroupSettings  # noqa: PLC0415  (start-up time)
     from hipsta_bids.protocols.toml import settings_toml  # noqa: PLC0415  (start-up time)
@@ -223,7 +91,7 @@ def print_settings(arguments: Sequence[str]) -> ExitCode:
 
 def write_demo_data(arguments: Sequence[str]) -> ExitCode:
     """Write the demo dataset."""
-    folder = _demo_folder("demo-data", "write a synthetic dataset with known thickness", arguments)
+    folder = _demo_folder("demo-data", arguments)
     _write_demo(folder)
     echo(f"demo dataset: {folder}")
     return ExitCode.OK
@@ -231,8 +99,7 @@ def write_demo_data(arguments: Sequence[str]) -> ExitCode:
 
 def run_demo(arguments: Sequence[str]) -> ExitCode:
     """Write the demo dataset, run on it, and print true beside measured thickness."""
-    text = "write a synthetic dataset, run on it, and compare with the truth"
-    folder = _demo_folder("demo", text, arguments)
+    folder = _demo_folder("demo", arguments)
     data, out = folder / "bids", folder / "out"
     _write_demo(data)
     code = participant.run_participant_level(
@@ -243,9 +110,9 @@ def run_demo(arguments: Sequence[str]) -> ExitCode:
     return code
 
 
-def _demo_folder(command: str, text: str, arguments: Sequence[str]) -> Path:
-    parser = Parser(f"hipsta-bids {command}", text)
-    parser.add_argument("folder", type=Path, metavar="DIR", help="new folder, or one of a demo")
+def _demo_folder(command: str, arguments: Sequence[str]) -> Path:
+    parser, add = parser_of(command)
+    add("folder", "DIR")
     folder: Path = parser.parse_args(arguments).folder
     return folder
 

@@ -2,6 +2,7 @@
 
 import argparse
 import os
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -124,8 +125,10 @@ def _add_sheets(parser: Parser) -> None:
     add("--exclude-flagged", "", "leave out hemispheres that the participant level flagged")
     add(
         "--exclude-qc",
-        "EXPRESSION",
-        "leave out by quality metrics, as 'filled_fraction > 0.01 or voxels_across < 3'",
+        "CONDITION...",
+        "leave out by quality metrics, as 'filled_fraction > 0.01' 'voxels_across < 3'; one that is"
+        " fulfilled is enough",
+        type=_condition,
     )
     add(
         "--exclude",
@@ -207,7 +210,7 @@ def _add_methods(parser: Parser) -> None:
         "--align",
         "",
         "registration of curvature profiles (default: registr)",
-        choices=["registr", "penalized", "penalised", "none"],
+        choices=["registr", "none"],
     )
     add(
         "--template",
@@ -225,13 +228,6 @@ def _add_methods(parser: Parser) -> None:
         "FILE",
         "do it with the harmonization.json of another analysis, for its sites and for new ones of"
         " enough participants; with its --template",
-    )
-    add(
-        "--weights",
-        "",
-        "how much each map counts at a point: the same (none, the default), or by its SD as"
-        " estimated by --uncertainty of the participant level",
-        choices=["none", "uncertainty"],
     )
     add(
         "--correction",
@@ -293,6 +289,17 @@ def _folder(text: str) -> Path:
 def _maybe_named(text: str) -> tuple[str | None, str]:
     name, equals, pattern = text.partition("=")
     return (name, pattern) if equals and name.isalnum() else (None, text)
+
+
+def _condition(text: str) -> tuple[str, str, float]:
+    """Read ``METRIC OPERATOR NUMBER``."""
+    number = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+    match = re.fullmatch(rf"\s*(\w+)\s*([<>]=?|[=!]=)\s*({number})\s*", text)
+    if match is None:
+        raise argparse.ArgumentTypeError(
+            f"{text[:80]!r} is not of the form 'filled_fraction > 0.01' (or >=, <, <=, ==, !=)"
+        )
+    return match[1], match[2], float(match[3])
 
 
 def _name(text: str) -> str:
@@ -384,9 +391,8 @@ def _settings(parsed: argparse.Namespace) -> "GroupSettings":
     """Read the settings, and put those in that have an option of their own."""
     from hipsta_bids.group.design.settings import load_group_settings  # noqa: PLC0415  (start-up time)
 
-    align = parsed.align and parsed.align.replace("penalised", "penalized")
     choices = {
-        "registration": {"align": align},
+        "registration": {"align": parsed.align},
         "multiplicity": {
             "method": parsed.correction,
             "scope": parsed.fdr_scope,
@@ -396,7 +402,6 @@ def _settings(parsed: argparse.Namespace) -> "GroupSettings":
         "model": {"age": parsed.age_model},
         "longitudinal": {"random": parsed.longitudinal},
         "harmonization": {"column": parsed.harmonize},
-        "glm": {"weights": parsed.weights},
         "classification": {
             "base": tuple(parsed.base) or None,
             "added": () if parsed.no_classification else None,
@@ -419,11 +424,9 @@ def _settings(parsed: argparse.Namespace) -> "GroupSettings":
 
 def _options(parsed: argparse.Namespace, arguments: Sequence[str]) -> "GroupOptions":
     from hipsta_bids.group.cohort.collect import GroupRequest  # noqa: PLC0415  (heavy)
-    from hipsta_bids.group.cohort.exclusions import QualityCondition  # noqa: PLC0415  (heavy)
     from hipsta_bids.group.design.model import Comparison, ModelRequest  # noqa: PLC0415  (heavy)
     from hipsta_bids.group.questions.study import GroupOptions  # noqa: PLC0415  (heavy)
 
-    condition = None if parsed.exclude_qc is None else QualityCondition(parsed.exclude_qc)
     sheets = from_namespace(
         GroupRequest,
         parsed,
@@ -431,7 +434,6 @@ def _options(parsed: argparse.Namespace, arguments: Sequence[str]) -> "GroupOpti
         subjects=tuple(parsed.participant_label),
         excluded=tuple(parsed.exclude_participant_label),
         sessions=tuple(parsed.session_label),
-        exclude_quality=condition,
         exclude_table=parsed.exclude,
     )
     model = from_namespace(

@@ -2,8 +2,11 @@
 
 import argparse
 import re
+import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
+from functools import cache
+from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
@@ -71,47 +74,44 @@ class Parser(argparse.ArgumentParser):
         raise UsageError(f"{message}{hint} (see {self.prog} --help)")
 
 
-class _Ignored(argparse.Action):
-    """Remembers an option of other BIDS Apps that has no meaning here, and why."""
-
-    def __call__(
-        self,
-        parser: argparse.ArgumentParser,
-        namespace: argparse.Namespace,
-        values: object,
-        option_string: str | None = None,
-    ) -> None:
-        del parser, values
-        previous = dict(getattr(namespace, self.dest) or {})
-        namespace.ignored = {**previous, str(option_string): str(self.const)}
-
-
 def accept(parser: argparse.ArgumentParser, options: Mapping[str, str]) -> None:
     """Accept options that have no meaning here; ``--name VALUE`` takes a value. Not in the help.
 
-    What was given is in ``ignored`` of the namespace, with the reason.
+    What was given is in ``ignored`` of the namespace, in pairs with the reason.
     """
     for name, reason in options.items():
         flag, _, value = name.partition(" ")
-        parser.add_argument(
-            flag,
-            action=_Ignored,
-            nargs=1 if value else 0,
-            dest="ignored",
-            const=reason,
-            default={},
-            help=argparse.SUPPRESS,
+        pair = flag, reason
+        kind: dict[str, Any] = (
+            {"action": "append", "type": lambda _, pair=pair: pair}
+            if value
+            else {"action": "append_const", "const": pair}
         )
+        parser.add_argument(flag, dest="ignored", default=[], help=argparse.SUPPRESS, **kind)
 
 
-def adder(group: argparse._ActionsContainer) -> Callable[..., None]:
-    """Return a function that adds an option to a group: spellings, value, text, and more.
+@cache
+def help_texts() -> dict[str, dict[str, str]]:
+    """Read the texts of the help, by command."""
+    return tomllib.loads((files("hipsta_bids.cli") / "help.toml").read_text(encoding="utf-8"))
+
+
+def parser_of(command: str) -> tuple[Parser, Callable[..., None]]:
+    """Return the parser of a command, and the function that adds an argument to it."""
+    texts = help_texts()[command]
+    parser = Parser(f"hipsta-bids {command}", texts["description"], epilog=texts.get("epilog"))
+    return parser, adder(parser, command)
+
+
+def adder(group: argparse._ActionsContainer, command: str = "") -> Callable[..., None]:
+    """Return a function that adds an argument to a group: spellings, value, text, and more.
 
     Without a value it is a switch; ``A B`` takes two values; ``A...`` takes several, and more when
-    it is repeated. Paths are recognized by the value's name, numbers by the default.
+    it is repeated. Paths are recognized by the value's name, numbers by the default. The texts of
+    a ``command`` are those of ``help.toml``.
     """
 
-    def add(flags: str, value: str, text: str, **options: Any) -> None:  # noqa: ANN401  (argparse's)
+    def add(flags: str, value: str = "", text: str = "", **options: Any) -> None:  # noqa: ANN401  (argparse's)
         if value.endswith("..."):
             value = value.removesuffix("...")
             options |= {"nargs": "+", "action": "extend", "default": []}
@@ -125,7 +125,8 @@ def adder(group: argparse._ActionsContainer) -> Callable[..., None]:
             options["type"] = Path
         elif isinstance(options.get("default"), int | float) and "action" not in options:
             options.setdefault("type", type(options["default"]))
-        group.add_argument(*flags.split(), help=text, **options)
+        names = flags.split()
+        group.add_argument(*names, help=text or help_texts()[command][names[0]], **options)
 
     return add
 

@@ -17,13 +17,14 @@ from hipsta_bids.cli.parser import (
     adder,
     bids_label,
     from_namespace,
+    help_texts,
     named_path,
     named_pattern,
     positive_float,
     positive_int,
     subject_label,
 )
-from hipsta_bids.errors import ExitCode, NothingToDoError, UsageError, did_you_mean
+from hipsta_bids.errors import ExitCode, NothingToDoError, OutputError, UsageError, did_you_mean
 from hipsta_bids.participant.cluster import Cluster, Shard, check_cluster, parse_shard
 from hipsta_bids.participant.pool import pin_threads, processors
 from hipsta_bids.protocols import EXPERIMENTAL
@@ -34,248 +35,96 @@ if TYPE_CHECKING:
     from hipsta_bids.inputs.scan import HemisphereInput, InputRequest
     from hipsta_bids.inputs.search import Findings
     from hipsta_bids.participant.run import RunOptions
+    from hipsta_bids.settings import Settings
+
+_HELP = "participant"
+"""Texts of the help."""
 
 COLLECT = "collect"
 LEVELS = ("participant", COLLECT)
 REGIONS = ("body", "extended", "entorhinal", *EXPERIMENTAL)
-
-#: Options of other BIDS Apps, and why they change nothing here.
-_NO_MEANING = {
-    "--omp-nthreads N": "each hemisphere uses one processor; --n-procs says how many at a time",
-    "--low-mem": "a hemisphere takes a few hundred megabytes; --mem limits how many at a time",
-    "--clean-workdir": "nothing is left in the scratch folder",
-    "--notrack": "nothing is tracked",
-    "--fs-license-file FILE": "FreeSurfer's programs are not run",
-}
 
 _GIGABYTES = {"K": 1e-6, "M": 1e-3, "G": 1.0, "T": 1e3}
 
 
 def build_parser(epilog: str | None = None) -> Parser:
     """Describe the participant level's command line."""
-    parser = Parser(
-        prog="hipsta-bids",
-        description="BIDS App: hippocampal thickness, curvature and shape maps from subfield"
-        " segmentations",
-        epilog=epilog,
-    )
-    parser.add_argument("bids_dir", type=Path, help="a BIDS dataset")
-    parser.add_argument("output_dir", type=Path, help="where the output dataset goes")
-    parser.add_argument(
-        "analysis_level",
-        type=_level,
-        help="participant; collect, which completes status.tsv after runs with --shard; or group"
-        " (which has a --help of its own)",
-    )
+    parser = Parser("hipsta-bids", help_texts()[_HELP]["description"], epilog=epilog)
+    add = adder(parser, _HELP)
+    add("bids_dir", type=Path)
+    add("output_dir", type=Path)
+    add("analysis_level", type=_level)
     parser.add_argument("--version", action="version", version=f"hipsta_bids {__version__}")
-    accept(parser, _NO_MEANING)
+    accept(parser, help_texts()["without meaning"])
     add_selection(parser)
     add_segmentations(parser)
     _add_signals(parser)
     _add_processing(parser)
-    _add_machines(parser)
+    add = adder(parser.add_argument_group("many machines"), _HELP)
+    add("--shard", "I/N", type=_shard)
+    add("--dask-scheduler", "ADDRESS")
+    add("--slurm", "OPTIONS")
     return parser
 
 
 def add_selection(parser: Parser) -> None:
     """Add the options that choose subjects, sessions and hemispheres."""
-    add = adder(parser.add_argument_group("what to process"))
-    add(
-        "--participant-label",
-        "LABEL...",
-        "subjects, with or without sub- (default: all)",
-        type=subject_label,
-    )
-    add(
-        "--exclude-participant-label",
-        "LABEL...",
-        "subjects to leave out",
-        type=subject_label,
-    )
-    add(
-        "--session-label",
-        "LABEL...",
-        "sessions, with or without ses- (default: all)",
-        type=bids_label("ses-"),
-    )
-    add(
-        "--hemi",
-        "H",
-        "hemispheres, L and R (default: both)",
-        nargs="+",
-        type=_hemi,
-        default=["L", "R"],
-    )
-    add(
-        "--bids-filter-file",
-        "FILE",
-        "JSON with the entities of the segmentations, in fMRIPrep's form",
-    )
-    add("--bids-database-dir", "DIR", "folder of a PyBIDS database, for speed")
-    add(
-        "--skip-bids-validation",
-        "",
-        "accepted for other BIDS Apps' sake; the raw dataset is never validated",
-    )
-    add("--dry-run", "", "print what would be processed and why, and end")
+    add = adder(parser.add_argument_group("what to process"), _HELP)
+    add("--participant-label", "LABEL...", type=subject_label)
+    add("--exclude-participant-label", "LABEL...", type=subject_label)
+    add("--session-label", "LABEL...", type=bids_label("ses-"))
+    add("--hemi", "H", nargs="+", type=_hemi, default=["L", "R"])
+    add("--bids-filter-file", "FILE")
+    add("--bids-database-dir", "DIR")
+    add("--skip-bids-validation")
+    add("--dry-run")
 
 
 def add_segmentations(parser: Parser) -> None:
     """Add the options that say where segmentations are."""
-    add = adder(parser.add_argument_group("where the segmentations are"))
-    add(
-        "-d --derivatives",
-        "NAME=PATH...",
-        "datasets with segmentations (default: BIDS_DIR/derivatives/*, BIDS_DIR/sourcedata/*)",
-        type=named_path,
-    )
-    add("--freesurfer-dir --fs-subjects-dir", "DIR", "FreeSurfer's subjects folder")
-    add("--ashs-dir", "DIR", "folder of ASHS runs")
-    add("--hippunfold-dir", "DIR", "HippUnfold's output dataset")
-    add(
-        "--fs-analysis",
-        "NAME",
-        "FreeSurfer analysis to use where there are several, such as T1 or T1-T2",
-    )
-    add(
-        "--participants-map",
-        "FILE.tsv",
-        "whose folders are, where names do not tell: columns folder, participant_id (and"
-        " session_id)",
-    )
-    add("--ashs-atlas", "SCHEME", "atlas of the ASHS runs, a name from `hipsta-bids schemes`")
-    add(
-        "--scheme --protocol",
-        "FILE.toml",
-        "a protocol of your own for the BIDS dseg files; or the name of one from `hipsta-bids"
-        " schemes` where labels do not tell (hsf, hsfCA23, cobralab)",
-    )
-    add(
-        "--edited-dir",
-        "DIR",
-        "labels (_desc-edited_dseg) and masks (_desc-edited_mask) corrected by hand",
-    )
+    add = adder(parser.add_argument_group("where the segmentations are"), _HELP)
+    add("-d --derivatives", "NAME=PATH...", type=named_path)
+    add("--freesurfer-dir --fs-subjects-dir", "DIR")
+    add("--ashs-dir", "DIR")
+    add("--hippunfold-dir", "DIR")
+    add("--fs-analysis", "NAME")
+    add("--participants-map", "FILE.tsv")
+    add("--ashs-atlas", "SCHEME")
+    add("--scheme --protocol", "FILE.toml")
+    add("--edited-dir", "DIR")
 
 
 def _add_signals(parser: Parser) -> None:
-    add = adder(parser.add_argument_group("what else to bring to the sheet"))
-    add(
-        "--map",
-        "NAME=PATTERN...",
-        "volumes in the space of the labels: path (also in BIDS_DIR) with {subject}, {hemi}, *",
-        type=named_pattern,
-    )
-    add(
-        "--map-sampling",
-        "[NAME=]depth|mid...",
-        "mean from wall to wall (default), or on the mid-surface",
-        type=_choice("depth", "mid"),
-    )
-    add(
-        "--map-interpolation",
-        "[NAME=]linear|nearest...",
-        "between voxels (default: linear); nearest for labels",
-        type=_choice("linear", "nearest"),
-    )
-    add(
-        "--roi",
-        "FILE.tsv",
-        "regions drawn on the sheet: columns x, y, region; their means go to a table",
-    )
+    add = adder(parser.add_argument_group("what else to bring to the sheet"), _HELP)
+    add("--map", "NAME=PATTERN...", type=named_pattern)
+    add("--map-sampling", "[NAME=]depth|mid...", type=_choice("depth", "mid"))
+    add("--map-interpolation", "[NAME=]linear|nearest...", type=_choice("linear", "nearest"))
+    add("--roi", "FILE.tsv")
 
 
 def _add_processing(parser: Parser) -> None:
     group = parser.add_argument_group("how to process")
-    add = adder(group)
-    add(
-        "--settings --config-file",
-        "FILE.toml",
-        "settings that change results (see `hipsta-bids settings`)",
-    )
-    add(
-        "--region",
-        "NAME",
-        "body (default), extended (with neighboring cortex), entorhinal (that alone); experimental:"
-        " headbody, whole (with head and tail)",
-        choices=REGIONS,
-    )
-    add(
-        "--x-coordinate",
-        "NAME",
-        "midsurface (default: harmonic on the mid-surface) or volume (Diers et al. 2023)",
-        choices=("midsurface", "volume"),
-    )
-    add(
-        "--ends",
-        "FILE.tsv",
-        "ends of the body placed by hand: columns participant_id, hemi, end, r, a, s (and session,"
-        " nr, na, ns)",
-    )
-    add("--write-meshes", "", "also write the tetrahedral meshes (VTU)")
-    add(
-        "--uncertainty",
-        "K",
-        "also measure K perturbed copies of the labels, and write the SD of maps and summary"
-        " measures (default: 0, none; 8 take about 7 times as long)",
-        type=_copies,
-        default=0,
-    )
-    add("--force", "", "redo what is up to date")
-    add_pages = adder(group.add_mutually_exclusive_group())
-    add_pages("--no-reports", "", "make no pages to look at (OUT_DIR/*.html)")
-    add_pages(
-        "--reports-only", "", "make these pages again from the results that are there, and end"
-    )
-    add(
-        "--no-anatomy",
-        "",
-        "show no anatomical images on the pages (default: behind the labels, where there are some)",
-    )
-    add(
-        "--n-procs --nprocs --n-cpus --nthreads",
-        "N",
-        "hemispheres at the same time, one processor each (default: all processors)",
-        type=positive_int,
-        default=processors(),
-    )
-    add(
-        "--mem --mem-mb",
-        "SIZE",
-        "memory for all processes together: 8000 (MB) or 8G; labels that need more than half of one"
-        " process' part to be read fail",
-        type=_gigabytes,
-    )
-    add(
-        "--timeout",
-        "S",
-        "seconds after which a hemisphere is given up (default: 600)",
-        type=positive_float,
-        default=600.0,
-    )
-    add("-w --work-dir", "DIR", "scratch folder")
-    add("--stop-on-first-crash", "", "stop at the first hemisphere that fails")
-    add("-v --verbose", "", "say more; twice for still more", action="count", default=0)
-    add("-q --quiet", "", "say only what went wrong")
-
-
-def _add_machines(parser: Parser) -> None:
-    add = adder(parser.add_argument_group("many machines"))
-    add(
-        "--shard",
-        "I/N",
-        "do the I-th of N equal parts of the subjects; slurm: as the array job says",
-        type=_shard,
-    )
-    add(
-        "--dask-scheduler",
-        "ADDRESS",
-        "measure on the workers of this Dask scheduler (tcp://HOST:PORT, or its file)",
-    )
-    add(
-        "--slurm",
-        "OPTIONS",
-        "measure in --n-procs SLURM jobs: sbatch's options in quotes, as '-p short'",
-    )
+    add = adder(group, _HELP)
+    add("--settings --config-file", "FILE.toml")
+    add("--region", "NAME", choices=REGIONS)
+    add("--method", "NAME", choices=("default", "published"))
+    add("--x-coordinate", "NAME", choices=("midsurface", "volume"))
+    add("--ends", "FILE.tsv")
+    add("--write-meshes")
+    add("--uncertainty", "K", type=_copies, default=0)
+    add("--force")
+    add_pages = adder(group.add_mutually_exclusive_group(), _HELP)
+    add_pages("--no-reports")
+    add_pages("--reports-only")
+    add("--no-anatomy")
+    processes = "--n-procs --nprocs --n-cpus --nthreads"
+    add(processes, "N", type=positive_int, default=processors())
+    add("--mem --mem-mb", "SIZE", type=_gigabytes)
+    add("--timeout", "S", type=positive_float, default=600.0)
+    add("-w --work-dir", "DIR")
+    add("--stop-on-first-crash")
+    add("-v --verbose", action="count", default=0)
+    add("-q --quiet")
 
 
 def _level(text: str) -> str:
@@ -335,9 +184,9 @@ def run_participant_level(options: "Namespace", arguments: Sequence[str] = ()) -
 
 def _run(options: "Namespace", arguments: Sequence[str]) -> ExitCode:
     pin_threads()
-    from hipsta_bids.settings import load_settings  # noqa: PLC0415  (start-up time)
+    from hipsta_bids.settings import PUBLISHED, load_settings  # noqa: PLC0415  (start-up time)
 
-    for name, reason in options.ignored.items():
+    for name, reason in dict(options.ignored).items():
         console.echo(f"note: {name} has no effect: {reason}")
     check_folders(options)
     collects = options.analysis_level == COLLECT
@@ -345,7 +194,9 @@ def _run(options: "Namespace", arguments: Sequence[str]) -> ExitCode:
         raise UsageError("collect is about all parts; leave --shard out")
     if options.reports_only:
         return _rebuild_reports(options)
-    settings = load_settings(options.settings).changed(
+    preset = PUBLISHED if options.method == "published" else {}
+    settings = load_settings(options.settings).changed(**preset)
+    settings = settings.changed(
         body={"region": options.region} if options.region else {},
         sheet={"x_coordinate": options.x_coordinate} if options.x_coordinate else {},
     )
@@ -377,6 +228,7 @@ def _run(options: "Namespace", arguments: Sequence[str]) -> ExitCode:
         console.echo_table(account.selection_table(items))
         console.echo_table(account.ignored_table(findings.ignored))
         console.echo_table(account.other_entries_table(findings.other_entries))
+        _check_labels(items, settings)
         return ExitCode.OK
     check_output_is_no_input(options.output_dir, items)
     from hipsta_bids.participant.run import collect, run_participants  # noqa: PLC0415  (heavy)
@@ -393,6 +245,19 @@ def _run(options: "Namespace", arguments: Sequence[str]) -> ExitCode:
             result = run_participants(items, out, settings, run_options, progress.report)
     console.echo_result(result, out)
     return result.exit_code
+
+
+def _check_labels(items: "Sequence[HemisphereInput]", settings: "Settings") -> None:
+    """Print what is wrong with the labels of each usable hemisphere."""
+    from hipsta_bids.participant.job import check_item  # noqa: PLC0415  (heavy)
+
+    usable = [item for item in items if item.problem is None]
+    problems = [(item, text) for item in usable for text in check_item(item, settings)]
+    for item, text in problems:
+        session = f" ses-{item.session}" if item.session else ""
+        console.echo(f"sub-{item.subject}{session} {item.hemi} {item.protocol.name}, {text}")
+    wrong = len({id(item) for item, _ in problems})
+    console.echo(f"labels of {len(usable)} hemispheres checked, problems in {wrong}")
 
 
 def _find(
@@ -444,21 +309,13 @@ def _rebuild_reports(options: "Namespace") -> ExitCode:
     check_writable(root)
     progress = console.Progress(-1 if options.quiet else options.verbose)
     with log_file(root, options.verbose) as log, progress:
-        problems = list(
-            write_reports(
-                PagePlan(
-                    root=root,
-                    n_workers=options.n_procs,
-                    log=log,
-                    bids_dir=None if options.no_anatomy else options.bids_dir,
-                ),
-                visits,
-            )
-        )
+        bids_dir = None if options.no_anatomy else options.bids_dir
+        plan = PagePlan(root=root, n_workers=options.n_procs, log=log, bids_dir=bids_dir)
+        problems = list(write_reports(plan, visits))
     for problem in problems:
-        console.warn(f"report: {problem.message}")
+        console.warn(f"report: {problem}")
     console.echo(f"reports of {len(visits)} visits: {root / DATASET_FILES['report']}")
-    if any(problem.fatal for problem in problems):
+    if any(isinstance(problem, OutputError) for problem in problems):
         return ExitCode.NOT_WRITABLE
     return ExitCode.INTERNAL if problems else ExitCode.OK
 

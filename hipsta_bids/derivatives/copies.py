@@ -53,14 +53,10 @@ def _list(names: Sequence[HemisphereName]) -> str:
 
 
 def mark_copies(root: Path) -> list[tuple[HemisphereName, ...]]:
-    """Say in the messages of ``status.tsv`` which hemispheres have the same labels.
+    """Write into the messages of ``status.tsv`` which hemispheres have the same labels.
 
     Rows that do not agree with their quality record are left as they are: another run is at them.
-
-    Returns
-    -------
-    list of tuple of HemisphereName
-        The groups, see :func:`same_labels`.
+    Returns the groups, see :func:`same_labels`.
     """
     rows, records = {}, {}
     for row in read_status(root):

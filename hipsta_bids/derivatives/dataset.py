@@ -12,6 +12,7 @@ from urllib.parse import quote, unquote, urlsplit
 from hipsta_bids import __version__
 from hipsta_bids.derivatives.names import (
     DATASET_FILES,
+    TEXTS,
     HemisphereName,
     ignore_file,
     output_path,
@@ -149,26 +150,7 @@ def write_notes(root: Path) -> None:
     """Write ``.bidsignore``, and a README unless the dataset has one."""
     files.write_text(root / DATASET_FILES["ignore"], ignore_file())
     if not any(root.glob("README*")):
-        files.write_text(root / DATASET_FILES["readme"], _README)
-
-
-_README = f"""\
-# Hippocampal thickness and curvature maps
-
-Made by {NAME} from segmentations of hippocampal subfields: maps of thickness, curvature and
-extents on the sheet of the hippocampal body, per hemisphere.
-
-- `{DATASET_FILES["report"]}` shows all hemispheres, with a page per participant beside it.
-- `{DATASET_FILES["status"]}` says how each hemisphere ended.
-- `{DATASET_FILES["citation"]}` describes the methods, with references.
-- `{DATASET_FILES["settings"]}` has all settings.
-- `sub-*/` has tables, surfaces and maps; a JSON file beside each table defines its columns.
-- `*.json` here, such as `thickness.json`, say of surfaces, maps and masks what they are.
-- `{DATASET_FILES["group"]}/` has results over participants, where there are some.
-
-The paths in `DatasetLinks` of `{DATASET_FILES["description"]}` are relative to this folder where
-they do not begin with a scheme such as `file:`.
-"""
+        files.write_text(root / DATASET_FILES["readme"], TEXTS["readme"])
 
 
 def _maker() -> dict[str, Any]:
@@ -284,39 +266,6 @@ def source_address(path: Path, sources: Mapping[str, Path]) -> str:
     return str(path)
 
 
-def write_citation(root: Path, settings: Settings, protocols: Sequence[Protocol]) -> None:
-    """Write ``CITATION.md``: a methods paragraph with this run's settings, and the references."""
-    files.write_text(root / DATASET_FILES["citation"], citation_text(settings, protocols))
-
-
-_LAYER_RULES = {
-    "nearest-sheet": "was given to the nearest subfield of the sheet",
-    "nearest-label": "was given to the nearest label, the dentate gyrus and CA4 included",
-}
-
-_FACES = (
-    " experimental: two faces and a rim were found on the surface of all labels, which was neither"
-    " cut nor closed, and thickness is the length of a line from face to face along the gradient of"
-    " a harmonic function. What follows is about the body."
-)
-_X_COORDINATE = {
-    "midsurface": " The first of these was solved for again on the mid-surface, between its edges"
-    " without notches, so that it does not depend on the thickness.",
-    "volume": "",
-}
-_REGIONS = {
-    "body": "",
-    "extended": " For files with label-extended, the sheet goes on beyond the subiculum into the"
-    " neighboring cortex, between the same end planes.",
-    "entorhinal": " For files with label-entorhinal, the neighboring cortex alone was taken,"
-    " between the same end planes; its interior side is the one that continues the hippocampal"
-    " sheet's.",
-    "headbody": " For files with label-headbody, head and body were laid out on one sheet, which is"
-    + _FACES,
-    "whole": " For files with label-whole, head, body and tail were laid out on one sheet, which is"
-    + _FACES,
-}
-
 #: Works that the methods of the participant level rest on.
 _CITED = ("method", "shapedna", "brainprint", "tetgen", "pybids")
 
@@ -329,7 +278,7 @@ def references() -> dict[str, str]:
 
 def _layer_rule(settings: BodySettings, protocols: Sequence[Protocol]) -> str:
     """Say what became of the molecular layer, and in which protocols it was left out."""
-    rule = _LAYER_RULES[settings.layer_rule]
+    rule: str = TEXTS["methods"]["layer"][settings.layer_rule]
     separate = [
         protocol.name
         for protocol in protocols
@@ -348,32 +297,26 @@ def citation_text(settings: Settings, protocols: Sequence[Protocol]) -> str:
     number = {entry: i for i, entry in enumerate(entries, start=1)}
     cite = {key: f"[{number[works[key]]}]" for key in _CITED}
     titles = ", ".join(f"{s.title} [{number[s.citation]}]" for s in protocols) or "none"
+    about = TEXTS["methods"]
+    region = about["region"][settings.body.region].format(faces=about["faces"])
+    text = about["text"].format(
+        **cite,
+        version=__version__,
+        titles=titles,
+        layer=_layer_rule(settings.body, protocols),
+        region=region,
+        end_rule=about["end_rule"][settings.body.end_rule],
+        mending=about["mending"][settings.body.mending],
+        operator=about["operator"][settings.boundaries.operator],
+        edges=about["edges"][settings.boundaries.edges],
+        x_coordinate=about["x_coordinate"][settings.sheet.x_coordinate],
+    )
     lines = [
         "# Methods",
         "",
         "This text may be used freely, as it stands or changed.",
         "",
-        (
-            f"Hippocampal thickness and curvature were measured with hipsta_bids {__version__},"
-            f" an implementation of the method of Diers et al. {cite['method']}."
-            f" Segmentations were found with PyBIDS {cite['pybids']} and follow: {titles}."
-            " The subfields of the hippocampal body from presubiculum to CA3 were merged into one"
-            " sheet; the molecular layer, where labeled,"
-            f" {_layer_rule(settings.body, protocols)}."
-            f"{_REGIONS[settings.body.region]}"
-            " The sheet was continued a little beyond both ends, meshed as a closed surface of"
-            " checked topology and filled with"
-            f" tetrahedra by TetGen {cite['tetgen']}. Its medial and lateral ends were located with"
-            " an eigenfunction of the anisotropic Laplace-Beltrami operator, computed with LaPy"
-            f" {cite['shapedna']}{cite['brainprint']} and moved to the middle of the sheet's edges;"
-            " three harmonic functions between opposite"
-            " faces gave each point a medial-to-lateral, posterior-to-anterior and"
-            f" interior-to-exterior coordinate.{_X_COORDINATE[settings.sheet.x_coordinate]}"
-            " Thickness is the length of a line from the interior"
-            " to the exterior wall; its mean counts every square millimeter of the mid-surface the"
-            " same (`thickness_mean`), or every node of the grid, as in the original method"
-            " (`thickness_nodes`). Curvature is the mean curvature of the mid-surface."
-        ),
+        text,
         "",
         "All settings:",
         "",
@@ -394,26 +337,11 @@ Row = Mapping[str, str]
 
 STAGE_PREFIX = "seconds_"
 
-#: Columns that every row has, with their meaning; one column per stage follows.
-COLUMNS: dict[str, str] = {
-    "subject": "subject, with its sub- prefix",
-    "session": "session, with its ses- prefix",
-    "hemi": "L or R",
-    "seg": "segmentation protocol",
-    "region": "what was measured: body, extended (and neighboring cortex), entorhinal (that alone),"
-    " headbody or whole (experimental)",
-    "status": "ok; repaired: small defects were mended; flagged: look before use;"
-    " failed: there are no maps",
-    "reason": "machine-readable reasons, joined by +",
-    "message": "what happened and what to try",
-    "edited": "what a person corrected: labels, mask, joined by +",
-    "version": "version of hipsta_bids",
-    "settings_hash": "SHA-256 of the resolved settings",
-    "input_hash": "SHA-256 of the input files and of how they are read",
-    "seconds": "elapsed time, s",
-    "cpu_seconds": "processor time, s",
-    "peak_memory_mb": "largest resident memory of the process, MB (1e6 bytes)",
-}
+#: Columns of the tables of this dataset that are no measures, by table: definition and unit.
+TABLES: dict[str, dict[str, list[str]]] = tomllib.loads(
+    (resources.files("hipsta_bids.derivatives") / "columns.toml").read_text("utf-8")
+)
+COLUMNS = TABLES["status"]
 
 NOT_FINISHED = "not-finished"
 """Reason of a hemisphere that a run has not reached yet."""
@@ -534,23 +462,18 @@ def update_status(root: Path, rows: Iterable[Row], *, shard: str | None = None) 
 
 def write_sidecar(root: Path) -> None:
     """Write ``status.json``, which says what the columns are."""
-    described = {name: {"Description": text} for name, text in COLUMNS.items()}
-    described[f"{STAGE_PREFIX}*"] = {"Description": "elapsed time of one stage, s"}
-    files.write_json(root / DATASET_FILES["status_sidecar"], described)
+    stages = {f"{STAGE_PREFIX}*": ["elapsed time of one stage, s"]}
+    files.write_json(root / DATASET_FILES["status_sidecar"], describe_columns(COLUMNS | stages))
+
+
+def describe_columns(columns: Mapping[str, Sequence[str]]) -> dict[str, dict[str, object]]:
+    """Describe columns as sidecars do, by their definitions and units."""
+    keys = ("Description", "Units")
+    return {name: dict(zip(keys, about, strict=False)) for name, about in columns.items()}
 
 
 #: Where the labels of a hemisphere come from: keys of ``provenance`` in its quality record.
-PROVENANCE: dict[str, str] = {
-    "tool": "program that made the labels",
-    "version": "its version; of FreeSurfer's subfields without one (v22), that of FreeSurfer",
-    "analysis": "images that it was given (T1, T1-T2, T2w), or ASHS's step (corr_usegray)",
-    "atlas": "atlas, where the program has several",
-    "hierarchy": "FreeSurfer's hierarchy of labels, and that of the parts (FS60+HBT)",
-    "space": "space in the name of the file",
-    "design": "cross-sectional or longitudinal",
-    "edited": "what a person corrected: labels, mask, joined by +",
-    "voxel_size": "edges of a voxel of the labels, mm",
-}
+PROVENANCE = tuple(TABLES["provenance"])
 
 
 def provenance_of(record: Mapping[str, Any]) -> dict[str, str]:
@@ -560,30 +483,21 @@ def provenance_of(record: Mapping[str, Any]) -> dict[str, str]:
     return {key: str(fields.get(key) or files.MISSING) for key in PROVENANCE}
 
 
-#: Columns of ``inputs.tsv``, with their meaning.
-INPUT_COLUMNS: dict[str, str] = {
-    "path": "file or folder; a folder stands for all in it that has no row of its own",
-    **{name: COLUMNS[name] for name in KEY},
-    "status": "used; failed; not used, though it seems meant to be; or not a segmentation",
-    "reason": "why it was chosen, failed, or was not used",
-    **PROVENANCE,
-}
-
-
 def write_inputs(root: Path, rows: Iterable[Row], *, is_whole: bool = True) -> None:
     """Write ``inputs.tsv``, an account of what a search found.
 
     Rows of earlier searches stay if they are about other participants and this one was not about
     every participant.
     """
-    listed = [{**dict.fromkeys(INPUT_COLUMNS, files.MISSING), **row} for row in rows]
-    path = root / DATASET_FILES["inputs"]
+    path, table = root / DATASET_FILES["inputs"], TABLES["inputs"]
+    columns = {"path": table["path"], **{name: COLUMNS[name] for name in KEY}, **table}
+    columns |= TABLES["provenance"]
+    listed = [{**dict.fromkeys(columns, files.MISSING), **row} for row in rows]
     with locked(root, DATASET):
         if not is_whole:
             subjects = {row["subject"] for row in listed}
             listed += [row for row in read_table(path) if row["subject"] not in subjects]
         listed.sort(key=lambda row: [row[key] for key in KEY])
-        cells = ([row.get(name, files.MISSING) for name in INPUT_COLUMNS] for row in listed)
-        files.write_tsv(path, tuple(INPUT_COLUMNS), cells)
-        described = {name: {"Description": text} for name, text in INPUT_COLUMNS.items()}
-        files.write_json(root / DATASET_FILES["inputs_sidecar"], described)
+        cells = ([row.get(name, files.MISSING) for name in columns] for row in listed)
+        files.write_tsv(path, tuple(columns), cells)
+        files.write_json(root / DATASET_FILES["inputs_sidecar"], describe_columns(columns))

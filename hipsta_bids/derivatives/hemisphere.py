@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hipsta_bids.derivatives.dataset import TABLES, describe_columns
 from hipsta_bids.derivatives.names import (
     EXTRA_OUTPUTS,
     OUTPUTS,
@@ -28,7 +29,7 @@ from hipsta_bids.derivatives.names import (
 from hipsta_bids.errors import HipstaError, InputError
 from hipsta_bids.geometry.catalog import MAPS, PER_SUBFIELD, SECTIONS, SUMMARY, Column
 from hipsta_bids.geometry.sheet import is_left_handed, layer_depth
-from hipsta_bids.io import files, gifti, meshes
+from hipsta_bids.io import files, gifti
 from hipsta_bids.io.volumes import mask_bytes
 from hipsta_bids.opening import open_regular
 from hipsta_bids.protocols import EXPERIMENTAL
@@ -38,33 +39,13 @@ from hipsta_bids.types import BodyMask, Bool, Flag, Float, HemisphereMaps, Sheet
 _REDO = "run the participant level again with --force"
 
 #: Columns of the tables that are no measures: definition and unit.
-NODES: dict[str, tuple[str, str | None]] = {
-    "x": ("node number along x, 1 at the medial end (subiculum)", None),
-    "y": ("node number along y, 1 at the posterior end", None),
-}
-POSITION: dict[str, tuple[str, str | None]] = {
-    "r": ("position on the mid-surface, scanner RAS, left to right", "mm"),
-    "a": ("position on the mid-surface, scanner RAS, posterior to anterior", "mm"),
-    "s": ("position on the mid-surface, scanner RAS, inferior to superior", "mm"),
-}
-STATE: dict[str, tuple[str, str | None]] = {
-    "subfield": ("subfield at the mid-surface", None),
-    "valid": ("true where measured directly, false where filled or missing", None),
-    "repaired": ("true where a repair of the labels' topology touched the column", None),
-}
-LAYERS: dict[str, tuple[str, str | None]] = {
-    **NODES,
-    "layer": ("number of the layer, 1 on the interior and the last on the exterior wall", None),
-    "depth": ("distance from the interior wall along the column", "mm"),
-    "relative_depth": ("the same over the length of the column", None),
-    **{
-        axis: (definition.replace("on the mid-surface", "of the point"), unit)
-        for axis, (definition, unit) in POSITION.items()
-    },
-}
+NODES, POSITION, STATE = (TABLES[name] for name in ("nodes", "position", "state"))
+LAYERS = NODES | TABLES["layers"]
 
 #: Columns of the sheet table, in order.
 SHEET_COLUMNS = (*NODES, *POSITION, *(row.name for row in MAPS), *STATE)
+
+_SUMMARY_ROWS = {row.name: row for row in SUMMARY}
 
 #: What all of these tables are about, whatever the columns.
 _MEASURED_REGION = (
@@ -150,8 +131,8 @@ def _write_sheet(result: ResultPlace, maps: HemisphereMaps, protocol: Protocol) 
         "valid": _truths(maps.sheet.valid),
         "repaired": _truths(maps.repaired),
     }
-    definitions = _definitions(NODES | POSITION)
-    definitions |= {row.name: _measure(row) for row in MAPS} | _definitions(STATE)
+    definitions = describe_columns(NODES | POSITION)
+    definitions |= {row.name: _measure(row) for row in MAPS} | describe_columns(STATE)
     definitions["subfield"]["Levels"] = {
         label.abbreviation: label.name for label in labels.values()
     }
@@ -160,16 +141,14 @@ def _write_sheet(result: ResultPlace, maps: HemisphereMaps, protocol: Protocol) 
 
 def _write_summary(result: ResultPlace, summary: Mapping[str, float]) -> None:
     """Write one row of summary measures: those of the catalog, then those of subfields."""
-    definitions = {row.name: _measure(row) for row in SUMMARY}
-    digits = {row.name: row.digits for row in SUMMARY}
-    definitions |= {name: _subfield_definition(name) for name in summary if name not in definitions}
-    columns = {
-        name: format_column(
-            np.array([summary.get(name, np.nan)]), digits.get(name, _MILLIMETER_DIGITS)
-        )
-        for name in definitions
-    }
-    _write_table(result, "summary", columns, definitions)
+    names = dict.fromkeys((*_SUMMARY_ROWS, *summary))
+    columns = {name: _summary_cell(name, summary.get(name, np.nan)) for name in names}
+    _write_table(result, "summary", columns, {name: _summary_definition(name) for name in names})
+
+
+def _summary_cell(name: str, value: float) -> list[str]:
+    row = _SUMMARY_ROWS.get(name)
+    return format_column(np.array([value]), row.digits if row else _MILLIMETER_DIGITS)
 
 
 def _write_profile(result: ResultPlace, maps: HemisphereMaps) -> None:
@@ -188,7 +167,7 @@ def _write_profile(result: ResultPlace, maps: HemisphereMaps) -> None:
                 "y": "one row per y from posterior to anterior, mean over x",
             },
         },
-        "node": _definition("node number along that axis, from 1", None),
+        "node": {"Description": "node number along that axis, from 1"},
     }
     wording = "{}; mean over the area of the columns measured directly"
     definitions |= {row.name: _measure(row, wording) for row in MAPS}
@@ -200,7 +179,7 @@ def _write_sections(result: ResultPlace, sections: Mapping[str, Float]) -> None:
     measures = _formatted(SECTIONS, sections)
     count = len(measures[SECTIONS[0].name])
     text = "number of the section, from the posterior to the anterior end"
-    definitions = {"y": _definition(text, None)} | {row.name: _measure(row) for row in SECTIONS}
+    definitions = {"y": {"Description": text}} | {row.name: _measure(row) for row in SECTIONS}
     _write_table(result, "sections", {**_numbers(("y",), (count,)), **measures}, definitions)
 
 
@@ -214,7 +193,7 @@ def _write_layers(result: ResultPlace, layers: Sheet) -> None:
         "relative_depth": format_column(depth / length, _MILLIMETER_DIGITS),
         **_positions(layers.points),
     }
-    _write_table(result, "layers", columns, _definitions(LAYERS))
+    _write_table(result, "layers", columns, describe_columns(LAYERS))
 
 
 def _numbers(axes: Iterable[str], shape: tuple[int, ...]) -> dict[str, list[str]]:
@@ -238,15 +217,6 @@ def _formatted(rows: Sequence[Column], values: Mapping[str, Float]) -> dict[str,
     return {row.name: format_column(values[row.name], row.digits) for row in rows}
 
 
-def _definition(description: str, unit: str | None) -> dict[str, object]:
-    definition: dict[str, object] = {"Description": description}
-    return definition | ({"Units": unit} if unit else {})
-
-
-def _definitions(entries: Mapping[str, tuple[str, str | None]]) -> dict[str, dict[str, object]]:
-    return {name: _definition(*entry) for name, entry in entries.items()}
-
-
 def _measure(row: Column, wording: str = "{}") -> dict[str, object]:
     """Define the column of a measure, with where its formula comes from."""
     return {
@@ -256,13 +226,15 @@ def _measure(row: Column, wording: str = "{}") -> dict[str, object]:
     }
 
 
-def _subfield_definition(column: str) -> dict[str, object]:
-    """Define a per-subfield column from its prefix; the rest of its name is the subfield."""
+def _summary_definition(column: str) -> dict[str, object]:
+    """Define a summary measure; the name of a subfield's begins with that of the measure."""
+    if column in _SUMMARY_ROWS:
+        return _measure(_SUMMARY_ROWS[column])
     for row in PER_SUBFIELD:
         if column.startswith(f"{row.name}_"):
             subfield = column.removeprefix(f"{row.name}_")
             return _measure(row) | {"Description": row.definition.format(subfield)}
-    return _definition(column.replace("_", " "), None)
+    return {"Description": column.replace("_", " ")}
 
 
 def write_results(
@@ -285,7 +257,7 @@ def write_results(
     files.write_bytes(result.path("body_mask"), mask_bytes(maps.body_mask))
     if write_meshes:
         _write_layers(result, maps.layers)
-        files.write_bytes(result.path("mesh"), meshes.mesh_bytes(maps.mesh, maps.coordinates))
+        files.write_bytes(result.path("mesh"), gifti.mesh_bytes(maps.mesh, maps.coordinates))
     write_more()
     _write_sources(result, record)
     undefined = int(np.isnan(maps.sheet.points[:, :, [0, -1]]).any(axis=(2, 3)).sum())
@@ -335,17 +307,14 @@ def write_spread(
         result,
         "uncertainty",
         {**_numbers(NODES, maps["thickness"].shape), **nodes},
-        {**_definitions(NODES), **definitions},
+        describe_columns(NODES) | definitions,
     )
-    rows = {row.name: row for row in SUMMARY}
-    definitions = {}
-    columns = {}
+    columns, definitions = {}, {}
     for name, value in summary.items():
-        about = _measure(rows[name]) if name in rows else _subfield_definition(name)
+        about = _summary_definition(name)
         about["Description"] = wording.format(about["Description"])
-        digits = rows[name].digits if name in rows else _MILLIMETER_DIGITS
         definitions[spread_name(name)] = about
-        columns[spread_name(name)] = format_column(np.array([value]), digits)
+        columns[spread_name(name)] = _summary_cell(name, value)
     _write_table(result, "summaryuncertainty", columns, definitions)
     name, unit = spread_name("thickness"), "mm"
     content = gifti.shape_bytes(

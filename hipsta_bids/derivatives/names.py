@@ -5,8 +5,10 @@ has no rule for is listed in ``.bidsignore``, with the reason, from the table be
 """
 
 import re
+import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
+from importlib.resources import files as files_of
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -14,6 +16,10 @@ from hipsta_bids.geometry.catalog import MAPS
 from hipsta_bids.io import files
 from hipsta_bids.protocols import EXPERIMENTAL
 from hipsta_bids.types import Hemisphere
+
+#: What files are, and what those of the dataset as a whole say.
+TEXTS = tomllib.loads((files_of("hipsta_bids.derivatives") / "texts.toml").read_text("utf-8"))
+_ABOUT = TEXTS["outputs"]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -87,13 +93,19 @@ class Output:
         return f"desc-{self.desc}_{self.suffix}.json" if self.desc else f"{self.suffix}.json"
 
 
+def _output(key: str, suffix: str, extension: str, **options: Any) -> Output:  # noqa: ANN401  (fields)
+    """Describe a file by its text."""
+    return Output(key, suffix, extension, _ABOUT[key], **options)
+
+
 def _table(
-    key: str, description: str, *, called: str | None = None, note: str = "", optional: bool = False
+    key: str, *, called: str | None = None, note: str = "", optional: bool = False
 ) -> tuple[Output, Output]:
     """Describe a table of one hemisphere, and its sidecar."""
+    text = _ABOUT[key] + note
     sidecar = f"columns, units and definitions of {called or f'the {key} table'}{note}"
     return (
-        Output(key, "morph", ".tsv", description + note, desc=key, optional=optional),
+        Output(key, "morph", ".tsv", text, desc=key, optional=optional),
         Output(f"{key}_sidecar", "morph", ".json", sidecar, desc=key, optional=optional),
     )
 
@@ -123,16 +135,14 @@ def _sidecars(images: Sequence[Output]) -> tuple[Output, ...]:
     )
 
 
-_SURFACES = {
-    "surface": ("surface of the sheet in the scanner space of the subject", None),
-    "unfold": ("surface laid flat: medial to lateral, posterior to anterior", "unfold"),
-}
 _MESHES = " (`--write-meshes`)"
 
 _IMAGES = (
     *(
-        Output(f"{name}_{kind}", name, ".surf.gii", f"{name} {description}", unit="mm", space=space)
-        for kind, (description, space) in _SURFACES.items()
+        Output(
+            f"{name}_{kind}", name, ".surf.gii", f"{name} {_ABOUT[kind]}", unit="mm", space=space
+        )
+        for kind, space in (("surface", None), ("unfold", "unfold"))
         for name in ("interior", "midthickness", "exterior")
     ),
     *(
@@ -146,124 +156,43 @@ _IMAGES = (
         )
         for row in MAPS
     ),
-    Output(
-        "subfields",
-        "dseg",
-        ".label.gii",
-        "subfield per surface vertex; names and colors are in the file's label table",
-        in_standard=True,
-    ),
-    Output(
-        "body_mask",
-        "mask",
-        ".nii.gz",
-        "the measured body on the grid of the labels; edit a copy to correct it",
-        desc="body",
-    ),
+    _output("subfields", "dseg", ".label.gii", in_standard=True),
+    _output("body_mask", "mask", ".nii.gz", desc="body"),
 )
 
 #: Every file of one hemisphere. The quality record comes last: it is written when all else is
 #: there, so that its presence means that the set is complete.
 OUTPUTS: tuple[Output, ...] = (
-    *_table("sheet", "one row per sheet point: position, thickness, curvatures, extents, subfield"),
-    *_table(
-        "summary",
-        "one row: means of thickness, curvatures and cross-sections, extents, volume, areas and"
-        " their ratios; some per subfield",
-    ),
-    *_table("profile", "means along the sheet: one row per x (over y), then one per y (over x)"),
-    *_table("sections", "one row per cross-section: lengths, area, ratio, shape index"),
+    *_table("sheet"),
+    *_table("summary"),
+    *_table("profile"),
+    *_table("sections"),
     *_IMAGES,
     *_sidecars(_IMAGES),
-    *_table(
-        "layers",
-        "one row per point of the three-dimensional grid: layer, depth, position",
-        note=_MESHES,
-        optional=True,
-    ),
-    Output(
-        "mesh",
-        "mesh",
-        ".vtu",
-        f"tetrahedral mesh with its three coordinates{_MESHES}",
-        desc="tet",
-        optional=True,
-    ),
-    Output(
-        "qc",
-        "metrics",
-        ".json",
-        "status, reason, flags, inputs, and every number that says whether to trust the maps",
-        desc="qc",
-    ),
+    *_table("layers", note=_MESHES, optional=True),
+    _output("mesh", "mesh", ".vtu", desc="tet", optional=True),
+    _output("qc", "metrics", ".json", desc="qc"),
 )
 
-_SPREAD = Output(
-    "thickness_sd",
-    "morph",
-    ".shape.gii",
-    "SD of thickness over perturbed copies of the labels; per surface vertex, mm (`--uncertainty`)",
-    unit="mm",
-    desc="thicknessSd",
+_SPREAD = _output("thickness_sd", "morph", ".shape.gii", unit="mm", desc="thicknessSd")
+_HEADS = tuple(
+    _output(key, "morph", ".shape.gii", unit="1", desc=key)
+    for key in ("distortion", "proximodistal")
 )
-
-_DISTORTION = Output(
-    "distortion",
-    "morph",
-    ".shape.gii",
-    "area round each node over the mean, binary logarithm; per surface vertex, 1"
-    " (`--region headbody` and `whole`, experimental)",
-    unit="1",
-    desc="distortion",
-)
-
-_PROXIMODISTAL = Output(
-    "proximodistal",
-    "morph",
-    ".shape.gii",
-    "harmonic function from the medial edge, -1, to the lateral edge, 1; per surface vertex"
-    " (`--region headbody` and `whole`, experimental)",
-    unit="1",
-    desc="proximodistal",
-)
-
-_SAMPLED = (
-    ("table", ".tsv", "another volume at each sheet point, one column per volume (`--map`)"),
-    ("sidecar", ".json", "its source, how it was sampled, and how much of it is missing"),
-    ("shape", ".shape.gii", "the same per surface vertex"),
-    ("series", ".func.gii", "the same per surface vertex, where there are several volumes"),
-)
+_SAMPLED = {"table": ".tsv", "sidecar": ".json", "shape": ".shape.gii", "series": ".func.gii"}
 
 #: Files of one hemisphere that come with an option or another command. A ``*`` stands for the name
 #: that the user gave.
 EXTRA_OUTPUTS: tuple[Output, ...] = (
-    *(Output(f"map_{key}", "map", end, text, desc="*") for key, end, text in _SAMPLED),
-    *_table(
-        "roi",
-        "one row per region drawn on the sheet: points, area, mean and SD of the maps (`--roi`)",
-        called="the region table",
-    ),
-    *_table(
-        "uncertainty",
-        "one row per sheet point: SD of each map over perturbed copies of the labels"
-        " (`--uncertainty`)",
-        called="that table",
-    ),
-    *_table(
-        "summaryuncertainty",
-        "one row: SD of each summary measure over the same copies (`--uncertainty`)",
-        called="that table",
-    ),
+    *(_output(f"map_{key}", "map", end, desc="*") for key, end in _SAMPLED.items()),
+    *_table("roi", called="the region table"),
+    *_table("uncertainty", called="that table"),
+    *_table("summaryuncertainty", called="that table"),
     _SPREAD,
     *_sidecars([_SPREAD]),
-    _DISTORTION,
-    _PROXIMODISTAL,
-    *_sidecars([_DISTORTION, _PROXIMODISTAL]),
-    *_table(
-        "surrogate",
-        "thickness from the medial axis of single slices (`hipsta-bids surrogate`)",
-        called="that table",
-    ),
+    *_HEADS,
+    *_sidecars(_HEADS),
+    *_table("surrogate", called="that table"),
 )
 
 #: Files of the whole dataset, by the name of what they hold.
@@ -301,31 +230,8 @@ TRIAL_MAPS: dict[str, tuple[str, str, str]] = {
 #: Folder and page of a meta-analysis, in an output folder of its own.
 META, META_REPORT = "meta", "meta.html"
 
-#: Lines of ``.bidsignore``, and why BIDS has no name for what each hides. The validator (3.0)
-#: passes over what is in a folder with a final slash, but not over the folder; and a wildcard
-#: before another one ends at the first character that follows it in the pattern. So folders have
-#: no slash, and patterns one wildcard and perhaps one at the end.
-IGNORED: dict[str, str] = {
-    f"/{DATASET_FILES['settings']}": "Settings of the program; BIDS has no file for them.",
-    f"/{DATASET_FILES['citation']}": "Text for a methods section; CITATION.cff cites a dataset.",
-    "/status.*": "How each hemisphere ended; BIDS has no table of a program's runs.",
-    "/inputs.*": "What was found and not used; BIDS has no table of a program's search.",
-    "/*.html": "Pages to look at; BIDS leaves reports to the program.",
-    f"/{DATASET_FILES['group']}": "Results over participants; BIDS has names for single ones only.",
-    "*_morph.*": "Morphometry; a proposal (BEP011), not yet in BIDS.",
-    "*thickness.*": "Thickness and midthickness surfaces, with sidecars; likewise (BEP011).",
-    "*curv.*": "Curvature on surfaces, with sidecars; likewise (BEP011).",
-    "*interior.*": "Interior surfaces, with sidecars; BIDS has no surfaces yet.",
-    "*exterior.*": "Exterior surfaces, with sidecars; likewise.",
-    "*_map.*": "Other volumes sampled on the sheet; BIDS has no suffix for any quantity.",
-    "*_mesh.vtu": "Tetrahedral meshes; BIDS has no volume meshes.",
-    "*_metrics.json": "Quality of one hemisphere; BIDS has no quality metrics of derivatives.",
-    "*desc-body_mask.*": "Masks per hemisphere; in BIDS, masks of voxels have no hemi and seg.",
-    "*_label-extended_dseg.*": "Subfields and cortex; in BIDS, labels on surfaces have no label.",
-    "*_label-entorhinal_dseg.*": "The cortex alone; likewise.",
-    "*_label-headbody_dseg.*": "Head and body; likewise.",
-    "*_label-whole_dseg.*": "Head, body and tail; likewise.",
-}
+#: Lines of ``.bidsignore``, and why BIDS has no name for what each hides.
+IGNORED: dict[str, str] = TEXTS["ignored"]
 
 _IGNORE_HEAD = """\
 # For the BIDS validator: what is in this dataset, but has no name in BIDS 1.11."""

@@ -81,16 +81,14 @@ def find_ends(
     dentate gyrus, and cross-sections like those in its middle. All this is evidence for or against
     each level; an end is the mean over all places where the body may end, weighted by evidence.
     """
+    if settings.end_rule == "last-slice":
+        return _last_slices(volume, sheet, axis)
     profile = _profile(volume, sheet, axis)
     levels = profile.levels
     low, high = known_levels.get("posterior", -np.inf), known_levels.get("anterior", np.inf)
     typical = _has_subfields(profile) & (levels > low) & (levels < high)
     if not typical.any():
-        raise GeometryError(
-            "no slice across the long axis has both CA1 and CA2/CA3, and there are no head and "
-            "tail labels: label the head and the tail, or check that the protocol fits the labels",
-            reason="no-body",
-        )
+        raise _no_body()
     absence, odd = _evidence(profile, typical)
     ends = _mean_ends(levels, _doubt(absence, odd), known_levels, settings)
     # The standard error over the cues, by leaving each out once (jackknife).
@@ -117,6 +115,39 @@ def find_ends(
         rule = _main_evidence(levels, ends[n], sign, absence, odd)
         results[end] = FoundEnd(ends[n] + sign * trim, rule, error)
     return results
+
+
+def _no_body() -> GeometryError:
+    return GeometryError(
+        "no slice across the long axis has both CA1 and CA2/CA3, and there are no head and "
+        "tail labels: label the head and the tail, or check that the protocol fits the labels",
+        reason="no-body",
+    )
+
+
+def _last_slices(volume: LabelVolume, sheet: NDArray[np.uint8], axis: Float) -> dict[End, FoundEnd]:
+    """Find the last slices of the image with labels of the body, as in Diers et al. 2023.
+
+    Posteriorly a slice has CA1 and CA2 or CA3, anteriorly CA2 or CA3. The body ends at its outer
+    side.
+    """
+    along = axis @ volume.affine[:3, :3]
+    through = int(np.argmax(np.abs(along)))
+    number = np.nonzero(sheet)[through]
+    heights = voxel_points(sheet > 0, volume.affine) @ axis
+    count = np.maximum(np.bincount(number, minlength=sheet.shape[through]), 1)
+    level = np.bincount(number, heights, sheet.shape[through]) / count
+    across = tuple(k for k in range(3) if k != through)
+    lateral, ca1 = (
+        np.isin(sheet, kinds).any(axis=across) for kinds in (LATERAL_END, (Tissue.CA1,))
+    )
+    if not (lateral & ca1).any():
+        raise _no_body()
+    half = abs(float(along[through])) / 2
+    return {
+        "posterior": FoundEnd(float(level[lateral & ca1].min()) - half, "last-slice", 0.0),
+        "anterior": FoundEnd(float(level[lateral].max()) + half, "last-slice", 0.0),
+    }
 
 
 def _profile(volume: LabelVolume, sheet: NDArray[np.uint8], axis: Float) -> _Profile:

@@ -142,10 +142,11 @@ class Body:
         return index, points
 
 
-def extract_body(volume: LabelVolume, settings: BodySettings) -> Body:
+def extract_body(volume: LabelVolume, settings: BodySettings, *, second: bool = False) -> Body:
     """Merge the sheet's subfields and find where the body begins and ends.
 
-    Merging and the molecular-layer rule: Diers et al. 2023, section 2.1.
+    With ``second``, doubtful cavities are taken for the other kind. Merging and the molecular-layer
+    rule: Diers et al. 2023, section 2.1.
     """
     tissue, layer_voxels = _merge_layer(volume, settings)
     if not tissue.any():
@@ -156,7 +157,9 @@ def extract_body(volume: LabelVolume, settings: BodySettings) -> Body:
         )
     ends = find_end_planes(volume, tissue, settings)
     volume, tissue, handed_over = completion.hand_over(volume, tissue, ends, settings.plane_reach)
-    cavities = completion.find_cavities(volume, tissue, ends, settings)
+    cavities = completion.Cavities()
+    if settings.mending == "gaps":
+        cavities = completion.find_cavities(volume, tissue, ends, settings, second=second)
     volume, tissue = completion.fill_cavities(volume, tissue, cavities, settings)
     change = None
     if volume.edited_mask is not None:
@@ -179,12 +182,8 @@ def extract_body(volume: LabelVolume, settings: BodySettings) -> Body:
         )
     if region != "body":
         check_reach(points, tissue[inside], ends, settings)
-    empty = volume.tissue == Tissue.BACKGROUND
-    slits = completion.fill_slits(tissue, inside, empty, volume.affine, settings)
-    if volume.edited_mask is not None:  # a person has taken these voxels out
-        empty &= volume.edited_mask.inside
-    tissue, pits = completion.fill_pits(slits.tissue, inside, empty, volume.affine, settings)
-    if len(slits.filled) or len(pits):
+    tissue, added, gap = _mend(volume, tissue, inside, settings)
+    if len(added):
         inside, _ = completion.between(tissue > 0, volume.affine, ends)
     return Body(
         tissue=tissue,
@@ -195,13 +194,29 @@ def extract_body(volume: LabelVolume, settings: BodySettings) -> Body:
         ends=ends,
         layer_voxels=layer_voxels,
         inside=inside,
-        filled=np.concatenate([slits.filled, pits]),
+        filled=added,
         cavities=cavities,
         uncus=uncus,
         handed_over=handed_over,
-        gap=slits.gap,
+        gap=gap,
         mask_change=change,
     )
+
+
+def _mend(
+    volume: LabelVolume, tissue: completion.Tissues, inside: Bool, settings: BodySettings
+) -> tuple[completion.Tissues, completion.Index, completion.Index]:
+    """Fill what the settings say; return the tissue, what was added, and a gap that was left."""
+    affine, empty = volume.affine, volume.tissue == Tissue.BACKGROUND
+    allowed = np.ones_like(empty)
+    if volume.edited_mask is not None:  # a person has taken these voxels out
+        allowed = volume.edited_mask.inside
+    if settings.mending == "closing":
+        tissue, added = completion.close_mask(tissue, allowed, affine)
+        return tissue, added, added[:0]
+    slits = completion.fill_slits(tissue, inside, empty, affine, settings)
+    tissue, pits = completion.fill_pits(slits.tissue, inside, empty & allowed, affine, settings)
+    return tissue, np.concatenate([slits.filled, pits]), slits.gap
 
 
 def check_side(body: Body, hemi: str) -> float:
@@ -223,14 +238,19 @@ def check_side(body: Body, hemi: str) -> float:
     # Six real bodies show 4-8 mm; one millimeter leaves room for a rotated head.
     centers = points[medial].mean(axis=0), points[lateral].mean(axis=0)
     if offset < -1.0 and not _has_handedness(body, *centers, hemi):
-        side = {"L": "left", "R": "right"}
-        opposite = side["R" if hemi == "L" else "L"]
-        raise GeometryError(
-            f"labeled {side[hemi]}, but the subiculum lies {-offset:.1f} mm lateral of CA1 as in "
-            f"a {opposite} hemisphere: check the image's affine and which file is which",
-            reason="left-right-swapped",
-        )
+        raise wrong_side(hemi, offset)
     return offset
+
+
+def wrong_side(hemi: str, offset: float) -> GeometryError:
+    """Make the error of a hemisphere whose medial subfields lie ``offset`` mm medially of CA1."""
+    side = {"L": "left", "R": "right"}
+    opposite = side["R" if hemi == "L" else "L"]
+    return GeometryError(
+        f"labeled {side[hemi]}, but the subiculum lies {-offset:.1f} mm lateral of CA1 as in "
+        f"a {opposite} hemisphere: check the image's affine and which file is which",
+        reason="left-right-swapped",
+    )
 
 
 def _has_handedness(body: Body, subiculum: Float, ca1: Float, hemi: str) -> bool:

@@ -5,9 +5,10 @@ parts of the wall belong to the edges by weights that fall smoothly from 1 to 0,
 change of the labels moves the boundary by little.
 """
 
-from collections.abc import Iterator
-from dataclasses import dataclass
-from itertools import islice
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from scipy import ndimage
@@ -17,7 +18,7 @@ from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.body import Body
 from hipsta_bids.geometry.checks import name_place
 from hipsta_bids.geometry.fem import DIRECTION_RESIDUAL, Laplace
-from hipsta_bids.geometry.mesh import mean_wall_thickness, signed_volume
+from hipsta_bids.geometry.mesh import mean_wall_thickness, signed_volume, tetra_volumes
 from hipsta_bids.geometry.wall import Wall, end_to_end
 from hipsta_bids.settings import BoundarySettings
 from hipsta_bids.types import Bool, Float, Int, Surface
@@ -50,9 +51,14 @@ EDGE_NEIGHBORS, EDGE_SD = 60, 0.4
 STRIP_WEIGHT = 0.5
 #: Below it, the sides hold the middle lines; width of that change.
 HOLD_FADE = 0.15
-#: Other operators, whose zero lines show how certain the curves are: factors of sharp_bend and of
-#: anisotropy.
-TILTS = ((0.8, 1.0), (1.0, 0.625))
+#: The operator of the settings, and others, whose zero lines show how certain the curves are:
+#: factors of sharp_bend and of anisotropy.
+TILTS = ((1.0, 1.0), (0.8, 1.0), (1.0, 0.625))
+#: Curves this near to each other on average lead to the same map, mm.
+SAME_CURVES = 0.05
+#: Curves this near to each other on their way to the middle of the edges end in the same place, mm:
+#: each band divides their distance by about ten.
+MET_CURVES = 0.01
 #: Distances at which interior labels are looked for, mm outside the wall.
 PROBE_DISTANCES = (0.4, 0.8, 1.2)
 #: Fewer hits than this share count as no interior labels.
@@ -60,6 +66,10 @@ MIN_PROBE_SHARE = 0.02
 
 #: Medial and lateral, or the other way round.
 Pair = tuple[Float, Float]
+#: Such curves, and the function (V,) whose zero lines they are.
+Centered = tuple[Pair, Float]
+#: Unit vectors (N, 3) at points (N, 3).
+Flow = Callable[[Float], Float]
 
 
 def ramp(values: Float) -> Float:
@@ -68,24 +78,34 @@ def ramp(values: Float) -> Float:
     return np.asarray(share * share * (3 - 2 * share))
 
 
-def center_curves(wall: Wall, values: Float, thickness: float) -> tuple[Pair, Float] | None:
+def center_curves(
+    wall: Wall,
+    values: Float,
+    thickness: float,
+    reference: Sequence[Centered] = (),
+    bands: Sequence[float] = EDGE_BANDS,
+) -> Sequence[Centered] | None:
     """Move zero lines of a function (V,) to the middle of the sheet's edges, which may be rounded.
 
     The function is made again, free in ever narrower bands of equal width on both sides of its
     lines and held at its signs elsewhere: a side that bends more, or reaches farther into a band,
     would pull the line towards itself. Bands fade out, so that a vertex that enters one moves
-    nothing by much. Returns the lines and the function.
+    nothing by much. Returns the lines and the function before the first band and after each. Lines
+    that meet those of a ``reference`` on their way become these.
     """
-    curves = end_to_end(wall, values)
-    for width in EDGE_BANDS:
+    curves, steps = end_to_end(wall, values), list[Centered]()
+    for width in bands:
         if curves is None:
             return None
+        if reference and _curve_distance(curves, reference[len(steps)][0]) < MET_CURVES:
+            return reference
+        steps.append((curves, values))
         reach = (width + BAND_FADE) * thickness
         distance = np.minimum(*(wall.distance(curve, reach) for curve in curves)) / thickness
         hold = ramp((distance - width) / BAND_FADE + 0.5)
         values = _screened(wall, hold, values, thickness)
         curves = end_to_end(wall, values)
-    return None if curves is None else (curves, values)
+    return None if curves is None else [*steps, (curves, values)]
 
 
 def _screened(wall: Wall, hold: Float, values: Float, thickness: float) -> Float:
@@ -112,15 +132,19 @@ def facing_strips(
     """
     normals, areas = wall.smooth_normals, wall.vertex_areas
     weights = [1.0 * np.isfinite(wall.distance(line, FIRST_STRIP * thickness)) for line in curves]
+    mean = LocalMean(laplace)
     for reach in STRIP_REACH:
         medial, lateral = (wall.index[weight > STRIP_WEIGHT] for weight in weights)
-        flow = Flow(laplace, laplace.between(medial, lateral, DIRECTION_RESIDUAL))
+        flow = mean.direction(laplace.between(medial, lateral, DIRECTION_RESIDUAL))
         for k, inward in enumerate((1.0, -1.0)):
             distance = wall.distance(curves[k], (reach + REACH_FADE) * thickness) / thickness
             strip = np.flatnonzero(weights[k])
             starts = wall.vertices[strip]
             outward = -inward * _direction_at_edge(flow, starts, inward * thickness)
-            close = np.flatnonzero(np.isfinite(distance))
+            # Nearer and farther ones have a weight of 1 and 0, wherever they face.
+            close = np.flatnonzero(
+                (distance > LEAST_STRIP - 0.5 * LEAST_FADE) & (distance < reach + 0.5 * REACH_FADE)
+            )
             share = (weights[k] * areas)[strip]
             towards = _local_mean(wall.vertices[close], starts, outward, share, EDGE_SD * thickness)
             cosine = (normals[close] * _unit(towards)).sum(axis=1)
@@ -150,7 +174,7 @@ def _in_order(lines: Pair, curves: Pair) -> Pair:
     return lines if first <= second else (lines[1], lines[0])
 
 
-def _direction_at_edge(flow: "Flow", starts: Float, inward: float) -> Float:
+def _direction_at_edge(flow: Flow, starts: Float, inward: float) -> Float:
     """Compute the unit direction (N, 3) of the flow at the sheet's edge.
 
     Three steps are made into the sheet; a line through the directions found there is continued
@@ -177,47 +201,51 @@ def _local_mean(at: Float, points: Float, vectors: Float, weight: Float, sd: flo
     return np.asarray(np.einsum("mk,mkd->md", share, vectors[near]))
 
 
-class Flow:
-    """Direction of a harmonic function in a volume, averaged over a neighborhood.
+class LocalMean:
+    """Mean of directions in the tetrahedra of a volume, over a neighborhood.
 
-    The mean is taken on a grid, so that the tetrahedra's number and place matter little.
+    It is taken on a grid, so that the tetrahedra's number and place matter little.
     """
 
     _STEP = 0.7
     """Of the grid, times the SD."""
 
-    def __init__(self, laplace: Laplace, values: Float) -> None:
-        corners = laplace.points[laplace.cells.T]
-        volume = np.abs(
-            np.einsum(
-                "ij,ij->i",
-                corners[1] - corners[0],
-                np.cross(corners[2] - corners[0], corners[3] - corners[0]),
-            )
-        )
-        flow = laplace.gradient(values)
-        centers = corners.mean(axis=0)
-        self._step = self._STEP * FLOW_SD
+    def __init__(self, laplace: Laplace) -> None:
+        """Find the node of the grid nearest to each tetrahedron."""
+        self._laplace = laplace
+        points, step = laplace.points, self._STEP * FLOW_SD
+        self._volume = np.abs(tetra_volumes(points, laplace.cells))
         # Around the middle, so that mirror images get mirrored grids.
-        middle = 0.5 * (laplace.points.max(axis=0) + laplace.points.min(axis=0))
-        half = np.ceil(np.ptp(laplace.points, axis=0) / 2 / self._step).astype(int) + 6
-        self._low = middle - half * self._step
-        shape = 2 * half + 1
-        cell = np.rint((centers - self._low) / self._step).astype(np.intp)
-        index = np.ravel_multi_index(tuple(cell.T), tuple(shape))
-        total = [np.bincount(index, volume * part, int(np.prod(shape))) for part in flow.T]
-        self._grid = np.stack(
-            [
-                ndimage.gaussian_filter(part.reshape(shape), 1 / self._STEP, truncate=3.0)
-                for part in total
-            ]
-        )
+        low, high = points.min(axis=0), points.max(axis=0)
+        half = np.ceil((high - low) / 2 / step).astype(int) + 6
+        self._low, self._shape = 0.5 * (high + low) - half * step, 2 * half + 1
+        centers = sum(points[corner] for corner in laplace.cells.T) / 4
+        node = np.rint((centers - self._low) / step).astype(np.intp)
+        self._node = np.ravel_multi_index(tuple(node.T), tuple(self._shape))
 
-    def __call__(self, points: Float) -> Float:
-        """Return unit vectors (N, 3) at points (N, 3)."""
-        place = ((points - self._low) / self._step).T
-        rows = [ndimage.map_coordinates(part, place, order=1) for part in self._grid]
-        return _unit(np.stack(rows, axis=1))
+    def direction(self, values: Float) -> Flow:
+        """Return a function that gives the mean unit gradient (N, 3) of values at points (N, 3)."""
+        step = self._STEP * FLOW_SD
+        grids = [
+            ndimage.gaussian_filter(
+                np.bincount(self._node, self._volume * part, np.prod(self._shape)).reshape(
+                    self._shape
+                ),
+                1 / self._STEP,
+                output=np.float32,
+                truncate=3.0,
+            )
+            for part in self._laplace.gradient(values).T
+        ]
+
+        def flow(points: Float) -> Float:
+            place = ((points - self._low) / step).T
+            rows = [
+                ndimage.map_coordinates(grid, place, order=1, output=np.float64) for grid in grids
+            ]
+            return _unit(np.stack(rows, axis=1))
+
+        return flow
 
 
 def _unit(vectors: Float) -> Float:
@@ -237,9 +265,6 @@ class Boundaries:
     medial_curve: Float
     """(N, 3) points of the boundary curve, RAS mm."""
     lateral_curve: Float
-    doubt: float
-    """Largest mean distance of the curves from those of other operators (``TILTS``), mm; NaN if one
-    of these has none."""
     side_rule: str
     """What tells interior from exterior: ``labels``, or, decided on the sheet, ``bending`` or,
     where cortex is measured, ``continuity`` with the hippocampus."""
@@ -249,6 +274,12 @@ class Boundaries:
     """Mean width of the boundary strips, mm."""
     sheet_thickness: float
     """2 volume / area of the two sides, strips left out on either, mm."""
+    tilt: int = 0
+    """Number of the first operator in ``TILTS`` that has curves; 0 is that of the settings."""
+    doubt: float = 0.0
+    """Largest mean distance of the curves from those of the other operators, mm."""
+    rival: "Boundaries | None" = None
+    """The boundary of the operator whose curves lie farthest away; None where all are the same."""
 
 
 def find_boundaries(
@@ -258,22 +289,61 @@ def find_boundaries(
 
     The zero lines of the first curvature-aware anisotropic Laplace-Beltrami eigenfunction of the
     wall are the medial and lateral boundary (Diers et al. 2023, section 2.1.3), moved to the middle
-    of the edges.
+    of the edges. Other operators lead to the same lines where these are certain, whatever the
+    start. Where they do not, their boundary is the result's ``rival``.
     """
     wall = Wall(surface, settings)
     thickness = mean_wall_thickness(surface)
-    values = _eigenfunction(wall, settings)
-    centered = None if values is None else center_curves(wall, values, thickness)
-    if values is None or centered is None:
+    tilt, lines, first = 0, list[Sequence[Centered]](), None
+    bands = EDGE_BANDS if settings.edges == "faces" else ()
+    for bend, anisotropy in TILTS:
+        operator = wall.operator(
+            settings.changed(
+                sharp_bend=bend * settings.sharp_bend,
+                anisotropy=anisotropy * settings.anisotropy,
+            )
+        )
+        if first is None:
+            first, values = operator, operator.eigenfunctions(1)[1][:, 0]
+        else:  # A rough function leads to the same curves where these are certain.
+            values = operator.first_near(values, first)
+        centered = center_curves(wall, values, thickness, lines[0] if lines else (), bands)
+        if centered is not None:
+            lines.append(centered)
+        tilt += not lines
+    if not lines:
         raise GeometryError(
             "no line runs along the medial and the lateral edge from end to end: check the labels "
             "for folds that touch each other",
             reason="boundaries",
         )
-    curves, smooth = centered
-    strips, sides, pair = _strips_and_sides(wall, laplace, curves, smooth, thickness)
+    distances = [_curve_distance(steps[-1][0], lines[0][-1][0]) for steps in lines]
+    farthest = int(np.argmax(distances))
+    along = partial(_along_curves, surface, wall, laplace, body, settings, thickness=thickness)
+    boundaries, rival = along(centered=lines[0][-1]), None
+    if distances[farthest] > SAME_CURVES:
+        with suppress(GeometryError):
+            rival = along(centered=lines[farthest][-1])
+    return replace(boundaries, tilt=tilt, doubt=distances[farthest], rival=rival)
+
+
+def _along_curves(
+    surface: Surface,
+    wall: Wall,
+    laplace: Laplace,
+    body: Body,
+    settings: BoundarySettings,
+    *,
+    centered: Centered,
+    thickness: float,
+) -> Boundaries:
+    """Find strips and sides along two curves, given with the function whose zero lines they are."""
+    if settings.edges == "zero-lines":
+        strips, sides, pair = _narrow_strips(wall, centered[0])
+    else:
+        strips, sides, pair = _strips_and_sides(wall, laplace, *centered, thickness)
     if sides is None:
-        raise _inseparable(curves, body)
+        raise _inseparable(centered[0], body)
     if _rank(pair[0], body) > _rank(pair[1], body):
         pair, strips = (pair[1], pair[0]), (strips[1], strips[0])
     sides, side_rule, margin = _interior_first(sides, wall, body)
@@ -287,7 +357,6 @@ def find_boundaries(
         anterior=np.flatnonzero(surface.anterior_cap).astype(np.int32),
         medial_curve=pair[0],
         lateral_curve=pair[1],
-        doubt=_doubt(wall, values, curves, thickness, settings),
         side_rule=side_rule,
         side_margin=margin,
         strip_width=area / (2 * body.ends.length(wall.vertices)),
@@ -298,40 +367,13 @@ def find_boundaries(
     )
 
 
-def _operators(wall: Wall, settings: BoundarySettings) -> Iterator[Laplace]:
-    """Make the operator of the settings, and others for comparison."""
-    for bend, anisotropy in ((1.0, 1.0), *TILTS):
-        yield wall.operator(
-            settings.changed(
-                sharp_bend=bend * settings.sharp_bend, anisotropy=anisotropy * settings.anisotropy
-            )
-        )
-
-
-def _eigenfunction(wall: Wall, settings: BoundarySettings) -> Float | None:
-    """Return the first eigenfunction (V,) with two zero lines from end to end, of any operator."""
-    for operator in _operators(wall, settings):
-        values = operator.eigenfunctions(1)[1][:, 0]
-        if end_to_end(wall, values) is not None:
-            return values
-    return None
-
-
-def _doubt(
-    wall: Wall, values: Float, curves: Pair, thickness: float, settings: BoundarySettings
-) -> float:
-    """Find how far curves lie from those that other operators lead to, mm; NaN if to none.
-
-    That is the largest mean distance; ``values`` (V,) is the eigenfunction of the first operator.
-
-    Curves that are certain are found from any start, to the thousandth of a millimeter.
-    """
-    distances = []
-    for operator in islice(_operators(wall, settings), 1, None):
-        tilted = operator.eigenfunctions(1, near=values, residual=1e-3)[1][:, 0]
-        moved = center_curves(wall, tilted, thickness)
-        distances.append(float("nan") if moved is None else _curve_distance(moved[0], curves))
-    return float(np.max(distances))
+def _narrow_strips(
+    wall: Wall, curves: Pair
+) -> tuple[tuple[Bool, Bool], tuple[Bool, Bool] | None, Pair]:
+    """Find the vertices along two curves, one on each edge that a curve crosses, and the sides."""
+    reach = 0.51 * float(wall.lengths.max())
+    first, second = (np.isfinite(wall.distance(curve, reach)) for curve in curves)
+    return (first, second), wall.sides(first | second), curves
 
 
 def _strips_and_sides(
@@ -341,17 +383,21 @@ def _strips_and_sides(
 
     Where strips that face along the sheet do not, those within ``FIRST_STRIP`` of the curves may.
     """
-    plain = [np.isfinite(wall.distance(curve, FIRST_STRIP * thickness)) for curve in curves]
-    attempts = [(plain, curves)]
     facing = facing_strips(wall, laplace, curves, values, thickness)
     if facing is not None:
         weights, lines = facing
-        attempts.insert(0, ([weight > STRIP_WEIGHT for weight in weights], lines))
-    for (first, second), _middle in attempts:
-        sides = None if (first & second).any() else wall.sides(first | second)
+        medial, lateral = (weight > STRIP_WEIGHT for weight in weights)
+        sides = _sides_between(wall, medial, lateral)
         if sides is not None:
-            break
-    return (first, second), sides, _middle
+            return (medial, lateral), sides, lines
+    reach = FIRST_STRIP * thickness
+    medial, lateral = (np.isfinite(wall.distance(curve, reach)) for curve in curves)
+    return (medial, lateral), _sides_between(wall, medial, lateral), curves
+
+
+def _sides_between(wall: Wall, medial: Bool, lateral: Bool) -> tuple[Bool, Bool] | None:
+    """Find the sides between two strips that do not touch, if there are two."""
+    return None if (medial & lateral).any() else wall.sides(medial | lateral)
 
 
 def _inseparable(curves: Pair, body: Body) -> GeometryError:

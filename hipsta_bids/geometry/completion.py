@@ -42,6 +42,9 @@ UNCUS_OFFSET = 5.0
 CAVITY_OPENNESS = 0.25
 #: A cavity with room for a ball of this radius is too wide to be the molecular layer, mm.
 CAVITY_RADIUS = 0.9
+#: A cavity of at least this volume, mm3, whose openness or radius is within this factor of its
+#: limit could as well be taken for the other kind.
+DOUBTFUL_CAVITY, CAVITY_MARGIN = 2.0, 1.15
 
 #: Neighbors that are no farther than the nearest by more than this are tied, mm: the affine of an
 #: image is stored with errors of a hundredth of that.
@@ -88,6 +91,8 @@ class Cavities(NamedTuple):
     """Cavities that may be a part of the molecular layer."""
     wide: tuple[Index, ...] = ()
     """Cavities that are too wide for that."""
+    doubtful: bool = False
+    """Whether a large one is near to a limit that decides about it."""
 
     @property
     def all(self) -> Index:
@@ -193,12 +198,18 @@ def hand_over(
 
 
 def find_cavities(
-    volume: LabelVolume, tissue: Tissues, ends: EndPlanes, settings: BodySettings
+    volume: LabelVolume,
+    tissue: Tissues,
+    ends: EndPlanes,
+    settings: BodySettings,
+    *,
+    second: bool = False,
 ) -> Cavities:
     """Find what is unlabeled but enclosed by the sheet, its layer and its interior.
 
     Vessels, cysts and strata that were left out make the inner wall jump across them. A cavity is
-    enclosed in three dimensions, or in a slice if little of it is open to the next slices.
+    enclosed in three dimensions, or in a slice if little of it is open to the next slices. With
+    ``second``, what is near to a limit is taken for the other kind.
     """
     solid = _subfields(volume) | np.isin(volume.tissue, (Tissue.HIPPOCAMPUS, Tissue.FISSURE))
     around = digital.box_around(digital.positions(between(solid, volume.affine, ends)[0]))
@@ -214,24 +225,28 @@ def find_cavities(
     enclosed &= np.isin(volume.tissue[around], (Tissue.BACKGROUND, Tissue.CYST))
     pieces, _ = ndimage.label(enclosed, structure=digital.CUBE)
     most_open = 1.0 if edges[through] > settings.slit_voxel else CAVITY_OPENNESS
-    narrow, wide = list[Index](), list[Index]()
+    narrow, wide, doubtful = list[Index](), list[Index](), False
     for number, part in enumerate(ndimage.find_objects(pieces), 1):
         room = digital.box_around(
             digital.positions(pieces[part] == number) + digital.low_corner(part)
         )
         piece = pieces[room] == number
         ring = digital.widened(piece) & ~piece
-        is_open = (ring & ~solid[room] & ~enclosed[room]).sum() > most_open * ring.sum()
         beside = ring & solid[room]
         index = digital.positions(piece) + digital.low_corner(around) + digital.low_corner(room)
         index = index[ends.depth(digital.to_ras(index, volume.affine)) > 0]
-        if not len(index) or is_open or not (beside & sheet[room]).any():
+        if not (len(index) and (beside & sheet[room]).any() and (beside & inner[room]).any()):
             continue
-        if (beside & inner[room]).any():
-            radius = ndimage.distance_transform_edt(np.pad(piece, 1), sampling=edges).max()
-            is_wide = float(radius) > CAVITY_RADIUS
+        opened = (ring & ~solid[room] & ~enclosed[room]).sum() / ring.sum() / most_open
+        radius = ndimage.distance_transform_edt(np.pad(piece, 1), sampling=edges).max()
+        ratios = np.array([opened, radius / CAVITY_RADIUS])
+        near = (ratios > 1 / CAVITY_MARGIN) & (ratios < CAVITY_MARGIN)
+        near &= len(index) * float(np.prod(edges)) > DOUBTFUL_CAVITY
+        doubtful |= bool(near[0] or (near[1] and opened <= 1))
+        is_open, is_wide = (ratios > 1) ^ (near & second)
+        if not is_open:
             (wide if is_wide else narrow).append(index)
-    return Cavities(tuple(narrow), tuple(wide))
+    return Cavities(tuple(narrow), tuple(wide), doubtful)
 
 
 def _cannot_leave(solid: Bool, structure: Bool, through: int) -> Bool:
@@ -260,6 +275,18 @@ def fill_cavities(
         if group:
             volume, tissue = _like_nearest(volume, tissue, np.concatenate(group), candidates)
     return volume, tissue
+
+
+def close_mask(tissue: Tissues, allowed: Bool, affine: Float) -> tuple[Tissues, Index]:
+    """Dilate and erode the mask by a voxel; what that adds, (N, 3), gets the nearest tissue."""
+    donors = tissue > 0
+    closed = ndimage.binary_closing(np.pad(donors, 1), structure=digital.CUBE)[1:-1, 1:-1, 1:-1]
+    added = digital.positions(closed & allowed & ~donors)
+    tissue = tissue.copy()
+    tissue[tuple(added.T)] = value_of_nearest(
+        tissue[donors], digital.voxel_points(donors, affine), digital.to_ras(added, affine)
+    )
+    return tissue, added
 
 
 class Slits(NamedTuple):

@@ -43,7 +43,8 @@ class EndPlane(NamedTuple):
     """One end plane, and the rule by which it was found.
 
     The rule is ``user``, ``labels``, or what the automatic rule found most different beyond the
-    plane: ``subfields`` (no CA1, CA2 or CA3), ``core`` (no dentate gyrus) or ``cross-section``.
+    plane: ``subfields`` (no CA1, CA2 or CA3), ``core`` (no dentate gyrus) or ``cross-section``; or
+    ``last-slice``.
     """
 
     point: Float
@@ -58,6 +59,16 @@ class EndPlane(NamedTuple):
         """Describe the plane for the quality record."""
         point, normal = self.point.round(3).tolist(), self.normal.round(4).tolist()
         return {"point_ras_mm": point, "normal_ras": normal}
+
+    def moved(self, end: End, shift: float, points: Float) -> GivenEnd:
+        """Give the plane that lies ``shift`` mm anterior, by a place beside one of points (N, 3).
+
+        The point of an automatic plane may lie far from the body.
+        """
+        height = (points - self.point) @ self.normal
+        nearest = np.abs(height).argmin()
+        point = points[nearest] + (shift - height[nearest]) * self.normal
+        return GivenEnd(end=end, point=tuple(point.tolist()), normal=tuple(self.normal.tolist()))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -103,18 +114,21 @@ class EndPlanes:
         return float(np.mean(below - above))
 
 
+def hippocampal_voxels(volume: LabelVolume) -> Bool:
+    """Mark the voxels (I, J, K) of the hippocampus that have a place along its long axis."""
+    beside = (Tissue.FIMBRIA, Tissue.FISSURE, Tissue.CYST, Tissue.HATA)
+    labeled = (volume.tissue > 0) & (volume.tissue <= Tissue.HIPPOCAMPUS)
+    return np.asarray(labeled & ~np.isin(volume.tissue, beside))
+
+
 def find_end_planes(
     volume: LabelVolume, sheet: NDArray[np.uint8], settings: BodySettings
 ) -> EndPlanes:
     """Find the planes between tail and body, and between body and head."""
-    hippocampal = (
-        (volume.tissue > 0)
-        & (volume.tissue <= Tissue.HIPPOCAMPUS)
-        & ~np.isin(volume.tissue, (Tissue.FIMBRIA, Tissue.FISSURE, Tissue.CYST, Tissue.HATA))
-    )
+    hippocampal = hippocampal_voxels(volume)
     points = voxel_points(hippocampal, volume.affine)
     parts = _largest_ends(np.where(hippocampal, volume.part, Part.UNKNOWN))[hippocampal]
-    axis = _long_axis(points, parts)
+    axis = long_axis(points, parts)
     half_slice = 0.5 * float(np.abs(axis @ volume.affine[:3, :3]).sum())
 
     is_head, is_tail = parts == Part.HEAD, parts == Part.TAIL
@@ -230,7 +244,7 @@ def _checked(planes: dict[End, EndPlane], axis: Float, half_slice: float) -> End
     )
 
 
-def _long_axis(points: Float, parts: NDArray[np.uint8]) -> Float:
+def long_axis(points: Float, parts: NDArray[np.uint8]) -> Float:
     """Find the unit vector from tail to head.
 
     It joins the centers of the labeled head and tail. Otherwise it is the first principal axis,

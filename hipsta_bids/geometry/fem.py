@@ -2,10 +2,11 @@
 
 import math
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from copy import copy
 from functools import cached_property
 from typing import Any
+from warnings import catch_warnings, simplefilter
 
 import numpy as np
 from lapy import Solver, TetMesh, TriaMesh
@@ -22,6 +23,8 @@ _ITERATED_SIZE = 4000  # vertices of a volume from which on iterating is faster 
 _RESIDUAL = 1e-9  # of the right-hand side; it leaves errors of 1e-7 mm in the sheet
 DIRECTION_RESIDUAL = 1e-6  # for directions, which are averaged over many tetrahedra
 _MAX_STEPS = 1000  # bodies take 100 to 150
+_ROUGH = 1e-2  # of the stiffness times the function; it moves lines of zeros by 1e-4 mm
+_MAX_ROUGH_STEPS = 40  # similar operators take 7 to 9
 _GROUPS = 2.0  # times the root of the number of unknowns: a step's two levels cost about the same
 
 
@@ -55,9 +58,7 @@ class Laplace:
 
         Anisotropic diffusion as in Andreux et al. 2014 (ECCV workshops, LNCS 8928:299-312).
         """
-        fem = copy(self._fem)
-        fem.stiffness = _directed_stiffness(self._mesh, first, second, speeds)
-        return Laplace(self._mesh, self._solver, fem)
+        return Directed(self, first, second)(speeds)
 
     def solve(
         self, fixed: NDArray[np.integer], values: Float, residual: float = _RESIDUAL
@@ -112,37 +113,67 @@ class Laplace:
         flow: Float = compute_gradient(self._mesh, values)
         # LaPy 1.7 returns the negative gradient on tetrahedra; the true one rises along edges.
         start, stop = self.cells[:, 0], self.cells[:, 1]
-        rise = (flow * (self.points[stop] - self.points[start])).sum(axis=1)
-        return flow if rise @ (values[stop] - values[start]) >= 0 else -flow
+        edges, rise = self.points[stop] - self.points[start], values[stop] - values[start]
+        return flow if np.einsum("tk,tk,t->", flow, edges, rise) >= 0 else -flow
 
-    def eigenfunctions(
-        self, count: int, near: Float | None = None, residual: float = 1e-6
-    ) -> tuple[Float, Float]:
-        """Compute eigenvalues (count,) and eigenfunctions (V, count) above the constant, in order.
-
-        Functions ``near`` (V,) the first one save time, as does a larger ``residual``.
-        """
+    def eigenfunctions(self, count: int) -> tuple[Float, Float]:
+        """Compute eigenvalues (count,) and eigenfunctions (V, count) above the constant."""
         size, matrix, mass = len(self.points), self._fem.stiffness, self._fem.mass
-        shift = -1e-2 * float(matrix.trace() / mass.sum()) / size
-        # Any fixed vector: results repeat exactly.
-        start = np.cos(np.arange(size, dtype=np.float64)) if near is None else near + near.std()
+        start = np.cos(np.arange(size, dtype=np.float64))  # any fixed vector: results repeat
         with _solvable():
             if self._solver == "lapy":
-                values, functions = self._fem.eigs(count + 1, sigma=shift, v0=start)
+                values, functions = self._fem.eigs(count + 1, sigma=self._shift, v0=start)
                 return values[1:], functions[:, 1:]
-            solve = _factor(matrix - shift * mass).solve
-        values, functions = linalg.eigsh(
-            matrix,
-            k=count + 1,
-            M=mass,
-            sigma=shift,
-            OPinv=linalg.LinearOperator((size, size), matvec=solve, dtype=np.float64),
-            v0=start,
-            ncv=min(2 * count + 8, size),  # the default of 20 means twice as many solutions
-            tol=residual,
-        )
+            values, functions = linalg.eigsh(
+                matrix,
+                k=count + 1,
+                M=mass,
+                sigma=self._shift,
+                OPinv=self._inverse,
+                v0=start,
+                ncv=min(2 * count + 8, size),  # the default of 20 means twice as many solutions
+                tol=1e-6,
+            )
         order = np.argsort(values)[1:]
         return values[order], functions[:, order]
+
+    def first_near(self, values: Float, similar: "Laplace") -> Float:
+        """Compute the first eigenfunction (V,), roughly, from that of a similar operator.
+
+        The other one's factors take the place of its own (LOBPCG: Knyazev 2001, SIAM J Sci Comput
+        23:517-541).
+        """
+        matrix, mass = self._fem.stiffness, self._fem.mass
+        if self._solver != "lapy":
+            start = values / math.sqrt(values @ (mass @ values))
+            scale = float(start @ (matrix @ start) * np.linalg.norm(mass @ start))
+            with suppress(UserWarning), catch_warnings():
+                simplefilter("error")  # it warns if it does not converge
+                _, functions = linalg.lobpcg(
+                    matrix,
+                    start[:, None],
+                    B=mass,
+                    M=similar._inverse,  # noqa: SLF001 -- of the same class
+                    Y=np.ones((len(values), 1)),
+                    tol=_ROUGH * scale,
+                    maxiter=_MAX_ROUGH_STEPS,
+                    largest=False,
+                )
+                return np.asarray(functions[:, 0])
+        return np.asarray(self.eigenfunctions(1)[1][:, 0])
+
+    @property
+    def _shift(self) -> float:
+        """Where eigenvalues are sought, a little below zero."""
+        mean = float(self._fem.stiffness.trace() / self._fem.mass.sum())
+        return -1e-2 * mean / len(self.points)
+
+    @cached_property
+    def _inverse(self) -> linalg.LinearOperator:
+        """The inverse of the stiffness, shifted so that it has one."""
+        matrix = self._fem.stiffness - self._shift * self._fem.mass
+        solve = _factor(matrix).solve
+        return linalg.LinearOperator(matrix.shape, matvec=solve, matmat=solve, dtype=np.float64)
 
     def _rest(self, right: Float, free: Bool, residual: float) -> Float:
         """Solve for the free vertices; zero at the others."""
@@ -173,24 +204,43 @@ def bare_mesh(kind: type[Any], points: Float, cells: Int) -> Any:  # noqa: ANN40
     return mesh
 
 
-def _directed_stiffness(
-    mesh: TriaMesh, first: Float, second: Float, speeds: Float
-) -> sparse.csc_matrix:
-    """Compute the stiffness (V, V) of a diffusion that has two speeds in each triangle.
+class Directed:
+    """Operators on the same triangles, with two speeds of diffusion in each of them.
 
-    LaPy's constructor knows no other speeds than exponentials of curvature.
+    What does not depend on the speeds is made once. LaPy's constructor knows no other speeds than
+    exponentials of curvature.
     """
-    corners = mesh.v[mesh.t]
-    edges = np.roll(corners, -1, axis=1) - corners
-    along = (edges[:, :, None] * np.stack([first, second], axis=1)[:, None]).sum(axis=-1)
-    areas = 2 * np.linalg.norm(np.cross(edges[:, 1], edges[:, 2]), axis=1)  # four times the area
-    least = np.finfo(float).eps
-    areas[areas < least] = max(1e-4 * areas.mean(), least)
-    pairs = np.roll(along, -1, axis=1) * speeds[:, None] * np.roll(along, 1, axis=1)
-    sides = pairs.sum(axis=-1) / areas[:, None]
-    entries = np.column_stack([sides.repeat(2, axis=1), -sides - np.roll(sides, 1, axis=1)])
-    rows, columns = mesh.t[:, [0, 1, 1, 2, 2, 0, 0, 1, 2]], mesh.t[:, [1, 0, 2, 1, 0, 2, 0, 1, 2]]
-    return sparse.csc_matrix((entries.ravel(), (rows.ravel(), columns.ravel())))
+
+    def __init__(self, laplace: Laplace, first: Float, second: Float) -> None:
+        """Take directions (T, 3) of the two speeds."""
+        self._laplace = laplace
+        triangles, count = laplace.cells, len(laplace.points)
+        corners = laplace.points[triangles.T]
+        edges = np.roll(corners, -1, axis=0) - corners
+        along = np.stack([np.einsum("etk,tk->et", edges, way) for way in (first, second)], axis=-1)
+        areas = 2 * np.linalg.norm(np.cross(edges[1], edges[2]), axis=1)  # four times the area
+        least = np.finfo(float).eps
+        areas[areas < least] = max(1e-4 * areas.mean(), least)
+        self._shares = np.roll(along, -1, axis=0) * np.roll(along, 1, axis=0) / areas[:, None]
+        start, stop = triangles.T, np.roll(triangles.T, -1, axis=0)
+        code = np.minimum(start, stop).astype(np.int64) * count + np.maximum(start, stop)
+        code, edge = np.unique(code, return_inverse=True)
+        self._edge = edge.ravel()
+        low, high = np.divmod(code, count)
+        rows, columns = np.concatenate([low, high]), np.concatenate([high, low])
+        # Each entry holds the number of its edge.
+        numbers = np.tile(np.arange(len(code)), 2)
+        self._edges = sparse.csc_matrix((numbers, (rows, columns)), shape=(count, count))
+
+    def __call__(self, speeds: Float) -> Laplace:
+        """Make the operator with speeds (T, 2)."""
+        sides = np.einsum("etk,tk->et", self._shares, speeds)
+        links = self._edges.astype(np.float64)
+        weights = np.asarray(np.bincount(self._edge, sides.ravel()), dtype=np.float64)
+        links.data = weights[self._edges.data]
+        fem = copy(self._laplace._fem)  # noqa: SLF001 -- of this module
+        fem.stiffness = links - sparse.diags(np.asarray(links.sum(axis=0))[0], format="csc")
+        return Laplace(self._laplace._mesh, self._laplace._solver, fem)  # noqa: SLF001 -- likewise
 
 
 def _factor(matrix: sparse.csc_array) -> linalg.SuperLU:

@@ -9,15 +9,22 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from hipsta_bids.errors import GeometryError
+from hipsta_bids.geometry import digital
 from hipsta_bids.geometry.body import Body
 from hipsta_bids.geometry.completion import Index
 from hipsta_bids.geometry.outlines import SLIT_HALF_WIDTH, TOUCH_DISTANCE
 from hipsta_bids.geometry.slices import has_thick_slices, points_of_ends, sample_slices
 from hipsta_bids.settings import CheckSettings, GridSettings, SliceSettings
-from hipsta_bids.types import Bool, Float, LabelVolume
+from hipsta_bids.types import Bool, End, Float, LabelVolume
 
 #: Free space around the body, mm.
 GRID_MARGIN = 1.5
+#: How cross-sections change towards an end plane is taken from this depth behind it, mm, ...
+MOTION_REACH = 3.0
+#: ... of the mask smoothed by this SD, mm, and of half a voxel at least.
+MOTION_SD = 0.4
+#: A change of size or shape weighs against it this share of what it explains.
+MOTION_PRIOR = 0.02
 
 _MAX_REPEATS = 1.3
 """Median number of equal slices in a row, along two axes, of labels that were resampled: 1 in
@@ -157,16 +164,57 @@ def continued_nodes(grid: WedgeGrid, body: Body, depth: float) -> Float:
     """Where to read the labels of all nodes, (A, B, W, 3), RAS mm.
 
     Nodes less than ``depth``, mm, inside an end plane, and those beyond it, are moved to that depth
-    along the body: there it goes on as it is at the plane.
+    along the body: there it goes on as it does behind the plane. Its cross-sections move, and
+    change linearly: walls that lean against its direction would be read too thick without that.
     """
     points = grid.node_points()
     for end, outward in body.outward.items():
-        inside = body.ends.height(points, end)
-        slope = body.ends.height(outward, end) - body.ends.height(np.zeros(3), end)
-        missing = depth - inside * np.sign(-slope)
+        plane = body.ends[end]
+        slope = float(outward @ plane.normal)
+        missing = depth + (points - plane.point) @ plane.normal * np.sign(slope)
         short = missing > 0
-        points[short] -= (missing[short] / abs(slope))[:, None] * outward
+        depths, inward = missing[short], -outward / abs(slope)
+        center, change = _motion(body, end, inward)
+        moved = points[short] - center + depths[:, None] * inward
+        matrix = np.eye(3) - depths[:, None, None] * change
+        points[short] = center + np.linalg.solve(matrix, moved[..., None])[..., 0]
     return points
+
+
+def _motion(body: Body, end: End, inward: Float) -> tuple[Float, Float]:
+    """Fit how a cross-section changes behind an end plane: its center (3,), change (3, 3) per mm.
+
+    A point at x from the center moves by ``inward`` (3,) and by change @ x per mm of depth. Along
+    such motions the smoothed mask stays as it is, in the sense of least squares (optical flow;
+    Lucas and Kanade 1981, Proc. IJCAI, 674-679).
+    """
+    plane = body.ends[end]
+    normal = plane.normal * np.sign(plane.normal @ inward)
+    index, points = body.inside_points()
+    near = index[(points - plane.point) @ normal < MOTION_REACH]
+    around = digital.box(np.maximum(near.min(axis=0) - 4, 0), near.max(axis=0) + 5)
+    mask = body.tissue[around] > 0
+    places = digital.voxel_points(np.ones_like(mask), body.affine)
+    places += body.affine[:3, :3] @ digital.low_corner(around)
+    depth = (places - plane.point) @ normal
+    behind = (depth > 0).reshape(mask.shape).astype(np.float64)
+    sigma = np.maximum(MOTION_SD / np.linalg.norm(body.affine[:3, :3], axis=0), 0.5)
+    weight = ndimage.gaussian_filter(behind, sigma)
+    smooth = ndimage.gaussian_filter(behind * mask, sigma) / np.maximum(weight, 1e-6)
+    slopes = np.stack([*np.gradient(smooth)], axis=-1).reshape(-1, 3)
+    slopes = slopes @ np.linalg.inv(body.affine[:3, :3])
+    edge = (depth > body.ends.half_slice) & (depth < MOTION_REACH) & (slopes != 0).any(axis=1)
+    slopes, depth, places = slopes[edge], depth[edge], places[edge]
+    weight = MOTION_REACH - depth
+    flat = places - depth[:, None] * inward  # moved back to the plane
+    center = np.average(flat, axis=0, weights=weight * np.linalg.norm(slopes, axis=1))
+    across = np.linalg.svd(normal[None])[2][1:]
+    step, offset = slopes @ across.T, (flat - center) @ across.T
+    columns = np.column_stack([step, (step[:, :, None] * offset[:, None]).reshape(-1, 4)])
+    matrix = columns.T @ (weight[:, None] * columns)
+    matrix[2:, 2:] += MOTION_PRIOR * np.trace(matrix[2:, 2:]) / 4 * np.eye(4)
+    solution = np.linalg.solve(matrix, columns.T @ (weight * -(slopes @ inward)))
+    return center, across.T @ solution[2:].reshape(2, 2) @ across
 
 
 def _nodes_in(voxels: Index, body: Body, points: Float, shape: tuple[int, int, int]) -> Bool | None:

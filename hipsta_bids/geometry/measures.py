@@ -6,6 +6,7 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter
 
 from hipsta_bids.geometry.body import Body
 from hipsta_bids.geometry.mesh import tetra_volumes
@@ -132,6 +133,18 @@ def node_shares(cells: Float) -> Float:
         for y in (slice(None, -1), slice(1, None)):
             shares[x, y] += cells / 4
     return shares
+
+
+def pool_sd(sd: Float, window: int) -> Float:
+    """Average variances of maps (..., Nx, Ny) over ``window`` nodes along x and y, as SD."""
+    finite = np.isfinite(sd)
+    size = (1,) * (sd.ndim - 2) + (window, window)
+    total, count = (
+        uniform_filter(values, size, mode="nearest")
+        for values in (np.where(finite, sd, 0.0) ** 2, finite.astype(np.float64))
+    )
+    mean = np.maximum(total, 0.0) / np.where(finite, count, 1.0)
+    return np.where(finite, np.sqrt(mean), np.nan)
 
 
 def _principal_curvatures(

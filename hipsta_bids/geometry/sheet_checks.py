@@ -19,11 +19,13 @@ ROW_DIP_REACH = 8.0
 EDGE_REACH = (2.5, 3.5, 5.0)
 #: Thickness is compared with that at these distances along the axis on both sides, mm.
 RIDGE_REACH = (1.0, 2.0, 3.0)
-#: Number of neighboring columns over which thickness is averaged before ridges are sought.
-RIDGE_COLUMNS = 9
+#: Width over which thickness is averaged before ridges are sought, mm.
+RIDGE_WIDTH = 4.0
+#: The way into the sheet goes from an edge to the columns at this distance from it, mm.
+INWARD = 2.5
 
-_INWARD = 7
-"""The way into the sheet goes from an edge to this part of the columns beside it."""
+#: A column is moved by a second choice if its thickness differs by more, mm.
+RIVAL_OFF = 0.3
 
 _LEAST_WIDTH = 1.0
 """mm of a subfield that rows may lack: less does not move the other columns."""
@@ -62,8 +64,8 @@ def check_edges(whole: Sheet, settings: CheckSettings) -> list[Finding]:
     move the columns of their rows. ``whole`` goes from edge to edge.
     """
     middle = whole.points[:, :, whole.middle]
-    step, count = _row_step(middle), middle.shape[1]
-    inner = max(middle.shape[0] // _INWARD, 1)
+    step, count = _step(middle, axis=1), middle.shape[1]
+    inner = min(max(round(INWARD / _step(middle, axis=0)), 1), middle.shape[0] - 1)
     findings = []
     for name, edge, beside in (("medial", 0, inner), ("lateral", -1, -1 - inner)):
         outline, inward = middle[edge], middle[beside] - middle[edge]
@@ -104,7 +106,7 @@ def check_subfields(
     missing, the other columns hardly move.
     """
     middle = sheet.points[:, :, sheet.middle]
-    step, lengths = _row_step(middle), np.linalg.norm(np.gradient(middle, axis=0), axis=-1)
+    step, lengths = _step(middle, axis=1), np.linalg.norm(np.gradient(middle, axis=0), axis=-1)
     gaps = [(0.0, Tissue.BACKGROUND, 0, 0, 0)]
     for edge in (0, -1):
         for tissue in map(Tissue, np.unique(subfield[edge]).tolist()):
@@ -144,9 +146,10 @@ def check_ridges(sheet: Sheet, thickness: Float, settings: CheckSettings) -> lis
         ("thickness-ridge", 1, settings.flag_ridge, "thicker"),
         ("thickness-groove", -1, settings.flag_groove, "thinner"),
     ):
-        bands = _bands(sign * thickness, limits, _row_step(middle))
+        columns = max(round(RIDGE_WIDTH / _step(middle, axis=0)), 1)
+        bands = _bands(sign * thickness, limits, _step(middle, axis=1), columns)
         excess, size, (column, row) = max(bands, default=(0.0, 0.0, (0, 0)))
-        half = RIDGE_COLUMNS // 2
+        half = columns // 2
         findings.append(
             Finding(
                 reason=reason,
@@ -162,7 +165,7 @@ def check_ridges(sheet: Sheet, thickness: Float, settings: CheckSettings) -> lis
 
 
 def _bands(
-    thickness: Float, limits: tuple[float, ...], step: float
+    thickness: Float, limits: tuple[float, ...], step: float, columns: int
 ) -> Iterator[tuple[float, float, tuple[int, int]]]:
     """Thickest band at each distance: times the limit, mm above both sides, and column."""
     for reach, limit in zip(RIDGE_REACH, limits, strict=True):
@@ -171,22 +174,44 @@ def _bands(
             continue
         sides = np.maximum(thickness[:, : -2 * k], thickness[:, 2 * k :])
         above = np.nan_to_num(thickness[:, k:-k] - sides)
-        band = ndimage.uniform_filter1d(above, RIDGE_COLUMNS, axis=0)
+        band = ndimage.uniform_filter1d(above, columns, axis=0)
         at = np.unravel_index(band.argmax(), band.shape)
         size = max(float(band[at]), 0.0)
         yield size / limit, size, (int(at[0]), int(at[1]) + k)
 
 
-def _row_step(middle: Float) -> float:
-    """Distance of neighboring rows of the mid-surface (Nx, Ny, 3), mm."""
-    return float(np.nanmedian(np.linalg.norm(np.diff(middle, axis=1), axis=-1)))
+def _step(middle: Float, axis: int) -> float:
+    """Median distance of neighboring nodes of the mid-surface (Nx, Ny, 3) along an axis, mm."""
+    return float(np.nanmedian(np.linalg.norm(np.diff(middle, axis=axis), axis=-1)))
 
 
 def _wider(lengths: Float, middle: Float, reach: float) -> Float:
     """Width (Ny,) that rows within ``reach`` mm attain on both sides of each row."""
     rows = np.arange(len(lengths))
     offset = rows[None, :] - rows[:, None]
-    near = np.abs(offset) <= max(round(reach / _row_step(middle)), 1)
+    near = np.abs(offset) <= max(round(reach / _step(middle, axis=1)), 1)
     before = np.where(near & (offset <= 0), lengths, -np.inf).max(axis=1)
     after = np.where(near & (offset >= 0), lengths, -np.inf).max(axis=1)
     return np.asarray(np.minimum(before, after))
+
+
+def check_rival(thickness: Float, choice: str, rival: Float, settings: CheckSettings) -> Finding:
+    """Flag a map (Nx, Ny), mm, that a second choice, as likely as the first, moves by much."""
+    difference = rival - thickness
+    moved = np.abs(difference) > RIVAL_OFF
+    rms = rms_difference(rival, thickness)
+    return Finding(
+        reason="second-choice",
+        value=rms,
+        limit=settings.flag_rival,
+        text=f"another {choice} is as likely and moves the map by {rms:.2f} mm (RMS), "
+        f"{moved.mean():.0%} of the columns by more than {RIVAL_OFF:g} mm",
+        remedy="look at the labels there",
+        share=float(moved.mean()),
+        change=float(np.nanmean(difference)),
+    )
+
+
+def rms_difference(first: Float, second: Float) -> float:
+    """Compute the root mean square of the difference of two maps, where both have values."""
+    return float(np.sqrt(np.nanmean((first - second) ** 2)))

@@ -15,7 +15,7 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from hipsta_bids.errors import GeometryError
-from hipsta_bids.geometry import digital
+from hipsta_bids.geometry import digital, membranes
 from hipsta_bids.geometry.grid import Field
 from hipsta_bids.settings import MeasureSettings, TopologySettings
 from hipsta_bids.types import Bool, Float, Sheet, position_text
@@ -34,7 +34,7 @@ Contact = Callable[[Float], bool]
 class Repair:
     """One change of the body's shape."""
 
-    kind: digital.Kind
+    kind: membranes.Kind
     """``part`` turns that touch, fill a ``slit`` of the labels, ``cut`` a bridge, ``fill`` a hole,
     remove an ``island``, fill a ``cavity``, leave out the ``uncus``."""
     voxels: int
@@ -88,6 +88,8 @@ class SolidField:
     """Euler number after the repairs; 1."""
     changed_fraction: float
     """Changed nodes over the nodes of the body."""
+    rival: Field | None = None
+    """Field before all repairs, with the second choices made that are as likely, if any."""
 
 
 def repair_topology(
@@ -111,24 +113,24 @@ def repair_topology(
             "use a finer segmentation",
             reason="sheet-too-thin",
         )
-    state = np.pad(before, digital.PAD)
-    euler_before = digital.euler(state)
-    padded = np.pad(values, digital.PAD, constant_values=-1.0)
+    state = np.pad(before, membranes.PAD)
+    euler_before = membranes.euler(state)
+    padded = np.pad(values, membranes.PAD, constant_values=-1.0)
     lifted = padded.copy()
     _refuse_strips(state, field, settings, locate)
 
     def touching(nodes: digital.Index) -> bool:
-        return contact(field.grid.to_ras((nodes - digital.FIRST).astype(float)))
+        return contact(field.grid.to_ras((nodes - membranes.FIRST).astype(float)))
 
     edits = _before_smoothing(field)
     edits += _remove_islands(state, field, locate) + _fill_cavities(state)
     for _ in range(settings.rounds):
-        wrong = [plates for plates in (False, True) if digital.euler(state, plates=plates) != 1]
+        wrong = [plates for plates in (False, True) if membranes.euler(state, plates=plates) != 1]
         if not wrong:
             break
         # Pits only once the body itself is sound: the inside of a closed tube is none.
         pits = _fill_cavities(state, plates=True) if wrong[0] else []
-        proposals = pits or digital.apply_membranes(
+        proposals = pits or membranes.apply_membranes(
             state, padded, lifted, settings, plates=wrong[0], contact=touching
         )
         edits += proposals
@@ -137,7 +139,7 @@ def repair_topology(
         edits += _remove_islands(state, field, locate) + _fill_cavities(state)
     else:
         raise _unrepaired(edits, state, field, locate)
-    after = state[digital.INNER]
+    after = state[membranes.INNER]
     size = int(np.count_nonzero(before))
     changed, touched = _changes(field, after, edits)
     repairs = tuple(
@@ -148,30 +150,42 @@ def repair_topology(
     return SolidField(
         field=replace(
             field,
-            values=_consistent_values(lifted[digital.INNER], after),
+            values=_consistent_values(lifted[membranes.INNER], after),
             separated=None,
             slits=None,
         ),
         repairs=repairs,
         touched=touched,
         euler_before=euler_before,
-        euler_after=digital.euler(state),
+        euler_after=membranes.euler(state),
         changed_fraction=float(np.count_nonzero(changed) / size),
+        rival=_second_choices(field, edits),
     )
 
 
-def _between_planes(edit: digital.Edit, field: Field) -> Bool:
+def _second_choices(field: Field, edits: Sequence[membranes.Edit]) -> Field | None:
+    """Cut where holes were filled, and fill where bridges were cut, if that was as likely."""
+    values = field.values.copy()
+    for edit in edits:
+        if edit.rival is not None:
+            nodes = edit.rival - membranes.FIRST
+            nodes = nodes[((nodes >= 0) & (nodes < values.shape)).all(axis=1)]
+            values[tuple(nodes.T)] = -0.1 if edit.kind == "fill" else 0.1
+    return None if np.array_equal(values, field.values) else replace(field, values=values)
+
+
+def _between_planes(edit: membranes.Edit, field: Field) -> Bool:
     """Which nodes (N,) of a change lie between the end planes."""
-    level = (edit.nodes - digital.FIRST)[:, 2]
+    level = (edit.nodes - membranes.FIRST)[:, 2]
     return np.asarray((level >= field.beyond) & (level < field.grid.shape[2] - field.beyond))
 
 
-def _changes(field: Field, after: Bool, edits: Sequence[digital.Edit]) -> tuple[Bool, Bool]:
+def _changes(field: Field, after: Bool, edits: Sequence[membranes.Edit]) -> tuple[Bool, Bool]:
     """Nodes that repairs of the sheet changed, and all for which columns of the map are marked."""
     changed = after != (field.values > 0)
     for edit in edits:
         if edit.kind == "uncus":  # no part of the sheet
-            changed[tuple((edit.nodes - digital.FIRST).T)] = False
+            changed[tuple((edit.nodes - membranes.FIRST).T)] = False
     if field.slits is not None:
         changed |= field.slits
     touched = changed.copy()
@@ -181,12 +195,12 @@ def _changes(field: Field, after: Bool, edits: Sequence[digital.Edit]) -> tuple[
     return changed, touched
 
 
-def _before_smoothing(field: Field) -> list[digital.Edit]:
+def _before_smoothing(field: Field) -> list[membranes.Edit]:
     """List what was removed between turns that touch, and what was filled, before smoothing."""
     edits = []
     if field.separated is not None and field.separated.any():
-        edits.append(digital.Edit("part", digital.positions(field.separated) + digital.FIRST))
-    kinds: tuple[tuple[digital.Kind, Bool | None], ...] = (
+        edits.append(membranes.Edit("part", digital.positions(field.separated) + membranes.FIRST))
+    kinds: tuple[tuple[membranes.Kind, Bool | None], ...] = (
         ("slit", field.slits),
         ("cavity", field.cavities),
     )
@@ -194,7 +208,7 @@ def _before_smoothing(field: Field) -> list[digital.Edit]:
         if nodes is not None:
             pieces, count = ndimage.label(nodes, structure=digital.CUBE)
             edits += [
-                digital.Edit(kind, digital.positions(pieces == n + 1) + digital.FIRST)
+                membranes.Edit(kind, digital.positions(pieces == n + 1) + membranes.FIRST)
                 for n in range(count)
             ]
     return edits
@@ -205,7 +219,7 @@ def _through_pieces(state: Bool) -> tuple[NDArray[Any], int, NDArray[Any]]:
 
     The plates are left out, or a fragment that touches one of them would count as connected.
     """
-    pieces, count = ndimage.label(state[digital.INNER], structure=digital.FACES)
+    pieces, count = ndimage.label(state[membranes.INNER], structure=digital.FACES)
     through = np.intersect1d(pieces[:, :, 0], pieces[:, :, -1])
     through = through[through > 0]
     sizes = np.bincount(pieces.ravel(), minlength=count + 1)[through]
@@ -240,17 +254,17 @@ def _refuse_strips(state: Bool, field: Field, settings: TopologySettings, locate
 
 
 def _unrepaired(
-    edits: list[digital.Edit], state: Bool, field: Field, locate: Locate
+    edits: list[membranes.Edit], state: Bool, field: Field, locate: Locate
 ) -> GeometryError:
     """Report the largest of the repairs that did not lead to one solid piece."""
-    fallback = digital.Edit("cut", digital.positions(state))
+    fallback = membranes.Edit("cut", digital.positions(state))
     nodes = max(edits, key=lambda edit: len(edit.nodes), default=fallback).nodes
-    point = field.grid.to_ras((nodes - digital.FIRST).mean(axis=0, keepdims=True))
+    point = field.grid.to_ras((nodes - membranes.FIRST).mean(axis=0, keepdims=True))
     at = position_text(point[0], locate(point))
     return GeometryError(
-        f"the labels have holes or bridges that could not be repaired (Euler number "
-        f"{digital.euler(state)}, with closed ends {digital.euler(state, plates=True)}, instead of "
-        f"1), the largest near {at}: correct the labels there by hand",
+        "the labels have holes or bridges that could not be repaired (Euler number "
+        f"{membranes.euler(state)}, with closed ends {membranes.euler(state, plates=True)}, "
+        f"instead of 1), the largest near {at}: correct the labels there by hand",
         reason="topology",
     )
 
@@ -270,7 +284,7 @@ def _interrupted(pieces: digital.Index, field: Field, locate: Locate) -> Geometr
     )
 
 
-def _remove_islands(state: Bool, field: Field, locate: Locate) -> list[digital.Edit]:
+def _remove_islands(state: Bool, field: Field, locate: Locate) -> list[membranes.Edit]:
     """Remove (in place) all but the largest piece that reaches from plate to plate."""
     pieces, count, through = _through_pieces(state)
     if not len(through):
@@ -278,11 +292,11 @@ def _remove_islands(state: Bool, field: Field, locate: Locate) -> list[digital.E
     if count == 1:
         return []
     main = pieces == through[0]
-    state[digital.INNER] &= main
+    state[membranes.INNER] &= main
     return [
-        digital.Edit(
+        membranes.Edit(
             "uncus" if _is_uncus(piece, main) else "island",
-            digital.positions(piece) + digital.FIRST,
+            digital.positions(piece) + membranes.FIRST,
         )
         for piece in (pieces == n for n in range(1, count + 1) if n != through[0])
     ]
@@ -298,29 +312,29 @@ def _is_uncus(piece: Bool, main: Bool) -> bool:
     return bool(medial < digital.positions(main[:, :, levels[0] :])[:, 0].mean())
 
 
-def _fill_cavities(state: Bool, *, plates: bool = False) -> list[digital.Edit]:
+def _fill_cavities(state: Bool, *, plates: bool = False) -> list[membranes.Edit]:
     """Fill (in place) background that does not reach the border, or with plates that cannot."""
-    solid = digital.with_plates(state, True) if plates else state
+    solid = membranes.with_plates(state, True) if plates else state
     pieces, count = ndimage.label(~solid, structure=digital.CUBE)
     if count == 1:
         return []
     outside = int(pieces[0, 0, 0])
     state |= (pieces > 0) & (pieces != outside)
     return [
-        digital.Edit("cavity", digital.positions(pieces == n))
+        membranes.Edit("cavity", digital.positions(pieces == n))
         for n in range(1, count + 1)
         if n != outside
     ]
 
 
 def _describe(
-    edit: digital.Edit, field: Field, size: int, settings: TopologySettings, locate: Locate
+    edit: membranes.Edit, field: Field, size: int, settings: TopologySettings, locate: Locate
 ) -> Repair:
     """Locate one change, and find out whether it is large."""
     kind, nodes = edit.kind, edit.nodes
-    points = field.grid.to_ras((nodes - digital.FIRST).astype(np.float64))
+    points = field.grid.to_ras((nodes - membranes.FIRST).astype(np.float64))
     center = points.mean(axis=0)
-    inside = np.clip(nodes - digital.FIRST, 0, np.array(field.grid.shape) - 1)
+    inside = np.clip(nodes - membranes.FIRST, 0, np.array(field.grid.shape) - 1)
     cost = edit.cost or float(np.abs(field.values[tuple(inside.T)]).sum())
     share = settings.flag_part if kind == "part" else settings.flag_fraction
     limit = {"cut": settings.flag_cut_cost, "fill": settings.flag_fill_cost}.get(kind, np.inf)

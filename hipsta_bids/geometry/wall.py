@@ -9,7 +9,7 @@ from scipy import sparse
 from scipy.spatial import cKDTree
 
 from hipsta_bids.geometry import mesh
-from hipsta_bids.geometry.fem import Laplace, bare_mesh
+from hipsta_bids.geometry.fem import Directed, Laplace, bare_mesh
 from hipsta_bids.settings import BoundarySettings
 from hipsta_bids.types import Bool, Float, Int, Surface
 
@@ -72,9 +72,11 @@ class Wall:
         self.areas = mesh.triangle_areas(self.vertices, self.triangles)
         self.vertex_areas = mesh.vertex_areas(self.vertices, self.triangles)
         plain = bare_mesh(TriaMesh, self.vertices, self.triangles)
-        self._laplace = Laplace(plain, settings.solver)
+        laplace = Laplace(plain, settings.solver)
         curved = _Mesh(self.vertices, self.triangles)
-        self._across, self._along, least, _ = curved.curvature_tria(CURVATURE_SMOOTHING)
+        across, along, least, largest = curved.curvature_tria(CURVATURE_SMOOTHING)
+        self._curvature = np.abs(np.stack([largest, least], axis=1))
+        self._directed = Directed(laplace, across, along)
         self._bend = -least / (LAPY_CURVATURE * float(self.lengths.mean()))
         self.evenly_aware = self.operator(settings, LEAST_DIFFUSION)
 
@@ -88,10 +90,13 @@ class Wall:
         divided by that and a factor (see the settings). On outward triangles it is negative where
         the surface is convex.
         """
+        if settings.operator == "published" and not least:
+            speeds = np.exp(-settings.anisotropy * self._curvature)
+            return self._directed(speeds)
         excess = np.maximum(self._bend - settings.sharp_bend, 0)
         slowed = np.maximum(np.exp(-settings.anisotropy * excess), least)
         speeds = np.stack([np.ones_like(slowed), slowed], axis=1)
-        return self._laplace.directed(self._across, self._along, speeds)
+        return self._directed(speeds)
 
     def distance(self, curve: Float, reach: float) -> Float:
         """Compute distances (V,) from the nearest of a curve's points (N, 3), up to ``reach``, mm.
@@ -121,7 +126,9 @@ class Wall:
     def connected(self, part: Bool, seed: Bool) -> Bool:
         """Vertices of a part of the wall that are connected within it to one of the seeds."""
         piece = self._pieces(part)
-        return np.asarray(part & np.isin(piece, piece[seed]))
+        reached = np.zeros(len(piece), dtype=bool)
+        reached[piece[seed]] = True
+        return np.asarray(part & reached[piece])
 
     def _pieces(self, where: Bool) -> NDArray[np.int32]:
         """Piece number of each vertex if only edges between vertices of a set connect."""

@@ -343,10 +343,7 @@ _LONGEST = 300
 def read_foreign(path: Path, kind: type[Table], *, max_bytes: float) -> Table:
     """Read a JSON file of other people, which may hold anything; nothing in it is run.
 
-    Raises
-    ------
-    ValueError
-        One line about what is wrong in it, or that it has more bytes than ``max_bytes``.
+    What is wrong in it, or that it has more than ``max_bytes``, is a ValueError of one line.
     """
     if path.is_file() and path.stat().st_size > max_bytes:
         raise ValueError(f"larger than {max_bytes / 1e6:g} MB")

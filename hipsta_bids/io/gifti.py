@@ -1,4 +1,4 @@
-"""Surfaces and maps on them as GIFTI and CIFTI-2, which Workbench and nibabel load.
+"""Surfaces and maps on them as GIFTI and CIFTI-2, and meshes in formats of other programs.
 
 Structure names are those of Connectome Workbench's ``StructureEnum``, which knows
 ``HippocampusLeft`` and ``HippocampusRight``; the metadata keys are those of the GIFTI 1.0
@@ -6,9 +6,13 @@ specification (Harwell et al. 2011) and of Workbench. CIFTI-2 calls them
 ``CIFTI_STRUCTURE_HIPPOCAMPUS_LEFT`` and ``_RIGHT``. HippUnfold's own CIFTI files are made by
 Workbench from a left and a right map, which makes their structures those of the cortex; both are
 read.
+
+VTU, VTK, PLY and OBJ are meshio's, which is slow to load, seldom needed, and writes to paths only.
 """
 
+import importlib
 import struct
+import tempfile
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -32,14 +36,20 @@ from nibabel.gifti.gifti import (
 from nibabel.spatialimages import HeaderDataError
 from numpy.typing import ArrayLike, NDArray
 
-from hipsta_bids.errors import InputError
+from hipsta_bids.errors import InputError, UsageError
 from hipsta_bids.io import files
 from hipsta_bids.io.files import entities
 from hipsta_bids.opening import open_regular
-from hipsta_bids.types import Float, Int, Mesh
+from hipsta_bids.types import Coordinates, Float, Int, Mesh, TetMesh
 
 #: Ending of the names of CIFTI files with one number per vertex.
 DENSE_SCALARS = ".dscalar.nii"
+
+#: Endings of surfaces that meshio reads and writes.
+ENDINGS = (".vtk", ".ply", ".obj")
+
+#: Names of the harmonic coordinates as point data of the tetrahedral mesh, in their order.
+COORDINATE_NAMES = ("medial_lateral", "posterior_anterior", "interior_exterior")
 
 _PRIMARY = "AnatomicalStructurePrimary"
 _STRUCTURE = {"L": "HippocampusLeft", "R": "HippocampusRight"}
@@ -308,3 +318,54 @@ def _load(path: Path, kind: type[Image]) -> Image:
             " .tsv files"
         )
     return image
+
+
+def mesh_bytes(mesh: TetMesh, coordinates: Coordinates) -> bytes:
+    """Encode a tetrahedral mesh and its coordinates as VTU (XML with compressed binary data)."""
+    values = zip(COORDINATE_NAMES, coordinates.values.T, strict=True)
+    data = {name: column.copy() for name, column in values}
+    return _by_meshio("vtu", mesh.vertices, ("tetra", mesh.tetrahedra), data)
+
+
+def write_surface(path: Path, mesh: Mesh, maps: Mapping[str, Float]) -> None:
+    """Write a surface as VTK, PLY or OBJ, with one number per vertex of each map; OBJ has no maps.
+
+    Vertices without a position are put at the mean of the others, and no triangle has them.
+    """
+    if path.suffix not in ENDINGS:
+        raise UsageError(f"{path.name}: surfaces end with {', '.join(ENDINGS)}")
+    present_points = np.asarray(np.isfinite(mesh.points).all(axis=1), dtype=np.bool_)
+    points = np.where(
+        present_points[:, None], mesh.points, mesh.points[present_points].mean(axis=0)
+    )
+    faces = mesh.triangles[present_points[mesh.triangles].all(axis=1)]
+    data = {} if path.suffix == ".obj" else {name: np.ravel(maps[name]) for name in maps}
+    files.write_bytes(path, _by_meshio(path.suffix[1:], points, ("triangle", faces), data))
+
+
+def read_surface(path: Path) -> Mesh:
+    """Read a surface: VTK, PLY, OBJ, or else GIFTI."""
+    if path.suffix not in ENDINGS:
+        return read_mesh(path)
+    try:  # meshio.read ends the process where a file is damaged
+        open_regular(path).close()
+        mesh = importlib.import_module(f"meshio.{path.suffix[1:]}").read(path)
+        points, triangles = mesh.points, mesh.get_cells_type("triangle")
+    except Exception as error:  # of any kind: meshio checks little
+        raise InputError(
+            f"{path}: not readable as {path.suffix[1:].upper()}; write it again"
+        ) from error
+    if not len(triangles):
+        raise InputError(f"{path}: has no triangles; write it again")
+    return checked_mesh(path, points, triangles)
+
+
+def _by_meshio(
+    kind: str, points: Float, cells: tuple[str, Any], data: Mapping[str, Float]
+) -> bytes:
+    import meshio  # noqa: PLC0415
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"mesh.{kind}"
+        meshio.write(path, meshio.Mesh(points, [cells], point_data=dict(data)), file_format=kind)
+        return path.read_bytes()

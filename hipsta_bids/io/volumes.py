@@ -147,8 +147,7 @@ def read_labels(path: Path, margin: float = 0.0, part: Box | None = None) -> Lab
     """
     with _opened(path) as image:
         shape = _label_shape(image, path)
-        affine = np.asarray(image.affine, dtype=np.float64)
-        _check_affine(image, affine, path, VOXEL_SIZES)
+        affine = _checked_affine(image, path, VOXEL_SIZES)
         first = None
         if part is None:
             part, first = _labeled_part(image, shape, margin, affine)
@@ -268,17 +267,14 @@ def read_grid(path: Path) -> tuple[tuple[int, int, int], Float]:
     with _opened(path) as image:
         _check_scalar(image, path)
         shape = _three_axes(image, path, "an anatomical image is")
-        affine: Float = np.asarray(image.affine, dtype=np.float64)
-        _check_affine(image, affine, path, VOXEL_SIZES)
-    return shape, affine
+        return shape, _checked_affine(image, path, VOXEL_SIZES)
 
 
 def read_scalars(path: Path, points: Float) -> ScalarVolume:
     """Read the part of an image around some points, (..., 3) RAS mm."""
     with _opened(path) as image:
         _check_scalar(image, path)
-        affine: Float = np.asarray(image.affine, dtype=np.float64)
-        _check_affine(image, affine, path, MAP_VOXEL_SIZES)
+        affine = _checked_affine(image, path, MAP_VOXEL_SIZES)
         shape = tuple(int(n) for n in image.shape)
         part = _part_around(affine, points, shape)
         _check_fits(
@@ -372,12 +368,9 @@ def _part_around(affine: Float, points: Float, shape: tuple[int, ...]) -> Box:
     return box(low, high)
 
 
-def _check_affine(
-    image: Any,  # noqa: ANN401 (nibabel's classes are untyped)
-    affine: Float,
-    path: Path,
-    limits: tuple[float, float],
-) -> None:
+def _checked_affine(image: Any, path: Path, limits: tuple[float, float]) -> Float:  # noqa: ANN401 (nibabel's classes are untyped)
+    """Return the affine, voxel index to RAS mm; refuse one that cannot be right."""
+    affine: Float = np.asarray(image.affine, dtype=np.float64)
     linear = affine[:3, :3]
     no_orientation = isinstance(image, nib.Nifti1Pair) and not (
         int(image.header["sform_code"]) or int(image.header["qform_code"])
@@ -416,6 +409,7 @@ def _check_affine(
                 " pixdim, and all lengths follow from them; set right the one that is wrong",
                 reason="bad-affine",
             )
+    return affine
 
 
 def _times(sizes: Float) -> str:

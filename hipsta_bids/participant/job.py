@@ -7,8 +7,8 @@ import resource
 import sys
 import time
 import traceback
-from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,9 +20,9 @@ from hipsta_bids.derivatives import hemisphere
 from hipsta_bids.derivatives.dataset import source_address
 from hipsta_bids.derivatives.hemisphere import ResultPlace, read_record
 from hipsta_bids.errors import GeometryError, HipstaError, InputError, OutputError, ProtocolError
+from hipsta_bids.geometry.sampling import Regions
 from hipsta_bids.inputs.scan import HemisphereInput
 from hipsta_bids.io import files
-from hipsta_bids.io.files import locked
 from hipsta_bids.participant.maps import (
     Mapped,
     add_signals,
@@ -139,6 +139,7 @@ def base_record(job: Job) -> dict[str, Any]:
         | ({"normal_ras": end.normal} if end.normal else {})
         for end in item.ends
     ]
+    published = job.settings.as_published()
     return {
         "version": __version__,
         "settings_hash": job.settings_hash,
@@ -158,6 +159,7 @@ def base_record(job: Job) -> dict[str, Any]:
         ],
         "notes": item.notes,
         **({"given_ends": given_ends} if given_ends else {}),
+        **({"as_published": published} if published else {}),
     }
 
 
@@ -265,13 +267,26 @@ def warm_up() -> None:
     import hipsta_bids.participant.measure  # noqa: F401, PLC0415
 
 
+def check_item(item: HemisphereInput, settings: Settings) -> list[str]:
+    """Read and check the labels of a hemisphere without measuring it; list what is wrong."""
+    from hipsta_bids.geometry.label_checks import check_label_image  # noqa: PLC0415  (heavy)
+    from hipsta_bids.inputs.labels import read_label_volume  # noqa: PLC0415  (heavy)
+
+    try:
+        volume = read_label_volume(item, settings.body.region)
+        findings = check_label_image(volume, item.hemi, settings.checks)
+    except HipstaError as error:
+        return [f"will be refused: {error}"]
+    return [f"will be flagged: {f.text}: {f.remedy}" for f in findings if f.raised]
+
+
 def run_job(job: Job) -> Outcome:
     """Measure one hemisphere and write its results; never raises a foreseen error.
 
     If another run is doing the same, its results are awaited and taken.
     """
     try:
-        with locked(job.result.root, job.title):
+        with files.locked(job.result.root, job.title):
             return finished(job) or _measure(job)
     except OutputError as error:
         return fail(job, error)
@@ -294,11 +309,14 @@ def _measure(job: Job) -> Outcome:
             edges = np.linalg.norm(volume.affine[:3, :3], axis=0)
             record["provenance"]["voxel_size"] = " x ".join(f"{edge:.3g}" for edge in edges)
         maps = measure_hemisphere(volume, job.item.hemi, job.settings, clock)
-        mapped = Mapped()
+        mapped: list[Mapped] = []
+        regions = None
         if job.item.maps or job.item.regions:
             with clock("maps"):
-                maps, mapped = add_signals(job.item, maps, job.settings.maps, dict(job.sources))
-                record |= mapped.record
+                maps, mapped, regions, entries = add_signals(
+                    job.item, maps, job.settings.maps, dict(job.sources)
+                )
+                record |= entries
         spread = None
         if job.copies:
             from hipsta_bids.participant import uncertainty  # noqa: PLC0415  (heavy)
@@ -307,7 +325,7 @@ def _measure(job: Job) -> Outcome:
                 spread = uncertainty.estimate_uncertainty(
                     volume, job.item.hemi, job.settings, job.copies
                 )
-                maps = replace(maps, qc={**maps.qc, **spread.metrics})
+                maps = uncertainty.add_uncertainty(maps, spread)
                 record["notes"] = [*record["notes"], *spread.notes]
         with clock("write"):
             hemisphere.write_results(
@@ -316,7 +334,7 @@ def _measure(job: Job) -> Outcome:
                 for_region(job.item.protocol, job.settings.body.region),
                 record,
                 write_meshes=job.write_meshes,
-                write_more=lambda: _write_more(job.result, maps, mapped, spread),
+                write_more=lambda: _write_more(job.result, maps, mapped, regions, spread),
             )
     except Exception as error:  # noqa: BLE001  (one hemisphere's bug must not end the others)
         explained = _explain(error, job.result.root)
@@ -338,10 +356,14 @@ def _measure(job: Job) -> Outcome:
 
 
 def _write_more(
-    result: ResultPlace, maps: HemisphereMaps, mapped: Mapped, spread: "Uncertainty | None"
+    result: ResultPlace,
+    maps: HemisphereMaps,
+    mapped: Sequence[Mapped],
+    regions: Regions | None,
+    spread: "Uncertainty | None",
 ) -> None:
     """Write what options asked for."""
-    write_signals(result, maps, mapped)
+    write_signals(result, maps, mapped, regions)
     for name in maps.maps.keys() & {"distortion", "proximodistal"}:
         from hipsta_bids.io import gifti  # noqa: PLC0415  (workers only)
 

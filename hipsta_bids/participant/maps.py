@@ -4,14 +4,14 @@ Nothing here can fail a hemisphere: what cannot be used is a flag, and its shape
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from hipsta_bids.derivatives import hemisphere
-from hipsta_bids.derivatives.dataset import source_address
+from hipsta_bids.derivatives.dataset import TABLES, describe_columns, source_address
 from hipsta_bids.derivatives.hemisphere import ResultPlace
 from hipsta_bids.errors import InputError
 from hipsta_bids.geometry import sampling
@@ -44,10 +44,7 @@ def write_map(
     names = _column_names(source.name, count)
     digits = 7 if source.interpolation == "linear" else 15
     write_nodes(result.path("map_table", source.name), names, sampled.values, digits)
-    definitions: dict[str, object] = {
-        "x": {"Description": "node number along x, 1 at the medial end (subiculum)"},
-        "y": {"Description": "node number along y, 1 at the posterior end"},
-    }
+    definitions = describe_columns(hemisphere.NODES)
     for number, name in enumerate(names, start=1):
         text = f"volume {number} of the source" if count > 1 else "value of the source"
         definitions[name] = {"Description": f"{text}, in its own unit"}
@@ -76,12 +73,7 @@ def _write_regions(
     result: ResultPlace, regions: sampling.Regions, statistics: sampling.RegionStatistics
 ) -> None:
     """Write one row per region, and the sidecar."""
-    definitions: dict[str, dict[str, object]] = {
-        "region": {"Description": "region, as the user named it"},
-        "n_points": {"Description": "sheet points in the region"},
-        "n_valid": {"Description": "... whose columns were measured directly"},
-        "area": {"Description": "area of the mid-surface round these points", "Units": "mm^2"},
-    }
+    definitions = describe_columns(TABLES["roi"])
     columns: dict[str, list[str]] = {
         "region": list(regions.names),
         "n_points": _cells(statistics.n_points),
@@ -106,14 +98,8 @@ def _write_regions(
     files.write_json(result.path("roi_sidecar"), definitions)
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Mapped:
-    """What was sampled on one sheet."""
-
-    maps: tuple[tuple[MapSource, sampling.SampledMap], ...] = ()
-    regions: sampling.Regions | None = None
-    record: Mapping[str, Any] = field(default_factory=dict)
-    """For the quality record."""
+#: What was sampled from a volume, with its entry of the quality record.
+Mapped = tuple[MapSource, dict[str, Any], sampling.SampledMap]
 
 
 def signal_hash(item: HemisphereInput) -> list[object]:
@@ -134,9 +120,12 @@ def _content(path: Path | None) -> str | None:
 
 def add_signals(
     item: HemisphereInput, maps: HemisphereMaps, settings: MapSettings, sources: Mapping[str, Path]
-) -> tuple[HemisphereMaps, Mapped]:
-    """Sample a hemisphere's volumes on its sheet, and read the regions."""
-    sampled_maps = []
+) -> tuple[HemisphereMaps, list[Mapped], sampling.Regions | None, dict[str, Any]]:
+    """Sample a hemisphere's volumes on its sheet, and read the regions.
+
+    Returns maps with flags, what was sampled, the regions, and what the quality record gets.
+    """
+    mapped = []
     flags = []
     entries: list[dict[str, Any]] = []
     for source in item.maps:
@@ -156,7 +145,7 @@ def add_signals(
             flags.append(Flag(reason="map-unusable", message=f"map {source.name}: {error}"))
             entry["problem"] = str(error)
             continue
-        sampled_maps.append((source, sampled))
+        mapped.append((source, entry, sampled))
         entry |= {
             "volumes": sampled.values.shape[2],
             "outside": sampled.outside,
@@ -177,8 +166,7 @@ def add_signals(
         except InputError as error:
             flags.append(Flag(reason="roi-unusable", message=f"regions: {error}"))
     record = {"maps": entries, "regions": str(item.regions) if item.regions else None}
-    mapped = Mapped(maps=tuple(sampled_maps), regions=regions, record=record)
-    return replace(maps, flags=(*maps.flags, *flags)), mapped
+    return replace(maps, flags=(*maps.flags, *flags)), mapped, regions, record
 
 
 def _sample(
@@ -198,20 +186,24 @@ def _sample(
     return replace(sampled, values=np.where(measured, sampled.values, np.nan))
 
 
-def write_signals(result: ResultPlace, maps: HemisphereMaps, mapped: Mapped) -> None:
+def write_signals(
+    result: ResultPlace,
+    maps: HemisphereMaps,
+    mapped: Sequence[Mapped],
+    regions: sampling.Regions | None,
+) -> None:
     """Write the tables and GIFTI files of what was sampled."""
     numbers: dict[str, Float] = {name: maps.maps[name] for name in _SHAPE_UNITS}
     labels: dict[str, Float] = {}
-    entries = {entry["name"]: entry for entry in mapped.record.get("maps", ())}
-    for source, sampled in mapped.maps:
-        about = {key.capitalize(): value for key, value in entries[source.name].items()}
+    for source, entry, sampled in mapped:
+        about = {key.capitalize(): value for key, value in entry.items()}
         write_map(result, source, sampled, about)
         columns = _column_names(source.name, sampled.values.shape[2])
         kind = numbers if source.interpolation == "linear" else labels
         kind |= {name: sampled.values[:, :, k] for k, name in enumerate(columns)}
-    if mapped.regions is not None:
-        statistics = sampling.summarize_regions(mapped.regions, maps.sheet, numbers, labels)
-        _write_regions(result, mapped.regions, statistics)
+    if regions is not None:
+        statistics = sampling.summarize_regions(regions, maps.sheet, numbers, labels)
+        _write_regions(result, regions, statistics)
 
 
 def is_complete(result: ResultPlace, record: Mapping[str, Any]) -> bool:

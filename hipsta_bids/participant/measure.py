@@ -4,8 +4,8 @@ Reads like the methods section of Diers et al. 2023 (NeuroImage 276:120182): lab
 tetrahedra, boundaries, coordinates, sheet, measures.
 """
 
-from collections.abc import Callable
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, suppress
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property, partial
 from typing import Any
@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 
 from hipsta_bids.errors import GeometryError
-from hipsta_bids.geometry.body import check_mask, check_side, extract_body
+from hipsta_bids.geometry import sheet_checks
+from hipsta_bids.geometry.body import Body, check_mask, check_side, extract_body
 from hipsta_bids.geometry.boundaries import Boundaries, find_boundaries
 from hipsta_bids.geometry.catalog import (
     Measured,
@@ -36,17 +37,18 @@ from hipsta_bids.geometry.checks import (
     name_place,
     name_subfields,
 )
-from hipsta_bids.geometry.fem import volume_laplace
+from hipsta_bids.geometry.completion import DOUBTFUL_CAVITY
+from hipsta_bids.geometry.fem import Laplace, volume_laplace
 from hipsta_bids.geometry.findings import (
     add_consequence,
     consequence_text,
     flag_margins,
     raise_flags,
 )
-from hipsta_bids.geometry.grid import check_voxel, in_plane_voxel, resample_body
-from hipsta_bids.geometry.measures import bending_angle
+from hipsta_bids.geometry.grid import Field, in_plane_voxel, resample_body
+from hipsta_bids.geometry.label_checks import check_label_image
+from hipsta_bids.geometry.measures import bending_angle, measure_thickness
 from hipsta_bids.geometry.mesh import extract_surface, fill_surface, tetra_quality
-from hipsta_bids.geometry.rows import straighten_rows
 from hipsta_bids.geometry.sheet import (
     between_planes,
     check_flipped,
@@ -57,9 +59,9 @@ from hipsta_bids.geometry.sheet import (
     label_sheet,
     sample_sheet,
     solve_coordinates,
+    straighten_rows,
     whole_body,
 )
-from hipsta_bids.geometry.sheet_checks import check_edges, check_ridges, check_rows, check_subfields
 from hipsta_bids.geometry.topology import Repair, SolidField, repair_topology, repaired_columns
 from hipsta_bids.participant.whole import Own, check_fine, measure_whole
 from hipsta_bids.protocols import EXPERIMENTAL
@@ -76,6 +78,8 @@ from hipsta_bids.types import (
     HemisphereMaps,
     LabelVolume,
     Sheet,
+    Surface,
+    TetMesh,
 )
 
 # Numbers that say whether to trust a map, and flags.
@@ -94,6 +98,8 @@ class Evidence(Measured):
     """One hemisphere's sheet, and what the stages found out on their way to it."""
 
     coordinates: Coordinates
+    image: tuple[Finding, ...]
+    """What the checks of the label image found."""
     side: float
     """How far the medial subfields lie medially of CA1, mm."""
     solid: SolidField
@@ -107,6 +113,8 @@ class Evidence(Measured):
     """Angle by which the sheet bends round its interior side, rad."""
     folded: float
     """Fraction of the volume in which the coordinates have the opposite orientation."""
+    rivals: Mapping[str, Float]
+    """Thickness (Nx, Ny), mm, after a second choice that is as likely, by what was chosen."""
 
     @cached_property
     def repaired(self) -> Bool:
@@ -120,7 +128,6 @@ def find_all(evidence: Evidence) -> list[Finding]:
     body, sheet, checks = evidence.body, evidence.sheet, settings.checks
     middle = sheet.points[:, :, sheet.middle]
     present = set(np.unique(body.tissue[body.inside]).tolist())
-    edges = np.minimum(*(np.linalg.norm(middle - middle[[end]], axis=2) for end in (0, -1)))
     ends = body.ends
     rows: list[tuple[str, float, float, str, str, Float | float]] = [
         (
@@ -159,13 +166,11 @@ def find_all(evidence: Evidence) -> list[Finding]:
         ),
         (
             "boundary-doubtful",
-            boundaries.doubt if np.isfinite(boundaries.doubt) else np.inf,
-            checks.flag_doubt,
-            f"the medial or lateral boundary is uncertain by {boundaries.doubt:.1f} mm"
-            if np.isfinite(boundaries.doubt)
-            else "the medial or lateral boundary depends on the operator",
+            float(boundaries.tilt),
+            0,
+            "no medial and lateral boundary runs from end to end with the operator of the settings",
             "look at the edges of the sheet",
-            middle[edges < np.nan_to_num(boundaries.doubt, nan=np.inf)],
+            1.0,
         ),
         (
             # The cortex beside the body bends the other way.
@@ -198,14 +203,18 @@ def find_all(evidence: Evidence) -> list[Finding]:
     return [
         *map(_of_repair, solid.repairs),
         *map(_whole, rows),
+        *[
+            sheet_checks.check_rival(evidence.thickness, *rival, checks)
+            for rival in evidence.rivals.items()
+        ],
         *check_image(body),
         *check_cavities(body, checks),
         *check_labels(body, checks),
         *check_cross_sections(solid.field, body, checks, solid.touched & (solid.field.values < 0)),
-        *check_rows(sheet, checks),
-        *check_edges(evidence.whole, checks),
-        *check_subfields(sheet, evidence.subfield, checks),
-        *check_ridges(sheet, evidence.thickness, checks),
+        *sheet_checks.check_rows(sheet, checks),
+        *sheet_checks.check_edges(evidence.whole, checks),
+        *sheet_checks.check_subfields(sheet, evidence.subfield, checks),
+        *sheet_checks.check_ridges(sheet, evidence.thickness, checks),
     ]
 
 
@@ -265,6 +274,13 @@ def quality_metrics(evidence: Evidence) -> dict[str, Any]:
         "tetra_quality_median": float(np.median(quality)),
         "tetra_quality_p01": float(np.quantile(quality, 0.01)),
         "boundary_doubt_mm": boundaries.doubt,
+        "second_choice_mm": max(
+            (
+                sheet_checks.rms_difference(rival, evidence.thickness)
+                for rival in evidence.rivals.values()
+            ),
+            default=0.0,
+        ),
         "boundary_strip_mm": boundaries.strip_width,
         "side_rule": boundaries.side_rule,
         "side_margin": boundaries.side_margin,
@@ -283,39 +299,27 @@ def quality_metrics(evidence: Evidence) -> dict[str, Any]:
 Clock = Callable[[str], AbstractContextManager[None]]
 
 
-def unfold(volume: LabelVolume, hemi: str, settings: Settings, clock: Clock) -> Evidence:
-    """Lay out the sheet of one hippocampal body; arguments are those of `measure_hemisphere`."""
+def unfold(
+    volume: LabelVolume, hemi: str, settings: Settings, clock: Clock, *, rivals: bool = True
+) -> Evidence:
+    """Lay out the sheet of one body, with second choices or not; cf. `measure_hemisphere`."""
     with clock("body"):
-        check_voxel(volume, settings.checks)
+        findings = check_label_image(volume, hemi, settings.checks)
         body = extract_body(volume, settings.body)
         side = check_side(body, hemi)
     with clock("surface"):
-        solid = repair_topology(
-            resample_body(body, hemi, settings.grid, settings.slices),
-            settings.topology,
-            name_subfields(body),
-            find_contacts(body),
-        )
+        field = resample_body(body, hemi, settings.grid, settings.slices)
+        solid = _solid(field, body, settings)
         surface = extract_surface(solid.field, settings.surface)
         across = check_voxels_across(surface, body, settings.checks)
     with clock("tetrahedra"):
-        surface, mesh, smoothed = fill_surface(
-            surface,
-            partial(extract_surface, solid.field),
-            settings.surface,
-            settings.tetra,
-            solid.field.grid.frame,
-        )
+        surface, mesh, smoothed = _fill(surface, solid, settings)
     with clock("boundaries"):
         laplace = volume_laplace(mesh, settings.boundaries.solver)
-        longer = replace(body, ends=body.ends.beyond(settings.grid.beyond))
-        boundaries = find_boundaries(surface, laplace, longer, settings.boundaries)
+        boundaries = _boundaries(surface, laplace, body, settings)
     with clock("coordinates"):
-        coordinates = solve_coordinates(laplace, boundaries)
-        if settings.grid.beyond:
-            coordinates = between_planes(mesh, coordinates, body.ends)
-        if settings.sheet.x_coordinate == "midsurface":
-            coordinates = straighten_rows(mesh, coordinates, settings.boundaries.solver)
+        lay_out = partial(_lay_out, laplace, mesh, body, settings)
+        coordinates = lay_out(boundaries)
         order = check_label_order(mesh, coordinates, body, settings.checks)
     with clock("sheet"):
         sheet = sample_sheet(mesh, coordinates, settings.sheet)
@@ -331,6 +335,21 @@ def unfold(volume: LabelVolume, hemi: str, settings: Settings, clock: Clock) -> 
         whole = sample_sheet(mesh, coordinates, whole_body(settings.sheet))
         subfield = label_sheet(sheet, body)
         folded = folded_fraction(mesh, coordinates)
+    with clock("second choices"):
+        rival_maps = {}
+        if rivals and boundaries.rival is not None:
+            rival = sample_sheet(mesh, lay_out(boundaries.rival), settings.sheet)
+            rival_maps["medial or lateral boundary"] = measure_thickness(rival)
+        with suppress(GeometryError):
+            if rivals and solid.rival is not None:
+                rival_maps["repair"] = _thickness(solid.rival, body, settings)
+        with suppress(GeometryError):
+            if rivals and body.cavities.doubtful:
+                second = extract_body(volume, settings.body, second=True)
+                changed = np.count_nonzero(second.inside != body.inside) * body.voxel_volume
+                if changed > DOUBTFUL_CAVITY:
+                    field = resample_body(second, hemi, settings.grid, settings.slices)
+                    rival_maps["reading of a cavity"] = _thickness(field, second, settings)
     return Evidence(
         body=body,
         surface=surface,
@@ -340,6 +359,7 @@ def unfold(volume: LabelVolume, hemi: str, settings: Settings, clock: Clock) -> 
         subfield=subfield,
         whole=whole,
         settings=settings,
+        image=tuple(findings),
         side=side,
         solid=solid,
         voxels_across=across,
@@ -348,7 +368,49 @@ def unfold(volume: LabelVolume, hemi: str, settings: Settings, clock: Clock) -> 
         label_order=order,
         bending=bending,
         folded=folded,
+        rivals=rival_maps,
     )
+
+
+def _solid(field: Field, body: Body, settings: Settings) -> SolidField:
+    return repair_topology(field, settings.topology, name_subfields(body), find_contacts(body))
+
+
+def _fill(surface: Surface, solid: SolidField, settings: Settings) -> tuple[Surface, TetMesh, int]:
+    return fill_surface(
+        surface,
+        partial(extract_surface, solid.field),
+        settings.surface,
+        settings.tetra,
+        solid.field.grid.frame,
+    )
+
+
+def _boundaries(surface: Surface, laplace: Laplace, body: Body, settings: Settings) -> Boundaries:
+    longer = replace(body, ends=body.ends.beyond(settings.grid.beyond))
+    return find_boundaries(surface, laplace, longer, settings.boundaries)
+
+
+def _thickness(field: Field, body: Body, settings: Settings) -> Float:
+    """Measure the thickness (Nx, Ny), mm, of another field of the same body."""
+    solid = _solid(field, body, settings)
+    surface, mesh, _ = _fill(extract_surface(solid.field, settings.surface), solid, settings)
+    laplace = volume_laplace(mesh, settings.boundaries.solver)
+    boundaries = _boundaries(surface, laplace, body, settings)
+    coordinates = _lay_out(laplace, mesh, body, settings, boundaries)
+    return measure_thickness(sample_sheet(mesh, coordinates, settings.sheet))
+
+
+def _lay_out(
+    laplace: Laplace, mesh: TetMesh, body: Body, settings: Settings, boundaries: Boundaries
+) -> Coordinates:
+    """Solve for the three coordinates between boundaries."""
+    coordinates = solve_coordinates(laplace, boundaries)
+    if settings.grid.beyond:
+        coordinates = between_planes(mesh, coordinates, body.ends)
+    if settings.sheet.x_coordinate == "midsurface":
+        coordinates = straighten_rows(mesh, coordinates, settings.boundaries.solver)
+    return coordinates
 
 
 def measure_hemisphere(
@@ -421,6 +483,7 @@ def _find(volume: LabelVolume, hemi: str, evidence: Evidence) -> list[Finding]:
     body, settings, checks = evidence.body, evidence.settings, evidence.settings.checks
     mask = volume.edited_mask
     return [
+        *evidence.image,
         *check_end_labels(volume, body, checks),
         *check_thickness(evidence.thickness, evidence.boundaries.sheet_thickness, checks),
         *([check_flipped(evidence.sheet, hemi)] if body.region == "extended" else []),

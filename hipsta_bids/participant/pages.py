@@ -41,21 +41,8 @@ class Pages:
     """False where nothing can be written."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class PageJob:
-    """One page."""
-
-    root: Path
-    """The output dataset."""
-    visit: VisitKey | None
-    """The visit that the page is about; ``None`` for that of the cohort."""
-    bids_dir: Path | None = None
-    """See :class:`PagePlan`."""
-
-    @property
-    def path(self) -> Path:
-        """The page's file."""
-        return self.root / (participant_report(*self.visit) if self.visit else _COHORT)
+#: Output dataset, visit (``None`` for the page of the cohort), dataset with anatomical images.
+PageJob = tuple[Path, VisitKey | None, Path | None]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,28 +63,19 @@ class PagePlan:
     """Workers elsewhere; ``None`` is this machine."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Problem:
-    """Why a page is missing or old."""
-
-    message: str
-    fatal: bool = False
-    """Whether the others would fail likewise."""
-
-
 def visits_of(root: Path) -> list[VisitKey]:
     """List the visits of which there is a record."""
     names = (result.name for result in list_results(root))
     return list(dict.fromkeys((name.subject, name.session) for name in names))
 
 
-def write_reports(plan: PagePlan, visits: Iterable[VisitKey]) -> Iterator[Problem]:
-    """Make the pages of some visits, and that of the cohort."""
-    jobs = [PageJob(root=plan.root, visit=None)] if plan.cohort else []
-    jobs += [
-        PageJob(root=plan.root, visit=visit, bids_dir=plan.bids_dir)
-        for visit in dict.fromkeys(visits)
-    ]
+def write_reports(plan: PagePlan, visits: Iterable[VisitKey]) -> Iterator[HipstaError]:
+    """Make the pages of some visits, and that of the cohort; yields why pages are missing or old.
+
+    An error of output ends it: the others would fail likewise.
+    """
+    jobs: list[PageJob] = [(plan.root, None, None)] if plan.cohort else []
+    jobs += [(plan.root, visit, plan.bids_dir) for visit in dict.fromkeys(visits)]
     workers = WorkerPlan(
         work=make_page,
         n_workers=max(1, min(plan.n_workers, len(jobs))),
@@ -116,18 +94,24 @@ def write_reports(plan: PagePlan, visits: Iterable[VisitKey]) -> Iterator[Proble
             problem = answer
             if isinstance(answer, WorkerLost):
                 cause = "took too long" if answer.timed_out else f"process died: {answer.cause}"
-                problem = Problem(message=f"{job.path.name}: not made ({cause})")
+                problem = HipstaError(f"{_page_name(job[1])}: not made ({cause})")
             if problem is not None:
-                _LOGGER.warning("report: %s", problem.message)
+                _LOGGER.warning("report: %s", problem)
                 yield problem
-                if problem.fatal:
+                if isinstance(problem, OutputError):
                     return
 
 
 @contextlib.contextmanager
-def reports_after(plan: PagePlan, visits: Sequence[VisitKey]) -> Generator[Pages]:
-    """Make pages when the block ends, also by an error; not when the user stops the run."""
+def reports_after(plan: PagePlan | None, visits: Sequence[VisitKey]) -> Generator[Pages]:
+    """Make pages when the block ends, also by an error; not when the user stops the run.
+
+    None are made without a plan.
+    """
     pages = Pages()
+    if plan is None:
+        yield pages
+        return
     try:
         yield pages
     except Exception:
@@ -150,7 +134,7 @@ def _try_all(plan: PagePlan, visits: Sequence[VisitKey], problems: list[str]) ->
     if not stale and (not plan.cohort or _is_newer(root / _COHORT, root, *_RECORDS)):
         return
     try:
-        problems += [problem.message for problem in write_reports(plan, stale)]
+        problems += [str(problem) for problem in write_reports(plan, stale)]
     except Exception as error:  # results are worth more than pages
         _LOGGER.exception("report")
         problems.append(f"not made ({type(error).__name__}: {error})")
@@ -183,27 +167,29 @@ def warm_up() -> None:
     new_figure((1.0, 1.0), "constrained")
 
 
-def make_page(job: PageJob) -> Problem | None:
-    """Make one page; never raises."""
+def _page_name(visit: VisitKey | None) -> str:
+    return participant_report(*visit) if visit else _COHORT
+
+
+def make_page(job: PageJob) -> HipstaError | None:
+    """Make one page; returns an error and never raises one."""
     from hipsta_bids.reports.cohort import cohort_page  # noqa: PLC0415  (workers only)
     from hipsta_bids.reports.participant import participant_page  # noqa: PLC0415
 
+    root, visit, bids_dir = job
+    name = _page_name(visit)
     try:
-        cohort = _cohort(job.root)
-        page = (
-            participant_page(job.root, *job.visit, cohort, job.bids_dir)
-            if job.visit
-            else cohort_page(cohort)
-        )
+        cohort = _cohort(root)
+        page = participant_page(root, *visit, cohort, bids_dir) if visit else cohort_page(cohort)
         if page is not None:
-            files.write_text(job.path, page)
+            files.write_text(root / name, page)
     except OutputError as error:
-        return Problem(message=str(error), fatal=True)
+        return error
     except HipstaError as error:
-        return Problem(message=f"{job.path.name}: {error}")
+        return HipstaError(f"{name}: {error}")
     except Exception as error:  # noqa: BLE001  (a bug in one page must not end the others)
         traceback.print_exc()  # to the log, as everything that a worker prints
-        return Problem(message=f"{job.path.name}: not made ({type(error).__name__}: {error})")
+        return HipstaError(f"{name}: not made ({type(error).__name__}: {error})")
     return None
 
 

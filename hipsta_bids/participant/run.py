@@ -6,7 +6,6 @@ import math
 import time
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from os import getpid
@@ -33,7 +32,6 @@ from hipsta_bids.derivatives.names import DATASET_FILES, HemisphereName, write_s
 from hipsta_bids.errors import ExitCode, HipstaError, InputError, OutputError, ProtocolError
 from hipsta_bids.inputs.scan import HemisphereInput
 from hipsta_bids.io import files
-from hipsta_bids.io.files import DATASET, locked
 from hipsta_bids.participant.cluster import Cluster, Shard, run_on_cluster
 from hipsta_bids.participant.job import (
     INTERNAL,
@@ -45,7 +43,7 @@ from hipsta_bids.participant.job import (
     run_job,
     warm_up,
 )
-from hipsta_bids.participant.pages import PagePlan, Pages, reports_after
+from hipsta_bids.participant.pages import PagePlan, reports_after
 from hipsta_bids.participant.pool import WorkerLost, WorkerPlan, run_jobs
 from hipsta_bids.settings import Settings
 from hipsta_bids.types import Status
@@ -332,6 +330,7 @@ def _run(
     shard = None if options.shard is None else options.shard.name
     outcomes: list[Outcome] = []
     copies: list[str] = []
+    visits = [(job.result.name.subject, job.result.name.session) for job in jobs]
     with log_file(out_dir, options.verbosity, shard) as log:
         _LOGGER.info("hipsta_bids %s, %d hemispheres", __version__, len(jobs))
         if options.command:
@@ -340,9 +339,17 @@ def _run(
             _LOGGER.info("note: %s", note)
         table = StatusTable(out_dir, shard)
         _write_inputs(out_dir, options, ())
+        plan = PagePlan(
+            root=out_dir,
+            n_workers=n_workers(options, len(visits)),
+            log=log,
+            bids_dir=options.anatomy,
+            cohort=options.shard is None,
+            cluster=options.cluster,
+        )
         # Closed at once, whatever ends the loop, so that no worker outlives it.
         with (
-            _pages_after(jobs, out_dir, options, log) as pages,
+            reports_after(plan if options.reports else None, visits) as pages,
             contextlib.closing(table),
             contextlib.closing(outcomes_of(jobs, table, options, log)) as results,
         ):
@@ -414,13 +421,14 @@ def _prepare(
     protocols = {protocol.name: protocol for protocol in used_protocols}
     dataset.check_own_dataset(out_dir)
     files.check_writable(out_dir)
-    with locked(out_dir, DATASET) as is_only_run:
+    with files.locked(out_dir, files.DATASET) as is_only_run:
         if is_only_run:
             files.remove_leftovers(out_dir, "*")
         digest = dataset.settle_settings(out_dir, settings)
         dataset.write_description(out_dir, sources)
         if options.shard is None or not (out_dir / DATASET_FILES["citation"]).exists():
-            dataset.write_citation(out_dir, settings, [protocols[k] for k in sorted(protocols)])
+            text = dataset.citation_text(settings, [protocols[k] for k in sorted(protocols)])
+            files.write_text(out_dir / DATASET_FILES["citation"], text)
         write_sidecar(out_dir)
         write_shared(out_dir)
     memory = options.mem_gb and options.mem_gb / n_workers(options, len(items))
@@ -447,24 +455,6 @@ def _prepare(
         )
         for item in items
     ]
-
-
-def _pages_after(
-    jobs: Sequence[Job], out_dir: Path, options: RunOptions, log: Path
-) -> AbstractContextManager[Pages]:
-    """Make pages when a block ends, if they are wanted; that of all if this is no part."""
-    if not options.reports:
-        return contextlib.nullcontext(Pages())
-    visits = [(job.result.name.subject, job.result.name.session) for job in jobs]
-    plan = PagePlan(
-        root=out_dir,
-        n_workers=n_workers(options, len(visits)),
-        log=log,
-        bids_dir=options.anatomy,
-        cohort=options.shard is None,
-        cluster=options.cluster,
-    )
-    return reports_after(plan, visits)
 
 
 def n_workers(options: RunOptions, n_jobs: int) -> int:
@@ -521,7 +511,7 @@ def _measured(
 def _remove_unfinished(job: Job) -> None:
     """Remove what was being written: it has no quality record yet."""
     if job.result.path("sheet").exists() and not job.result.path("qc").exists():
-        with locked(job.result.root, job.title):
+        with files.locked(job.result.root, job.title):
             if not job.result.path("qc").exists():  # another run may have been at it
                 hemisphere.remove_results(job.result)
 
@@ -540,5 +530,5 @@ def _lost(job: Job, loss: WorkerLost, options: RunOptions) -> Outcome:
             reason="worker-died",
         )
     # Another run may have been at it, and for that one it may have gone well.
-    with locked(job.result.root, job.title):
+    with files.locked(job.result.root, job.title):
         return finished(job) or fail(job, error, seconds=loss.seconds)

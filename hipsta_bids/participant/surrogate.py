@@ -21,23 +21,6 @@ from hipsta_bids.types import Float
 #: Compared with points of the mid-surface that lie this near, mm.
 MATCH_REACH = 1.0
 
-#: Columns of the table: definition and unit.
-COLUMNS: dict[str, tuple[str, str | None]] = {
-    "slice": ("where the slice is, fraction of the body's length from its posterior end", None),
-    "sampling": (
-        "proportional: where the sheet has its nodes along x; equidistant: in equal steps",
-        None,
-    ),
-    "point": ("number along the medial axis, 1 nearest to the medial rim", None),
-    "fraction": ("place on the medial axis, 0 at the medial and 1 at the lateral rim", None),
-    "distance": ("from the medial rim along the medial axis", "mm"),
-    "r": ("position on the medial axis, scanner RAS, left to right", "mm"),
-    "a": ("position on the medial axis, scanner RAS, posterior to anterior", "mm"),
-    "s": ("position on the medial axis, scanner RAS, inferior to superior", "mm"),
-    "thickness": ("distances to the closest points of the contour on both sides, added", "mm"),
-    "thickness_mesh": ("thickness of the sheet nearby, if the participant level has run", "mm"),
-}
-
 _DIGITS = 4
 
 
@@ -92,12 +75,9 @@ def _measure(item: HemisphereInput, result: ResultPlace, settings: Settings) -> 
             rows += _rows(profile, mesh)
             if profile.sampling == "proportional":
                 lines.append(_line(profile, mesh))
-    files.write_tsv(result.path("surrogate"), list(COLUMNS), rows)
-    described = {
-        name: {"Description": text} | ({"Units": unit} if unit else {})
-        for name, (text, unit) in COLUMNS.items()
-    }
-    files.write_json(result.path("surrogate_sidecar"), described)
+    columns = dataset.TABLES["surrogate"]
+    files.write_tsv(result.path("surrogate"), list(columns), rows)
+    files.write_json(result.path("surrogate_sidecar"), dataset.describe_columns(columns))
     return lines
 
 

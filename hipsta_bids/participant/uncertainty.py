@@ -1,10 +1,10 @@
 """How certain a map is: the spread of measurements of perturbed copies of the same labels.
 
-Labels tell on which side of a boundary a voxel's center lies, no more: the boundary may be anywhere
-up to half a voxel away. A copy is what the same body might look like if it had been scanned and
-labeled again: its boundaries are moved at random within that range, and its voxels lie elsewhere.
+A copy is what the same body might look like if it had been scanned and labeled again. A person
+draws boundaries a little elsewhere, over millimeters alike, and ends the body at another slice;
+labels tell on which side of a boundary a voxel's center lies, no more; and voxels lie elsewhere.
 This is a parametric bootstrap (Efron and Tibshirani 1993, An Introduction to the Bootstrap, chapter
-6). It knows nothing of errors that do not look like this, such as a whole subfield drawn wrongly.
+6). It does not include other errors, such as a whole subfield drawn wrongly.
 """
 
 import hashlib
@@ -16,32 +16,44 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.ndimage import (
     affine_transform,
-    gaussian_filter1d,
     maximum_filter,
     maximum_filter1d,
     minimum_filter,
 )
+from scipy.spatial.distance import pdist, squareform
 from scipy.spatial.transform import Rotation
 
 from hipsta_bids.errors import GeometryError
+from hipsta_bids.geometry.body import extract_body
 from hipsta_bids.geometry.catalog import measure_maps, summarize
 from hipsta_bids.geometry.checks import check_thickness
-from hipsta_bids.geometry.digital import box
+from hipsta_bids.geometry.digital import box, to_ras
+from hipsta_bids.geometry.ends import EndPlanes
+from hipsta_bids.geometry.findings import raise_flags
+from hipsta_bids.geometry.measures import pool_sd
+from hipsta_bids.geometry.sheet_checks import RIVAL_OFF
 from hipsta_bids.io.volumes import moved
 from hipsta_bids.participant.measure import measure_hemisphere, unfold
 from hipsta_bids.protocols import EXPERIMENTAL
 from hipsta_bids.protocols.load import for_region
-from hipsta_bids.settings import Settings, UncertaintySettings
-from hipsta_bids.types import EditedMask, Float, LabelVolume
+from hipsta_bids.settings import CheckSettings, Settings, UncertaintySettings
+from hipsta_bids.types import EditedMask, Finding, Float, GivenEnd, HemisphereMaps, LabelVolume
 
 _Codes = NDArray[np.int64]
 
-#: Copies without which no SD is told.
+#: Copies without which no SD is told, and which make a mode.
 LEAST = 2
+POOLED = 3
+"""Nodes along x and y over which variances are averaged: eight copies know one to a half."""
+MODE_RATIO = 1.5
+"""Ratio of the distance between two modes to that within them, means over pairs of copies."""
 #: Labels of a voxel as one number: tissue, part, and whether it is in the edited mask.
 _PART, _MASK = 1 << 8, 1 << 16
+_MARGIN = 3
+"""Nodes of noise beyond the voxels at each side, 4.5 SD of the kernel."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -56,6 +68,8 @@ class Uncertainty:
     """(Nx, Ny) by name of the map, in its unit; empty if fewer than half could be measured."""
     summary: Mapping[str, float]
     """By name of the summary measure, in its unit; empty likewise."""
+    modes: Finding | None = None
+    """Two groups of copies whose maps differ, if there are any; its value is in mm."""
 
     @property
     def known(self) -> bool:
@@ -71,6 +85,8 @@ class Uncertainty:
             "uncertainty_failed": self.failed,
             "uncertainty_thickness_mm": sd,
             "uncertainty_mean_mm": self.summary["thickness_mean"] if self.known else None,
+            "uncertainty_modes": (2 if self.modes else 1) if self.known else None,
+            "uncertainty_modes_mm": self.modes.value if self.modes else 0.0,
         }
 
     @property
@@ -91,9 +107,10 @@ def estimate_uncertainty(
     are.
     """
     measured: list[tuple[Mapping[str, Float], Mapping[str, float]]] = []
+    ends = extract_body(volume, settings.body.changed(region="body")).ends
     for number in range(copies):
         try:
-            copy = perturb(volume, settings.uncertainty, number)
+            copy = perturb(volume, ends, settings.uncertainty, number)
             measured.append(_measure(copy, hemi, settings))
         except GeometryError:
             continue
@@ -103,7 +120,14 @@ def estimate_uncertainty(
         failed=copies - len(measured),
         maps=_spread([maps for maps, _ in sufficient]),
         summary={k: float(v) for k, v in _spread([summary for _, summary in sufficient]).items()},
+        modes=find_modes([maps["thickness"] for maps, _ in sufficient], settings.checks),
     )
+
+
+def add_uncertainty(maps: HemisphereMaps, spread: Uncertainty) -> HemisphereMaps:
+    """Return the maps with the numbers of their uncertainty, and its flag if there is one."""
+    flags = raise_flags([spread.modes] if spread.modes else [], maps.sheet, str)
+    return replace(maps, qc={**maps.qc, **spread.metrics}, flags=(*maps.flags, *flags))
 
 
 def _measure(
@@ -114,7 +138,7 @@ def _measure(
     if settings.body.region in EXPERIMENTAL:
         whole = measure_hemisphere(volume, hemi, settings.changed(grid=grid), _no_clock)
         return whole.maps, whole.summary
-    measured = unfold(volume, hemi, settings.changed(grid=grid), _no_clock)
+    measured = unfold(volume, hemi, settings.changed(grid=grid), _no_clock, rivals=False)
     check_thickness(measured.thickness, measured.boundaries.sheet_thickness, settings.checks)
     tissues = for_region(volume.protocol, settings.body.region).sheet
     return measure_maps(measured), summarize(measured, tissues)
@@ -125,32 +149,66 @@ def _no_clock(_: str) -> AbstractContextManager[None]:
 
 
 def _spread(rows: Sequence[Mapping[str, Any]]) -> dict[str, Float]:
-    """SD over copies by name, of what at least two of them know; NaN elsewhere."""
+    """Compute the SD over copies by name, where two know it; of maps around each node."""
     spread = {}
     for name in rows[0] if rows else ():
         values = np.array([row[name] for row in rows], dtype=np.float64)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)  # where fewer than two know it
             sd = np.nanstd(np.where(np.isfinite(values), values, np.nan), axis=0, ddof=1)
-        spread[name] = np.asarray(sd)
+        spread[name] = pool_sd(sd, POOLED) if sd.ndim else np.asarray(sd)
     return spread
 
 
-def perturb(volume: LabelVolume, settings: UncertaintySettings, number: int) -> LabelVolume:
-    """Make one copy: boundaries moved at random, on a voxel grid that lies elsewhere.
+def find_modes(maps: Sequence[Float], settings: CheckSettings) -> Finding | None:
+    """Find two groups of copies, by average linkage of RMS differences of maps (Nx, Ny), mm.
 
-    ``number`` tells copies of the same labels apart.
+    Each has two copies or more, and copies of different groups differ much more than copies of one.
     """
+    if len(maps) < 2 * LEAST:
+        return None
+    values = np.array([values.ravel() for values in maps])
+    values = values[:, np.isfinite(values).all(axis=0)]
+    distance = pdist(values) / np.sqrt(values.shape[1])
+    second = fcluster(linkage(distance, "average"), 2, "maxclust") == 2  # noqa: PLR2004 -- two
+    counts = np.array([np.sum(~second), np.sum(second)])
+    across = squareform(second[:, None] != second, checks=False)
+    if counts.min() < LEAST or distance[across].mean() < MODE_RATIO * distance[~across].mean():
+        return None
+    difference = values[second].mean(axis=0) - values[~second].mean(axis=0)
+    # Means over few copies differ by chance, too.
+    by_chance = (distance[~across] ** 2).mean() / 2 * (1 / counts).sum()
+    rms = float(np.sqrt(max((difference**2).mean() - by_chance, 0.0)))
+    return Finding(
+        reason="two-modes",
+        value=rms,
+        limit=settings.flag_rival,
+        text=f"perturbed copies of the labels have one of two maps ({counts[0]} and {counts[1]} "
+        f"copies), which differ by {rms:.2f} mm (RMS)",
+        remedy="look at the edges of the sheet and at repairs",
+        share=float((np.abs(difference) > RIVAL_OFF).mean()),
+    )
+
+
+def perturb(
+    volume: LabelVolume, ends: EndPlanes, settings: UncertaintySettings, number: int
+) -> LabelVolume:
+    """Make the copy of a number: boundaries and ends are moved, and the voxels lie elsewhere."""
     volume = _cropped(volume)
     generator = np.random.default_rng((_fingerprint(volume), number))
     codes = _encode(volume)
     shape, affine = _other_grid(volume, settings, generator)
     to_volume = np.linalg.inv(volume.affine) @ affine
     near, places = _near_labels(codes, shape, to_volume)
-    spread = settings.jitter / np.sqrt(3.0)  # SD of a uniform distribution
+    voxel = np.linalg.norm(affine[:3, :3], axis=0)
+    by_voxel = settings.jitter / np.sqrt(3.0)  # SD of a uniform distribution
+    smooth = np.sqrt(np.maximum((settings.relabeling / voxel) ** 2 - by_voxel**2, 0.0))
+    share = smooth / np.sqrt(len(settings.correlation))
     for axis in range(3):
-        noise = _smooth_noise(shape, settings.correlation, generator)
-        places[axis] += spread * noise[near]
+        places[axis] += by_voxel * _smooth_noise(shape, np.ones(3), generator)[near]
+        for length in settings.correlation:
+            noise = _smooth_noise(shape, length / voxel, generator)[near]
+            places[axis] += share[axis] * noise
     sampled = np.zeros(np.prod(shape), dtype=np.int64)
     sampled[near] = _likeliest(codes, places)
     sampled = sampled.reshape(shape)
@@ -161,7 +219,26 @@ def perturb(volume: LabelVolume, settings: UncertaintySettings, number: int) -> 
         affine=affine,
         protocol=volume.protocol,
         edited_mask=None if mask is None else EditedMask(inside=sampled >= _MASK, voxel=mask.voxel),
-        given_ends=volume.given_ends,
+        given_ends=_moved_ends(volume, ends, settings, generator),
+    )
+
+
+def _moved_ends(
+    volume: LabelVolume,
+    ends: EndPlanes,
+    settings: UncertaintySettings,
+    generator: np.random.Generator,
+) -> tuple[GivenEnd, ...]:
+    """Move both end planes along their normals, if the settings ask for it."""
+    if not settings.end_shift:
+        return volume.given_ends
+    half_slices = 2 * settings.end_shift * ends.half_slice
+    sds = [max(half_slices, plane.uncertainty) for plane in (ends.posterior, ends.anterior)]
+    points = to_ras(np.argwhere(np.isin(volume.tissue, volume.protocol.sheet)), volume.affine)
+    posterior, anterior = generator.normal(0.0, sds)
+    return (
+        ends.posterior.moved("posterior", posterior, points),
+        ends.anterior.moved("anterior", anterior, points),
     )
 
 
@@ -237,19 +314,22 @@ def _near_labels(
     return near, to_volume[:3, :3] @ index + to_volume[:3, 3:]
 
 
-def _smooth_noise(shape: tuple[int, ...], length: float, generator: np.random.Generator) -> Float:
-    """Gaussian noise of SD 1 at the voxels (N,), correlated over ``length`` voxels.
+def _smooth_noise(shape: Sequence[int], length: Float, generator: np.random.Generator) -> Float:
+    """Draw Gaussian noise of SD 1 at voxels (N,), correlated over ``length`` (3,) voxels.
 
-    White noise smoothed with a Gaussian of SD s has the autocorrelation exp(-d^2 / 4 s^2), which is
-    1/e at the distance d = 2 s.
+    White noise at nodes, blurred by a Gaussian of SD s, has the autocorrelation exp(-d^2 / 4 s^2),
+    which is 1/e at the distance d = 2 s. Nodes are 1.5 s apart, few enough and hardly visible.
     """
-    noise: NDArray[np.float32] = generator.standard_normal(shape, dtype=np.float32)
-    for axis in range(3):
-        impulse = np.zeros(shape[axis])
-        impulse[0] = 1.0
-        kernel = gaussian_filter1d(impulse, length / 2, mode="wrap")
-        noise = gaussian_filter1d(noise, length / 2, axis=axis, mode="wrap")
-        noise /= np.float32(np.linalg.norm(kernel))
+    kernels = []
+    for count, reach in zip(shape, length, strict=True):
+        step = 0.75 * reach
+        nodes = step * np.arange(-_MARGIN, np.ceil((count - 1) / step) + _MARGIN + 1)
+        kernel = np.exp(-2 * ((np.arange(count)[:, None] - nodes) / reach) ** 2)
+        kernels.append((kernel / np.linalg.norm(kernel, axis=1)[:, None]).astype(np.float32))
+    nodes_shape = [kernel.shape[1] for kernel in kernels]
+    noise = generator.standard_normal(nodes_shape, dtype=np.float32)
+    for kernel in kernels:
+        noise = np.tensordot(noise, kernel, (0, 1))  # each axis in turn
     return noise.ravel().astype(np.float64)
 
 

@@ -4,8 +4,8 @@ Both cover the hippocampus from its posterior to its anterior end and from the s
 of the sheet at CA3. What has the same share of both ways is taken for the same place.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -33,14 +33,6 @@ _LARGEST = 1 + 1e-4
 """Of a proximal-distal coordinate, with room for rounding."""
 _COVERED = 0.9
 """A surface covers this share of the rectangle along both axes, at least."""
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class SheetMap(PointMap):
-    """One number per point of one side."""
-
-    hemi: str
-    path: Path
 
 
 class Correspondence:
@@ -98,21 +90,22 @@ def resample(
     if out.resolve() in {path.resolve() for path in (*paths, *surfaces)}:
         raise UsageError(f"{out}: is an input; choose another name")
     surface_of = {_hemi(path): _unfolded(path) for path in surfaces}
-    positions_of = {side.hemi: side.values for path in sheets for side in _read(path, column)}
+    positions_of = {hemi: side.values for path in sheets for hemi, side in _read(path, column)}
     x, y, _ = sheet_levels(settings, "whole")
     nodes = len(x), len(y)
-    moved: dict[str, SheetMap] = {}
+    moved: dict[str, PointMap] = {}
+    path_of: dict[str, Path] = {}
     vertices = False
-    for side in (side for path in paths for side in _read(path, column)):
-        if side.hemi in moved:
-            raise _several(f"{moved[side.hemi].path} and {side.path}: both are of side {side.hemi}")
-        flat = surface_of.get(side.hemi, surface_of.get(None))
+    sides = ((path, *pair) for path in paths for pair in _read(path, column))
+    for path, hemi, side in sides:
+        if hemi in moved:
+            raise _several(f"{path_of[hemi]} and {path}: both are of side {hemi}")
+        flat = surface_of.get(hemi, surface_of.get(None))
         if flat is None:
             raise InputError(
-                f"{side.path}: there is no unfolded surface of side {side.hemi}; add it to"
-                " --surface"
+                f"{path}: there is no unfolded surface of side {hemi}; add it to --surface"
             )
-        places = positions_of.get(side.hemi)
+        places = positions_of.get(hemi)
         if places is not None and (
             places.size != nodes[0] * nodes[1] or np.nanmax(np.abs(places)) > _LARGEST
         ):
@@ -124,18 +117,18 @@ def resample(
         on_nodes = len(side.values) == nodes[0] * nodes[1] and side.nodes in (None, nodes)
         if not on_nodes and len(side.values) != len(flat.points):
             raise InputError(
-                f"{side.path}: has {len(side.values)} points, the whole sheet {nodes[0]} x"
+                f"{path}: has {len(side.values)} points, the whole sheet {nodes[0]} x"
                 f" {nodes[1]}, and the surface {len(flat.points)}; give the surface of its density,"
                 " or the --settings of the results"
             )
         if moved and on_nodes != vertices:
-            raise _several(f"{side.path}: is not on the same points as {paths[0]}")
+            raise _several(f"{path}: is not on the same points as {paths[0]}")
         vertices = on_nodes
         if on_nodes:
             values = between.to_vertices(side.values.reshape(nodes))
         else:
             values = between.to_nodes(side.values)
-        moved[side.hemi] = replace(side, values=values)
+        moved[hemi], path_of[hemi] = replace(side, values=values), path
     _write(out, moved, to_nodes=not vertices)
     missing = np.mean(np.isnan(np.concatenate([side.values.ravel() for side in moved.values()])))
     points = "vertices of HippUnfold" if vertices else "nodes of the whole sheet"
@@ -143,19 +136,17 @@ def resample(
     return f"{out}: {points_each} {points}, {missing:.0%} without a value"
 
 
-def _write(out: Path, maps: Mapping[str, SheetMap], *, to_nodes: bool) -> None:
-    first, *further_maps = maps.values()
-    flat = {hemi: one.values.ravel() for hemi, one in maps.items()}
+def _write(out: Path, maps: Mapping[str, PointMap], *, to_nodes: bool) -> None:
+    (hemi, first), *further_maps = maps.items()
     if out.name.endswith(DENSE_SCALARS):
-        sides = {hemi: flat[hemi][None] for hemi in sorted(flat)}
+        sides = {hemi: maps[hemi].values.ravel()[None] for hemi in sorted(maps)}
         files.write_bytes(out, gifti.cifti_bytes(sides, [first.name]))
         return
     if further_maps:
         raise UsageError(f"{out}: holds one side; name a {DENSE_SCALARS} file for both")
     if out.suffix != TABLE:
-        content = gifti.shape_bytes(
-            flat[first.hemi], hemi=first.hemi, name=first.name, unit=first.unit
-        )
+        values = first.values.ravel()
+        content = gifti.shape_bytes(values, hemi=hemi, name=first.name, unit=first.unit)
         files.write_bytes(out, content)
         return
     if not to_nodes:
@@ -163,8 +154,8 @@ def _write(out: Path, maps: Mapping[str, SheetMap], *, to_nodes: bool) -> None:
     write_nodes(out, [first.name], first.values[..., None])
 
 
-def _read(path: Path, column: str) -> list[SheetMap]:
-    """Read the maps of one file: of one side, or of those that a CIFTI file has."""
+def _read(path: Path, column: str) -> Iterator[tuple[str, PointMap]]:
+    """Read the maps of one file by their sides: one side, or those that a CIFTI file has."""
     pairs = files.entities(path.name)
     region = pairs.get("label", "body")
     if "seg" in pairs and region != "whole":  # HippUnfold's names have no seg
@@ -182,20 +173,10 @@ def _read(path: Path, column: str) -> list[SheetMap]:
             reason="unknown-hemisphere",
         )
     units = {row.name: row.unit for row in MAPS}
-    maps = []
     for hemi in hemis:
         side = gifti.read_map(path, column, hemi)
-        maps.append(
-            SheetMap(
-                values=side.values,
-                unit=units.get(side.name, side.unit),
-                nodes=side.nodes,
-                name=side.name or pairs["suffix"],
-                hemi=hemi,
-                path=path,
-            )
-        )
-    return maps
+        unit, name = units.get(side.name, side.unit), side.name or pairs["suffix"]
+        yield hemi, replace(side, unit=unit, name=name)
 
 
 def _hemi(path: Path) -> str | None:

@@ -1,9 +1,10 @@
 """Synthetic cohorts: groups with a planted effect, covariates and known truth."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -264,7 +265,11 @@ def write_cohort(
         hemispheres,
         layouts=(layout,),
         voxel_size=voxel_size,
-        participants=_participants(plan, subjects),
+        columns=_columns(plan),
+        rows={
+            one.label: (one.group, f"{one.age:.1f}", one.sex, f"{one.icv:.1f}", one.site)
+            for one in subjects
+        },
     )
     for item in hemispheres:
         if isinstance(item.spec, PhantomSpec):
@@ -272,11 +277,8 @@ def write_cohort(
     (_write_effect if plan.head is None else _write_head_effect)(out, plan)
 
 
-def _participants(plan: CohortPlan, subjects: Sequence[Subject]) -> dataset.Participants:
-    rows = {
-        one.label: (one.group, f"{one.age:.1f}", one.sex, f"{one.icv:.1f}", one.site)
-        for one in subjects
-    }
+def _columns(plan: CohortPlan) -> Mapping[str, Mapping[str, Any]]:
+    """Describe the columns of ``participants.tsv``."""
     groups = {
         name: "no effect" if not dose else f"effect planted {dose} time(s)"
         for dose, name in enumerate(plan.groups)
@@ -284,16 +286,13 @@ def _participants(plan: CohortPlan, subjects: Sequence[Subject]) -> dataset.Part
     sites = {f"site{i}": f"{add:+g} mm of thickness" for i, add in enumerate(plan.sites, 1)}
     if plan.site:
         sites = {plan.site: f"{plan.thickness:g} mm of thickness at 65 years"}
-    return dataset.Participants(
-        columns={
-            "group": {"Description": "group of the cohort", "Levels": groups},
-            "age": {"Description": "age", "Units": "year"},
-            "sex": {"Description": "sex", "Levels": {"F": "female", "M": "male"}},
-            "icv": {"Description": "intracranial volume", "Units": "mL"},
-            "site": {"Description": "place of the scan", "Levels": sites},
-        },
-        rows=rows,
-    )
+    return {
+        "group": {"Description": "group of the cohort", "Levels": groups},
+        "age": {"Description": "age", "Units": "year"},
+        "sex": {"Description": "sex", "Levels": {"F": "female", "M": "male"}},
+        "icv": {"Description": "intracranial volume", "Units": "mL"},
+        "site": {"Description": "place of the scan", "Levels": sites},
+    }
 
 
 def _grid() -> tuple[Float, Float]:

@@ -95,16 +95,6 @@ class Hemisphere:
     """(4, 4) rigid motion in RAS mm."""
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Participants:
-    """Columns of ``participants.tsv`` beside the labels."""
-
-    columns: Mapping[str, Mapping[str, Any]]
-    """Descriptions by column, in the form of a BIDS sidecar."""
-    rows: Mapping[str, Sequence[str]]
-    """Values in the order of the columns, by subject label without ``sub-``."""
-
-
 def write_dataset(
     out: Path,
     hemispheres: Sequence[Hemisphere],
@@ -112,10 +102,13 @@ def write_dataset(
     layouts: Sequence[str] = ("freesurfer",),
     voxel_size: tuple[float, float, float] = (0.4, 0.4, 0.4),
     axes: str = "LIA",
-    participants: Participants | None = None,
+    columns: Mapping[str, Mapping[str, Any]] = MappingProxyType({}),
+    rows: Mapping[str, Sequence[str]] = MappingProxyType({}),
 ) -> None:
     """Write phantoms as a BIDS dataset with derivatives and a table of the truth.
 
+    ``columns`` describes those of ``participants.tsv`` beside the labels, as a BIDS sidecar does;
+    ``rows`` has their values in this order, by subject label without ``sub-``.
     The same input gives the same bytes. Existing files of the same name are replaced.
     """
     unknown = [name for name in layouts if name not in LAYOUTS]
@@ -154,7 +147,7 @@ def write_dataset(
         header = ["participant_id", "hemi", "end", "r", "a", "s", "nr", "na", "ns"]
         files.write_tsv(out / ENDS_TABLE, header, ends)
     _write_truth(out, hemispheres, truth)
-    _write_participants(out, hemispheres, participants or Participants(columns={}, rows={}))
+    _write_participants(out, hemispheres, columns, rows)
     _write_descriptions(out, layouts)
 
 
@@ -257,19 +250,22 @@ def write_sidecar(
 
 
 def _write_participants(
-    out: Path, hemispheres: Sequence[Hemisphere], participants: Participants
+    out: Path,
+    hemispheres: Sequence[Hemisphere],
+    columns: Mapping[str, Mapping[str, Any]],
+    rows: Mapping[str, Sequence[str]],
 ) -> None:
     subjects = dict.fromkeys(item.subject for item in hemispheres)
     files.write_tsv(
         out / "participants.tsv",
-        ["participant_id", *participants.columns],
-        [[f"sub-{name}", *participants.rows.get(name, ())] for name in subjects],
+        ["participant_id", *columns],
+        [[f"sub-{name}", *rows.get(name, ())] for name in subjects],
     )
     for name in subjects:
         # A subject's folder has to be there, and folders without files are lost by archives.
         files.write_tsv(out / f"sub-{name}" / f"sub-{name}_scans.tsv", ["filename"], [])
     about = {"Description": "synthetic subject; there is no image behind it"}
-    files.write_json(out / "participants.json", {"participant_id": about, **participants.columns})
+    files.write_json(out / "participants.json", {"participant_id": about, **columns})
 
 
 def _write_descriptions(out: Path, layouts: Sequence[str]) -> None:

@@ -196,16 +196,18 @@ class HeadPhantom:
             (points + wall[..., None] * out).reshape(-1, 3) for points, out, wall in self._parts
         ]
         outline = np.concatenate(outer) @ rotation.T + shift
-        grid = make_grid(outline, voxel_size=voxel_size, axes=axes, rotation=None, border=3.0)
-        points = np.moveaxis(np.indices(grid.shape), 0, -1) @ grid.affine[:3, :3].T
-        points = (points + grid.affine[:3, 3] - shift) @ rotation
+        shape, affine = make_grid(
+            outline, voxel_size=voxel_size, axes=axes, rotation=None, border=3.0
+        )
+        points = np.moveaxis(np.indices(shape), 0, -1) @ affine[:3, :3].T
+        points = (points + affine[:3, 3] - shift) @ rotation
         tissue = _tissues(self.spec, points)
         # In other protocols the layer belongs to the body's sheet, which then were thicker.
         tissue[tissue == Tissue.MOLECULAR_LAYER] = Tissue.DENTATE_GYRUS
         parts = np.array([Part.TAIL, Part.BODY, Part.HEAD], dtype=np.uint8)
         part = parts[np.searchsorted(self.spec.ends, points[..., 1])]
         tissue, part = _labeled(tissue, part, protocol)
-        return LabelVolume(tissue=tissue, part=part, affine=grid.affine, protocol=protocol)
+        return LabelVolume(tissue=tissue, part=part, affine=affine, protocol=protocol)
 
     def ends(self, hemi: str, pose: Float | None) -> dict[End, Float]:
         """Return a point and the normal (6,) of the planes at which the body ends, RAS mm."""

@@ -1,7 +1,6 @@
 """A phantom drawn on a voxel grid, in the labels of any protocol."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from types import MappingProxyType
 
 import numpy as np
@@ -12,15 +11,7 @@ from scipy.ndimage import maximum_filter, minimum_filter
 from hipsta_bids.errors import ProtocolError
 from hipsta_bids.phantom.shape import Body, PhantomSpec, bad, check_rotation
 from hipsta_bids.protocols.protocol import CORE, LATERAL_END, Label, Part, Protocol, Tissue
-from hipsta_bids.types import Bool, Float, Int, LabelVolume
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Grid:
-    """A voxel grid: number of voxels and the affine from index to RAS mm."""
-
-    shape: tuple[int, int, int]
-    affine: Float
+from hipsta_bids.types import Float, LabelVolume
 
 
 def make_grid(
@@ -30,8 +21,10 @@ def make_grid(
     axes: str,
     rotation: Float | None,
     border: float,
-) -> Grid:
+) -> tuple[tuple[int, int, int], Float]:
     """Lay a grid round points (N, 3), RAS mm, with a border of background, mm.
+
+    Returns the number of voxels, and the affine from index to RAS mm.
 
     The lattice is fixed in space (a voxel center lies at the origin of RAS), so that moving the
     phantom by part of a voxel changes its voxels.
@@ -49,7 +42,7 @@ def make_grid(
     low = np.floor(index.min(axis=0) - pad)
     count = (np.ceil(index.max(axis=0) + pad) - low).astype(int) + 1
     shape = (int(count[0]), int(count[1]), int(count[2]))
-    return Grid(shape=shape, affine=from_matvec(matrix, matrix @ low))
+    return shape, from_matvec(matrix, matrix @ low)
 
 
 def _axis_directions(axes: str) -> Float:
@@ -99,28 +92,32 @@ _CHUNK = 400_000  # points located at once: about 200 MB of temporary arrays
 
 def draw(
     body: Body,
-    grid: Grid,
+    shape: tuple[int, int, int],
+    affine: Float,
     protocol: Protocol,
     *,
     hemi: str,
     pose: Float | None,
     supersample: int | tuple[int, int, int],
 ) -> NDArray[np.intp]:
-    """Label every voxel."""
+    """Label every voxel of a grid; the affine goes from index to RAS mm."""
     counts = np.broadcast_to(np.asarray(supersample, dtype=int), 3)
     if (counts < 1).any():
         raise bad(f"supersample must be 1 or more, not {supersample}")
     table = _label_table(protocol)
-    index = np.indices(grid.shape).reshape(3, -1).T.astype(np.float64)
+    index = np.indices(shape).reshape(3, -1).T.astype(np.float64)
     codes = np.concatenate(
-        [table[_regions(body, part, grid, hemi, pose)] for part in _chunks(index, 1)]
-    ).reshape(grid.shape)
+        [table[_regions(body, part, affine, hemi, pose)] for part in _chunks(index, 1)]
+    ).reshape(shape)
     if (counts > 1).any():
-        offsets = _sub_voxels(counts)
-        mixed = np.argwhere(_near_borders(codes)).astype(np.float64)
+        # In voxels, the points (M, 3) that vote for the label of one that touches another label.
+        steps = [(np.arange(count) + 0.5) / count - 0.5 for count in counts]
+        offsets = np.stack(np.meshgrid(*steps, indexing="ij"), axis=-1).reshape(-1, 3)
+        low, high = (f(codes, 3, mode="nearest") for f in (minimum_filter, maximum_filter))
+        mixed = np.argwhere(low != high).astype(np.float64)
         votes = [
             _majority(
-                table[_regions(body, (part[:, None] + offsets).reshape(-1, 3), grid, hemi, pose)],
+                table[_regions(body, (part[:, None] + offsets).reshape(-1, 3), affine, hemi, pose)],
                 per_voxel=len(offsets),
                 kinds=len(protocol.labels) + 1,
             )
@@ -233,11 +230,11 @@ def _label_table(protocol: Protocol) -> NDArray[np.intp]:
 
 
 def _regions(
-    body: Body, index: Float, grid: Grid, hemi: str, pose: Float | None
+    body: Body, index: Float, affine: Float, hemi: str, pose: Float | None
 ) -> NDArray[np.intp]:
     """Region number (N,) at voxel coordinates (N, 3)."""
     spec = body.spec
-    points = index @ grid.affine[:3, :3].T + grid.affine[:3, 3]
+    points = index @ affine[:3, :3].T + affine[:3, 3]
     reach = body.thickest / 2.0 + spec.interior_depth
     u, v, n = body.locate(points, hemi=hemi, pose=pose, reach=reach).T
     region = np.zeros(len(points), dtype=np.intp)
@@ -259,18 +256,6 @@ def _regions(
     part = (v >= 0.0).astype(int) + (v > 1.0)
     region[near] = np.where(local > 0, part * _PER_PART + local, 0)
     return region
-
-
-def _sub_voxels(counts: Int) -> Float:
-    """Offsets (M, 3), in voxels, of the points that vote for a voxel's label."""
-    steps = [(np.arange(count) + 0.5) / count - 0.5 for count in counts]
-    return np.stack(np.meshgrid(*steps, indexing="ij"), axis=-1).reshape(-1, 3)
-
-
-def _near_borders(codes: NDArray[np.intp]) -> Bool:
-    """Voxels that touch (by face, edge or corner) a voxel of another label."""
-    low, high = (f(codes, 3, mode="nearest") for f in (minimum_filter, maximum_filter))
-    return np.asarray(low != high)
 
 
 def _majority(labels: NDArray[np.intp], *, per_voxel: int, kinds: int) -> NDArray[np.intp]:

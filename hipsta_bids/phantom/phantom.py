@@ -156,13 +156,6 @@ def summarize(body: Body, *, span: tuple[float, float] = (0.0, 1.0)) -> dict[str
     }
 
 
-def line_lengths(body: Body, u: Float, v: Float) -> tuple[Float, Float]:
-    """Lengths of the mid-surface's lines along u and along v through positions (u, v), mm."""
-    u, v = np.broadcast_arrays(np.asarray(u, np.float64), np.asarray(v, np.float64))
-    along = _axis_stretch(body, u)[0] * body.spec.length
-    return np.full(v.shape, body.spec.width), np.broadcast_to(along, u.shape).copy()
-
-
 def _surface_jet(body: Body, u: Float, v: Float, at: float) -> _Jet:
     """Differentiate ``mid + at * T * normal``.
 
@@ -244,18 +237,20 @@ class Phantom:
         border
             mm of background on every side.
         """
-        grid = make_grid(
+        shape, affine = make_grid(
             self._outline(hemi, pose),
             voxel_size=voxel_size,
             axes=axes,
             rotation=grid_rotation,
             border=border,
         )
-        labels = draw(self.body, grid, protocol, hemi=hemi, pose=pose, supersample=supersample)
-        tissue = np.array([0, *(label.tissue for label in protocol.labels)], dtype=np.uint8)
-        part = np.array([0, *(label.part for label in protocol.labels)], dtype=np.uint8)
+        labels = draw(
+            self.body, shape, affine, protocol, hemi=hemi, pose=pose, supersample=supersample
+        )
+        meanings = [(0, 0), *((label.tissue, label.part) for label in protocol.labels)]
+        tissue, part = np.array(meanings, dtype=np.uint8).T
         return LabelVolume(
-            tissue=tissue[labels], part=part[labels], affine=grid.affine, protocol=protocol
+            tissue=tissue[labels], part=part[labels], affine=affine, protocol=protocol
         )
 
     def truth(
@@ -263,7 +258,6 @@ class Phantom:
     ) -> PhantomTruth:
         """Return what a perfect method would measure at positions (u, v)."""
         x, y = np.broadcast_arrays(np.asarray(u, np.float64), np.asarray(v, np.float64))
-        extent_x, extent_y = line_lengths(self.body, x, y)
         interior, mid, exterior = (curvatures(self.body, x, y, at=at) for at in SURFACES.values())
         return PhantomTruth(
             thickness=self.body.thickness(x, y),
@@ -274,8 +268,8 @@ class Phantom:
             gaussian_curvature=mid[1],
             gaussian_curvature_interior=interior[1],
             gaussian_curvature_exterior=exterior[1],
-            extent_x=extent_x,
-            extent_y=extent_y,
+            extent_x=np.full(x.shape, self.spec.width),
+            extent_y=_axis_stretch(self.body, x)[0] * self.spec.length,
             subfield=tissue_at(self.spec, x, y),
             summary=summarize(self.body),
         )

@@ -305,12 +305,6 @@ class ThicknessJet(NamedTuple):
     sw: Float
     ww: Float
 
-    def thinned(self, depth: float, across: "Window", along: "Window") -> "ThicknessJet":
-        """Take off ``depth`` mm times the product of two windows."""
-        orders = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
-        windows = (depth * across[i] * along[j] for i, j in orders)
-        return ThicknessJet(*(own - window for own, window in zip(self, windows, strict=True)))
-
 
 #: Value, first and second derivative of a window.
 Window = tuple[Float, Float, Float]
@@ -372,7 +366,9 @@ class Body:
         for thinning in spec.thinnings:
             across = window_jet(u * spec.width, thinning.u, spec.width, thinning.edge)
             along = window_jet(v * spec.length, thinning.v, spec.length, thinning.edge)
-            jet = jet.thinned(thinning.depth, across, along)
+            orders = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
+            windows = (thinning.depth * across[i] * along[j] for i, j in orders)
+            jet = ThicknessJet(*(a - b for a, b in zip(jet, windows, strict=True)))
         return jet
 
     @cached_property

@@ -27,35 +27,29 @@ from hipsta_bids.protocols.toml import did_you_mean, first_mistake
 
 #: What laboratories call the tissues, after :func:`identify_tissue` has reduced a name.
 _NAMES = {
-    Tissue.BACKGROUND: {"background", "clear", "unknown"},
-    Tissue.PRESUBICULUM: {"presubiculum", "presub", "prs"},
-    Tissue.SUBICULUM: {"subiculum", "sub", "subicularcomplex"},
-    Tissue.CA1: {"ca1"},
-    Tissue.CA2: {"ca2"},
-    Tissue.CA2_3: {"ca23", "ca2ca3"},
-    Tissue.CA3: {"ca3"},
-    Tissue.CA4: {"ca4", "hilus"},
-    Tissue.DENTATE_GYRUS: {
-        *("dg", "dentate", "dentategyrus", "fasciadentata", "gcdg", "gcmldg"),
-        *("ca4dg", "dgca4", "ca4dentategyrus", "dentategyrusca4", "ca4gcdg", "ca4gcmldg"),
-        *("dghilus", "hilusdg"),
-    },
-    Tissue.MOLECULAR_LAYER: {
-        *("molecularlayer", "ml", "srlm", "slrm", "srlslm", "slm"),
-        "stratumradiatumlacunosummoleculare",
-        "stratumradiatumstratumlacunosumstratummoleculare",
-    },
-    Tissue.PARASUBICULUM: {"parasubiculum", "parasub", "paras"},
-    Tissue.HATA: {"hata", "amygdalatransitionarea"},
-    Tissue.FIMBRIA: {"fimbria", "fim"},
-    Tissue.FISSURE: {"fissure", "fis"},
-    Tissue.CYST: {"cyst", "cysts"},
-    Tissue.ENTORHINAL: {"entorhinal", "erc", "ec"},
-    Tissue.BA35: {"ba35", "br35", "a35", "area35"},
-    Tissue.BA36: {"ba36", "br36", "a36", "area36"},
-    Tissue.PARAHIPPOCAMPAL: {"parahippocampal", "parahippocampalgyrus", "phc", "phg"},
+    Tissue.BACKGROUND: "background clear unknown",
+    Tissue.PRESUBICULUM: "presubiculum presub prs",
+    Tissue.SUBICULUM: "subiculum sub subicularcomplex",
+    Tissue.CA1: "ca1",
+    Tissue.CA2: "ca2",
+    Tissue.CA2_3: "ca23 ca2ca3",
+    Tissue.CA3: "ca3",
+    Tissue.CA4: "ca4 hilus",
+    Tissue.DENTATE_GYRUS: "dg dentate dentategyrus fasciadentata gcdg gcmldg ca4dg dgca4"
+    " ca4dentategyrus dentategyrusca4 ca4gcdg ca4gcmldg dghilus hilusdg",
+    Tissue.MOLECULAR_LAYER: "molecularlayer ml srlm slrm srlslm slm"
+    " stratumradiatumlacunosummoleculare stratumradiatumstratumlacunosumstratummoleculare",
+    Tissue.PARASUBICULUM: "parasubiculum parasub paras",
+    Tissue.HATA: "hata amygdalatransitionarea",
+    Tissue.FIMBRIA: "fimbria fim",
+    Tissue.FISSURE: "fissure fis",
+    Tissue.CYST: "cyst cysts",
+    Tissue.ENTORHINAL: "entorhinal erc ec",
+    Tissue.BA35: "ba35 br35 a35 area35",
+    Tissue.BA36: "ba36 br36 a36 area36",
+    Tissue.PARAHIPPOCAMPAL: "parahippocampal parahippocampalgyrus phc phg",
 }
-_TISSUES = {name: tissue for tissue, names in _NAMES.items() for name in names}
+_TISSUES = {name: tissue for tissue, names in _NAMES.items() for name in names.split()}
 _PARTS = {"head": Part.HEAD, "body": Part.BODY, "tail": Part.TAIL}
 
 #: Words that do not change what a label is.

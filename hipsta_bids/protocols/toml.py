@@ -16,6 +16,7 @@ from pydantic import (
     ConfigDict,
     Field,
     NonNegativeFloat,
+    PositiveFloat,
     Strict,
     ValidationError,
 )
@@ -82,6 +83,7 @@ OpenFraction = Annotated[float, Field(gt=0, lt=1)]
 Odd = Annotated[int, Field(ge=3), AfterValidator(_odd)]
 # TOML has lists, and settings do not change: these become tuples.
 Numbers = Annotated[tuple[NonNegativeFloat, ...], Strict(strict=False)]
+Lengths = Annotated[tuple[PositiveFloat, ...], Strict(strict=False), Field(min_length=1)]
 OpenFractions = Annotated[tuple[OpenFraction, ...], Strict(strict=False), Field(min_length=1)]
 Texts = Annotated[tuple[str, ...], Strict(strict=False)]
 

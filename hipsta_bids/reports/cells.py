@@ -166,6 +166,21 @@ def _deviations(scores: pd.Series) -> str:
     return f"{spread}; {beyond}" if len(scores) else ""
 
 
+def _quality(value: float, usual: Mapping[str, Any]) -> str:
+    """Write a quality number, with its unit."""
+    if np.isnan(value):
+        return files.MISSING
+    return f"{value:.1%}" if "percent" in usual else f"{value:.3g} {usual.get('unit', '')}".rstrip()
+
+
+def _usual_range(usual: Mapping[str, Any]) -> str:
+    """Write the usual range of a quality number."""
+    low, high = (_quality(usual[end], usual) for end in ("low", "high"))
+    if np.isinf(usual["high"]):
+        return "any" if np.isinf(usual["low"]) else f"at least {low}"
+    return f"at most {high}" if np.isinf(usual["low"]) else f"{low} to {high}"
+
+
 #: By the names that templates use.
 FILTERS: dict[str, Callable[..., str]] = {
     "number": number_text,
@@ -182,4 +197,6 @@ FILTERS: dict[str, Callable[..., str]] = {
     "statistic": statistic_text,
     "position": position_text,
     "visit": visit_of,
+    "quality": _quality,
+    "usual_range": _usual_range,
 }

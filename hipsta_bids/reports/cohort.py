@@ -55,16 +55,7 @@ _QUALITY = {
 }
 
 
-@dataclass(frozen=True, kw_only=True)
-class Measure:
-    """A number of the summary that pages show."""
-
-    name: str
-    title: str
-    unit: str
-    digits: int
-
-
+#: Numbers of the summary that pages show, in their order: titles and decimals.
 _TITLES = {
     "thickness_mean": ("Mean thickness", 2),
     "curvature_mean": ("Mean curvature", 3),
@@ -77,23 +68,15 @@ _TITLES = {
 }
 _UNITS = {row.name: row.unit for row in SUMMARY}
 
-#: In the order in which they are shown.
-MEASURES = tuple(
-    Measure(name=name, title=title, unit="" if _UNITS[name] == "1" else _UNITS[name], digits=digits)
+#: Title, unit and decimals of these, by name.
+MEASURES: dict[str, dict[str, Any]] = {
+    name: {"title": title, "unit": _UNITS[name].removesuffix("1"), "digits": digits}
     for name, (title, digits) in _TITLES.items()
-)
+}
 
 _RUN = re.compile(r"^(?P<time>\d{4}-\d\d-\d\d \d\d:\d\d):\d\d,\d+ INFO (?P<text>.*)$")
 _COMMAND = "command: "
 _OUTCOME = re.compile(r"(?P<title>sub-\S+_hemi-\S+): (?:ok|repaired|flagged|failed)\b")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Origin:
-    """The run that measured a hemisphere, from its log."""
-
-    command: str | None
-    time: str
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -103,17 +86,13 @@ class Cohort:
     hemispheres: tuple[Hemisphere, ...]
     settings: Mapping[str, Any]
     """Resolved, by stage."""
-    origins: Mapping[str, Origin] = field(default_factory=dict)
-    """By title of the hemisphere."""
+    origins: Mapping[str, tuple[str | None, str]] = field(default_factory=dict)
+    """Command and time of the run that measured a hemisphere, by its title; from the logs."""
 
     def like(self, name: HemisphereName) -> list[Hemisphere]:
         """Measured hemispheres of the same side, protocol and region."""
         kind = _kind(name)
         return [h for h in self.hemispheres if h.measured and _kind(h.result.name) == kind]
-
-    def origin(self, hemisphere: Hemisphere) -> Origin | None:
-        """Find the run that measured a hemisphere, if its log is there."""
-        return self.origins.get(hemisphere.result.name.title)
 
     @cached_property
     def verdicts(self) -> Mapping[str, Verdict]:
@@ -160,7 +139,7 @@ def _is_readable(hemisphere: Hemisphere) -> bool:
         return False
 
 
-def _read_origins(root: Path) -> dict[str, Origin]:
+def _read_origins(root: Path) -> dict[str, tuple[str | None, str]]:
     """Read from the logs which command measured each hemisphere last."""
     origins = {}
     for path in sorted((root / DATASET_FILES["logs"]).glob("run-*.log")):
@@ -176,7 +155,7 @@ def _read_origins(root: Path) -> dict[str, Origin]:
             if entry["text"].startswith(_COMMAND):
                 command = entry["text"].removeprefix(_COMMAND)
             elif (outcome := _OUTCOME.match(entry["text"])) is not None:
-                origins[outcome["title"]] = Origin(command=command, time=entry["time"])
+                origins[outcome["title"]] = command, entry["time"]
     return origins
 
 
@@ -203,8 +182,8 @@ def distances(cohort: Cohort, thickness: Mapping[str, Float]) -> dict[str, tuple
     for members in kinds.values():
         if len(members) < SMALLEST_COMPARED:
             continue
-        table = np.array([[h.summary.get(m.name, np.nan) for m in MEASURES] for h in members])
-        titles = [m.title for m in MEASURES]
+        table = np.array([[h.summary.get(name, np.nan) for name in MEASURES] for h in members])
+        titles = [measure["title"] for measure in MEASURES.values()]
         maps = [thickness.get(h.result.name.title, np.empty((0, 0))) for h in members]
         scores = np.abs(np.nan_to_num(robust_scores(table)))
         if maps[0].size and len({m.shape for m in maps}) == 1:
@@ -237,10 +216,10 @@ def cohort_page(cohort: Cohort) -> str | None:
         if found
     }
     outliers = distances(cohort, thickness)
-    sprites, grid = make_sprites(maps)
+    sprites, columns, tiles = make_sprites(maps)
     counts = Counter(str(h.status) for h in hemispheres)
     rows = [
-        _row(h, cohort, outliers.get(h.result.name.title), grid.tiles.get(n))
+        _row(h, cohort, outliers.get(h.result.name.title), tiles.get(n))
         for n, h in enumerate(hemispheres)
     ]
     return render(
@@ -265,8 +244,8 @@ def cohort_page(cohort: Cohort) -> str | None:
             "apart": OUTLIER,
             "ratings": RATINGS,
             "grid": {
-                "columns": grid.columns,
-                "rows": grid.rows,
+                "columns": columns,
+                "rows": max(1, -(-len(tiles) // columns)),
                 "aspect": _aspect(hemispheres),
             },
         },
@@ -276,7 +255,6 @@ def cohort_page(cohort: Cohort) -> str | None:
 def _columns(hemispheres: Sequence[Hemisphere], *, compared: bool) -> list[Mapping[str, Any]]:
     """Columns of the table; those of one protocol, or of bodies alone, are left out."""
     names = [h.result.name for h in hemispheres]
-    measures = {measure.name: measure for measure in MEASURES}
     columns: list[Mapping[str, Any]] = [{"key": "participant", "title": "Participant"}]
     if any(name.session for name in names):
         columns.append({"key": "session", "title": "Session"})
@@ -303,8 +281,7 @@ def _columns(hemispheres: Sequence[Hemisphere], *, compared: bool) -> list[Mappi
         columns.append({"key": "distance", **score})
         columns.append({"key": "farthest", "title": "Outlier measure"})
     for key, title in _SUMMARY.items():
-        unit, digits = measures[key].unit, measures[key].digits
-        columns.append({"key": key, "title": title, "unit": unit, "digits": digits})
+        columns.append({"key": key, **MEASURES[key], "title": title})
     for key, title in _QUALITY.items():
         percent = {"percent": True} if key.endswith("fraction") else {}
         columns.append({"key": key, "title": title, "digits": 1, **percent})

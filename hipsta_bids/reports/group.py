@@ -172,8 +172,8 @@ def _classification(results: GroupResults) -> Mapping[str, Any] | None:
     }
 
 
-def _registered(results: GroupResults) -> dict[str, Any] | None:
-    """List what registration explains, and sheets whose warps are outliers."""
+def _registration(results: GroupResults) -> Mapping[str, Any] | None:
+    """Describe what registration explains, with its figure, and sheets with extreme warps."""
     table = results.table("registration")
     if not len(table):
         return None
@@ -182,21 +182,14 @@ def _registered(results: GroupResults) -> dict[str, Any] | None:
     if len(extreme):
         extreme = extreme.sort_values("displacement", ascending=False)
     settings = (results.record.get("settings") or {}).get("registration") or {}
+    alt = "Curvature from medial to lateral before and after registration, and warps, by group"
     return {
         "align": settings.get("align"),
         "rows": records(table),
         "alignment": records(results.table("alignment")),
         "extreme": records(extreme),
+        "pictures": embedded(results, "registration", "Registration", alt),
     }
-
-
-def _registration(results: GroupResults) -> Mapping[str, Any] | None:
-    """Describe what registration has done, with curvature before and after it, and warps."""
-    values = _registered(results)
-    if values is None:
-        return None
-    alt = "Curvature from medial to lateral before and after registration, and warps, by group"
-    return {**values, "pictures": embedded(results, "registration", "Registration", alt)}
 
 
 def _harmonization(results: GroupResults) -> Mapping[str, Any] | None:

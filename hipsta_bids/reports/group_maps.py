@@ -63,7 +63,7 @@ def map_scenes(results: GroupResults) -> Mapping[str, Any] | None:
         ]
         blocks.append({"title": title, "plates": plates})
         if scene and plates:
-            data.append({**scene, "sides": list(map(_rounded, scene["sides"]))})
+            data.append(_rounded(scene))
     first = _OPEN + (cells.JOINT in measures)
     return {"blocks": blocks[:first], "more": blocks[first:], "data": data}
 
@@ -208,17 +208,13 @@ def _span(values: Float) -> str:
     )
 
 
-def _rounded(side: Mapping[str, Any]) -> dict[str, Any]:
+def _rounded(value: Any) -> Any:  # noqa: ANN401  (of JSON)
     """Prepare a side for JSON: colors and readers do not resolve more than four digits."""
-
-    def plain(value: Any) -> Any:  # noqa: ANN401  (of JSON)
-        if isinstance(value, np.ndarray):
-            return [float(f"{v:.4g}") if np.isfinite(v) else None for v in value.tolist()]
-        if isinstance(value, Mapping):
-            return {key: plain(part) for key, part in value.items()}
-        return [plain(part) for part in value] if isinstance(value, list) else value
-
-    return {key: plain(value) for key, value in side.items()}
+    if isinstance(value, np.ndarray):
+        return [float(f"{v:.4g}") if np.isfinite(v) else None for v in value.tolist()]
+    if isinstance(value, Mapping):
+        return {key: _rounded(part) for key, part in value.items()}
+    return [_rounded(part) for part in value] if isinstance(value, list) else value
 
 
 #: Participants per arm that the map's share is given for.

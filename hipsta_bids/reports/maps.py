@@ -90,14 +90,17 @@ def _own_settings() -> Iterator[None]:
 class Picture:
     """A figure in a page."""
 
-    address: str
-    """Data address."""
+    content: bytes
+    """The drawing, SVG."""
     alt: str
     caption: str
     width: int
     """CSS pixels at which its letters have their size."""
-    content: bytes = b""
-    """The drawing, where it was made before."""
+
+    @property
+    def address(self) -> str:
+        """Data address."""
+        return "data:image/svg+xml;base64," + base64.b64encode(self.content).decode()
 
 
 def draw_map(kind: MapKind, hemispheres: Sequence[Hemisphere]) -> Picture:
@@ -169,13 +172,8 @@ def picture_of_file(path: Path, *, alt: str, caption: str) -> Picture:
     """Embed a drawing that was made before."""
     content = path.read_bytes()
     width = re.search(rb'<svg[^>]*? width="([\d.]+)pt"', content)
-    return Picture(
-        address="data:image/svg+xml;base64," + base64.b64encode(content).decode(),
-        alt=alt,
-        caption=caption,
-        width=round(float(width[1]) / 0.75) if width else 800,
-        content=content,
-    )
+    pixels = round(float(width[1]) / 0.75) if width else 800
+    return Picture(content=content, alt=alt, caption=caption, width=pixels)
 
 
 def _new_figure(rows: int, columns: int, size: tuple[float, float]) -> tuple["Figure", Any]:
@@ -194,12 +192,8 @@ def _encode(figure: "Figure", *, alt: str, caption: str) -> Picture:
     # The same results give the same bytes.
     with rc_context(_STYLE):
         figure.savefig(buffer, format="svg", metadata={"Date": None}, dpi=150)
-    return Picture(
-        address="data:image/svg+xml;base64," + base64.b64encode(buffer.getvalue()).decode(),
-        alt=alt,
-        caption=caption,
-        width=round(figure.get_figwidth() * 96),
-    )
+    width = round(figure.get_figwidth() * 96)
+    return Picture(content=buffer.getvalue(), alt=alt, caption=caption, width=width)
 
 
 def draw_sheet(
@@ -330,16 +324,6 @@ def _mark_subfields(axis: "Axes", hemisphere: Hemisphere) -> None:
         )  # fmt: skip
 
 
-@dataclass(frozen=True, kw_only=True)
-class Grid:
-    """Where tiles lie in the pictures."""
-
-    columns: int
-    rows: int
-    tiles: Mapping[int, int]
-    """Number of the tile, by row in the list of hemispheres."""
-
-
 def read_maps(hemisphere: Hemisphere) -> dict[str, Float]:
     """Read the maps that are shown, faster than the whole sheet."""
     try:
@@ -348,8 +332,13 @@ def read_maps(hemisphere: Hemisphere) -> dict[str, Float]:
         return {}
 
 
-def make_sprites(maps: Sequence[Mapping[str, Float]]) -> tuple[list[dict[str, Any]], Grid]:
-    """Draw the maps of all hemispheres, on tiles for the longest; without one, a tile is empty."""
+def make_sprites(
+    maps: Sequence[Mapping[str, Float]],
+) -> tuple[list[dict[str, Any]], int, dict[int, int]]:
+    """Draw the maps of all hemispheres, on tiles for the longest; without one, a tile is empty.
+
+    Returns the pictures, how many tiles lie side by side, and the tile of each row that has one.
+    """
     shapes = [found[MAP_KINDS[0].column].shape for found in maps if found]
     usual = max(set(shapes), key=shapes.count) if shapes else (0, 0)
     drawn = [
@@ -358,18 +347,14 @@ def make_sprites(maps: Sequence[Mapping[str, Float]]) -> tuple[list[dict[str, An
         if found and next(iter(found.values())).shape[0] == usual[0]
     ]
     longest = max((shape[1] for shape in shapes if shape[0] == usual[0]), default=0)
-    grid = Grid(
-        columns=min(_COLUMNS, max(1, len(drawn))),
-        rows=max(1, -(-len(drawn) // _COLUMNS)),
-        tiles={row: tile for tile, row in enumerate(drawn)},
-    )
+    columns = min(_COLUMNS, max(1, len(drawn)))
     step = 1 if len(drawn) <= _FULL_SIZE else 2
     sprites = []
     for kind in MAP_KINDS if drawn else ():
         scale = scale_of(kind, [maps[row][kind.column] for row in drawn])
         tiles = [_longer(maps[row][kind.column], longest)[::step, ::step] for row in drawn]
-        sprites.append(_sprites(kind, tiles, grid, scale))
-    return sprites, grid
+        sprites.append(_sprites(kind, tiles, columns, scale))
+    return sprites, columns, {row: tile for tile, row in enumerate(drawn)}
 
 
 def _longer(values: Float, rows: int) -> Float:
@@ -378,18 +363,16 @@ def _longer(values: Float, rows: int) -> Float:
 
 
 def _sprites(
-    kind: MapKind,
-    maps: Sequence[Float],
-    grid: Grid,
-    scale: tuple[float, float],
+    kind: MapKind, maps: Sequence[Float], columns: int, scale: tuple[float, float]
 ) -> dict[str, Any]:
     low, high = scale
     width, height = maps[0].shape
-    picture = np.full((grid.rows * height, grid.columns * width), _COLORS, dtype=np.uint8)
+    rows = -(-len(maps) // columns)
+    picture = np.full((rows * height, columns * width), _COLORS, dtype=np.uint8)
     for number, values in enumerate(maps):
         share = np.clip((values - low) / (high - low), 0, 1)
         shade = np.where(np.isnan(values), _COLORS, np.nan_to_num(share) * (_COLORS - 1))
-        row, column = divmod(number, _COLUMNS)
+        row, column = divmod(number, columns)
         window = np.s_[row * height : (row + 1) * height, column * width : (column + 1) * width]
         picture[window] = shade.round().astype(np.uint8).T[::-1]
     colors = colors_of(kind.colors, _COLORS)
@@ -401,8 +384,7 @@ def _palette_png(picture: NDArray[np.uint8], colors: NDArray[np.str_]) -> str:
     from PIL import Image  # noqa: PLC0415  (slow to load)
 
     image = Image.fromarray(picture, mode="P")
-    palette = [int(color[i : i + 2], 16) for color in colors.tolist() for i in (1, 3, 5)]
-    image.putpalette([*palette, *_MISSING])
+    image.putpalette([*bytes.fromhex("".join(colors.tolist()).replace("#", "")), *_MISSING])
     buffer = io.BytesIO()
     image.save(buffer, format="png", optimize=True)
     return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode()

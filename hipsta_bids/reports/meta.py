@@ -67,14 +67,10 @@ def _drawing(rows: Sequence[Mapping[str, Any]], unit: str) -> dict[str, Any]:
     for number, row in enumerate(estimated):
         is_site = row["kind"] == _SITE
         estimate = row["estimate"]
-        limits = (
-            f"{cells.number_text(row['estimate_low'])} to {cells.number_text(row['estimate_high'])}"
-        )
-        text = (
-            f"[{limits}]"
-            if row["kind"] == _PREDICTION
-            else f"{cells.number_text(estimate)} [{limits}]"
-        )
+        low_text, high_text = (cells.number_text(row[f"estimate_{end}"]) for end in ("low", "high"))
+        text = f"[{low_text} to {high_text}]"
+        if row["kind"] != _PREDICTION:
+            text = f"{cells.number_text(estimate)} {text}"
         size = _LARGEST * math.sqrt(row["weight"]) if is_site else 0.0
         marks.append(
             {

@@ -14,7 +14,6 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from hipsta_bids import __version__
-from hipsta_bids.io.files import MISSING
 from hipsta_bids.reports.cells import FILTERS
 from hipsta_bids.reports.display import ORIENTATION
 from hipsta_bids.settings import Settings
@@ -87,104 +86,30 @@ def _environment() -> "Environment":
     return environment
 
 
-@dataclass(frozen=True, kw_only=True)
-class Reason:
-    """What a machine-readable reason means, and what to do about it."""
-
-    action: str
-    """What kind of thing to do, a key of :func:`reason_actions`."""
-    meaning: str
-    remedy: str
-
-
-@dataclass(frozen=True, kw_only=True)
-class ReasonSection:
-    """Reasons that occur in the same situation."""
-
-    title: str
-    text: str
-    reasons: Mapping[str, Reason]
-    """By their names."""
-
-
 @cache
-def reason_sections() -> tuple[ReasonSection, ...]:
-    """Read the table of all reasons, in the order of the reference page."""
-    return tuple(
-        ReasonSection(
-            title=section["title"],
-            text=section["text"],
-            reasons={name: Reason(**row) for name, row in section["reasons"].items()},
-        )
-        for section in _table("reasons.toml")["section"]
-    )
-
-
-def reason_actions() -> Mapping[str, str]:
-    """Titles of what to do, in the order of the reference page, by the keys that reasons name."""
-    actions: Mapping[str, str] = _table("reasons.toml")["actions"]
-    return actions
-
-
-@cache
-def _table(name: str) -> dict[str, Any]:
+def read_table(name: str) -> dict[str, Any]:
+    """Read a TOML file of this folder: ``reasons.toml`` or ``usual.toml``."""
     return tomllib.loads((files("hipsta_bids.reports") / name).read_text(encoding="utf-8"))
-
-
-@dataclass(frozen=True, kw_only=True)
-class Usual:
-    """A quality number and its usual range."""
-
-    name: str
-    """In the quality record."""
-    title: str
-    meaning: str
-    low: float = -math.inf
-    high: float = math.inf
-    unit: str = ""
-    percent: bool = False
-
-    def text(self, value: float) -> str:
-        """Write a value with its unit."""
-        if math.isnan(value):
-            return MISSING
-        if self.percent:
-            return f"{value:.1%}"
-        return f"{value:.3g}{f' {self.unit}' if self.unit else ''}"
-
-    def excludes(self, value: float) -> bool:
-        """Test whether a value is known and outside of the usual range."""
-        return value < self.low or value > self.high
-
-    @property
-    def range(self) -> str:
-        """Write the usual range."""
-        low, high = math.isfinite(self.low), math.isfinite(self.high)
-        if low and high:
-            return f"{self.text(self.low)} to {self.text(self.high)}"
-        if low:
-            return f"at least {self.text(self.low)}"
-        return f"at most {self.text(self.high)}" if high else "any"
 
 
 def usual_ranges(
     thickness: float, settings: Mapping[str, Any], *, whole: bool = False
-) -> list[Usual]:
-    """List the quality numbers that a page shows; some limits are relative to the thickness, mm.
+) -> dict[str, dict[str, Any]]:
+    """Return the rows of ``usual.toml`` with numbers as limits, infinite where there are none.
 
-    ``whole`` are sheets with a head, which are folded where their map is.
+    Some limits are relative to the thickness, mm. ``whole`` are sheets with a head, which are
+    folded where their map is.
     """
-    usual, ranges = Settings().model_dump(), []
-    for name, about in _table("usual.toml").items():
+    usual, ranges = Settings().model_dump(), {}
+    for name, about in read_table("usual.toml").items():
         row = about | about.get("whole", {}) if whole else about
         scale = thickness if row.get("relative") else 1.0
-        limits = {}
-        for end in (end for end in ("low", "high") if row.get(end)):
+        limits = {"low": -math.inf, "high": math.inf}
+        for end in (end for end in limits if row.get(end)):
             stage, setting = row[end].removeprefix("-").split(".")
             value = scale * (usual[stage] | dict(settings.get(stage) or {}))[setting]
             limits[end] = -value if row[end].startswith("-") else value
-        fields = {key: row[key] for key in row.keys() - {"low", "high", "relative", "whole"}}
-        ranges.append(Usual(name=name, **fields, **limits))
+        ranges[name] = row | limits
     return ranges
 
 

@@ -15,7 +15,6 @@ from hipsta_bids.reports.cohort import (
     MEASURES,
     SMALLEST_COHORT,
     Cohort,
-    Measure,
     card_of,
     correction_of,
 )
@@ -202,12 +201,12 @@ def _key_numbers(series: Series) -> Mapping[str, Any] | None:
     measured = series.measured
     if not measured:
         return None
-    measures = (*MEASURES, *_subfield_measures(series))
+    measures = MEASURES | _subfield_measures(series)
     rows = [
-        (measure, [_value_in_cohort(h, measure, series.cohort) for h in measured])
-        for measure in measures
+        (about, [_value_in_cohort(h, name, series.cohort, about["digits"]) for h in measured])
+        for name, about in measures.items()
     ]
-    counts = [len(series.cohort.values(h.result.name, MEASURES[0].name)) for h in measured]
+    counts = [len(series.cohort.values(h.result.name, "thickness_mean")) for h in measured]
     return {
         "sides": [h.side for h in measured],
         "rows": rows,
@@ -216,30 +215,26 @@ def _key_numbers(series: Series) -> Mapping[str, Any] | None:
     }
 
 
-def _subfield_measures(series: Series) -> list[Measure]:
+def _subfield_measures(series: Series) -> dict[str, dict[str, Any]]:
     """Mean thickness of each subfield that one of the hemispheres has."""
     prefix = "thickness_mean_"
-    names = dict.fromkeys(
-        name.removeprefix(prefix)
-        for hemisphere in series.measured
-        for name, value in hemisphere.summary.items()
-        if name.startswith(prefix) and np.isfinite(value)
-    )
-    measures = []
-    for name in names:
-        title = f"Mean thickness, {subfield_title(name)}"
-        measures.append(Measure(name=f"{prefix}{name}", title=title, unit="mm", digits=2))
+    measures = {}
+    for hemisphere in series.measured:
+        for name, value in hemisphere.summary.items():
+            if name.startswith(prefix) and np.isfinite(value):
+                title = f"Mean thickness, {subfield_title(name.removeprefix(prefix))}"
+                measures[name] = {"title": title, "unit": "mm", "digits": 2}
     return measures
 
 
 def _value_in_cohort(
-    hemisphere: Hemisphere, measure: Measure, cohort: Cohort
+    hemisphere: Hemisphere, name: str, cohort: Cohort, digits: int
 ) -> tuple[float, Mapping[str, Any] | None]:
     """Look up a number, with its position in the range of the cohort."""
-    value = hemisphere.summary.get(measure.name, np.nan)
-    values = cohort.values(hemisphere.result.name, measure.name)
+    value = hemisphere.summary.get(name, np.nan)
+    values = cohort.values(hemisphere.result.name, name)
     comparable = len(values) >= SMALLEST_COHORT and np.isfinite(value)
-    return value, _strip(value, values, measure.digits) if comparable else None
+    return value, _strip(value, values, digits) if comparable else None
 
 
 def _strip(value: float, values: Float, digits: int) -> Mapping[str, Any]:
@@ -269,13 +264,13 @@ def _quality_numbers(series: Series) -> Mapping[str, Any] | None:
     rows = []
     lengths = np.array([number(h.metrics, "body_length_mm") for h in measured])
     opposite = lengths[::-1] if len(lengths) > 1 else np.full(1, np.nan)
-    for usual in usual_ranges(thickness, series.cohort.settings, whole=series.whole):
-        values = [number(h.metrics, usual.name) for h in measured]
-        if usual.name == "length_difference_mm":
+    ranges = usual_ranges(thickness, series.cohort.settings, whole=series.whole)
+    for name, usual in ranges.items():
+        values = [number(h.metrics, name) for h in measured]
+        if name == "length_difference_mm":
             values = (lengths - opposite).tolist()
-        if np.isnan(values).all():
-            continue
-        rows.append((usual, values))
+        if not np.isnan(values).all():
+            rows.append((usual, values))
     facts = [
         (title, [", ".join(str(h.metrics.get(key, "n/a")) for key in keys) for h in measured])
         for title, *keys in _FACTS
@@ -315,16 +310,17 @@ def participant_page(
         anatomy=any(view and view.anatomy for one in series for view in one.views.values()),
         versions=versions,
         hashes=hashes,
-        measured=max((_time_of(h, cohort) for h in hemispheres), default=""),
+        measured=max(_origin_of(h, cohort)[1] for h in hemispheres),
     )
 
 
-def _time_of(hemisphere: Hemisphere, cohort: Cohort) -> str:
-    origin = cohort.origin(hemisphere)
-    if origin is not None:
-        return origin.time
+def _origin_of(hemisphere: Hemisphere, cohort: Cohort) -> tuple[str | None, str]:
+    """Find which command measured a hemisphere, and when; without its log, when that was."""
+    title = hemisphere.result.name.title
+    if title in cohort.origins:
+        return cohort.origins[title]
     written = hemisphere.result.path("qc").stat().st_mtime
-    return f"{datetime.fromtimestamp(written, UTC):%Y-%m-%d %H:%M} UTC"
+    return None, f"{datetime.fromtimestamp(written, UTC):%Y-%m-%d %H:%M} UTC"
 
 
 def _status(series: Series) -> Mapping[str, Any]:
@@ -375,7 +371,7 @@ def _legend(series: Series) -> Mapping[str, str]:
     colors: dict[str, str] = {}
     for hemisphere in series.hemispheres:
         view = series.view(hemisphere)
-        names = [label.name for label in view.names.values()] if view else []
+        names = [name for name, _ in view.names.values()] if view else []
         colors |= palette(hemisphere.protocol, list(dict.fromkeys(names)))
     return colors
 
@@ -456,11 +452,7 @@ def _correct(series: Series) -> Mapping[str, Any] | None:
 
 
 def _origin(series: Series) -> Mapping[str, Any]:
-    return {
-        "rows": [
-            (h, series.cohort.origin(h), _time_of(h, series.cohort)) for h in series.hemispheres
-        ]
-    }
+    return {"rows": [(h, *_origin_of(h, series.cohort)) for h in series.hemispheres]}
 
 
 #: From top to bottom: key, which is also the template's name, title, and what builds it.

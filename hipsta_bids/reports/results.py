@@ -24,7 +24,7 @@ from hipsta_bids.derivatives.hemisphere import (
 from hipsta_bids.errors import HipstaError, InputError
 from hipsta_bids.geometry.sampling import ScalarVolume
 from hipsta_bids.inputs.search import Candidate, find_anatomy
-from hipsta_bids.io import files, gifti
+from hipsta_bids.io import files, gifti, volumes
 from hipsta_bids.io.volumes import LabelImage, read_grid, read_labels, read_scalars
 from hipsta_bids.protocols import body_ends
 from hipsta_bids.protocols.load import load_protocol, protocol_names
@@ -104,11 +104,13 @@ class SheetTable:
         """Rows of the ends of the body that lie on the sheet, not at its edge."""
         return [row for row in self.ends or () if 0 < row < self.shape[1] - 1]
 
-    @property
-    def shown_rows(self) -> NDArray[np.intp]:
-        """Rows that are worth a picture: on a sheet with a head those of which half has values."""
-        covered = self.valid.mean(axis=0) >= _HALF
-        return np.flatnonzero(covered | (self.ends is None))
+    def rows_at(self, shares: Sequence[float]) -> list[int]:
+        """Choose rows by their share of the way from posterior to anterior.
+
+        On a sheet with a head, half of a row that is worth a picture has values.
+        """
+        rows = np.flatnonzero((self.valid.mean(axis=0) >= _HALF) | (self.ends is None)).tolist()
+        return [rows[round(share * (len(rows) - 1))] for share in shares]
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -255,15 +257,6 @@ def number_of(cell: str) -> float:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class LabelName:
-    """How a label is shown."""
-
-    name: str
-    color: str
-    """``#rrggbb``"""
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
 class Anatomy:
     """The part of an anatomical image round the body."""
 
@@ -308,8 +301,8 @@ class Views:
     """(I, J, K) the body; ``None`` if it could not be found."""
     affine: Float
     """(4, 4), voxel index to RAS mm; the axes run to the right, anterior and superior."""
-    names: Mapping[int, LabelName]
-    """By code."""
+    names: Mapping[int, tuple[str, str]]
+    """Name and color (``#rrggbb``) of labels, by code."""
     missing: str | None
     """Why there are no labels, in one phrase."""
     anatomy: Anatomy | None = None
@@ -318,10 +311,16 @@ class Views:
     """Which anatomical image is not shown and why, in one phrase."""
 
     @property
+    def body(self) -> Bool:
+        """(I, J, K) the mask, or without one the labels of the protocol."""
+        if self.mask is None and self.labels is not None:
+            return np.isin(self.labels, list(self.names))
+        return np.zeros((0, 0, 0), dtype=bool) if self.mask is None else self.mask
+
+    @property
     def shape(self) -> tuple[int, int, int]:
         """Numbers of voxels."""
-        array = self.mask if self.labels is None else self.labels
-        i, j, k = array.shape if array is not None else (0, 0, 0)
+        i, j, k = (self.body if self.labels is None else self.labels).shape
         return i, j, k
 
     @property
@@ -351,7 +350,10 @@ def read_views(hemisphere: Hemisphere, bids_dir: Path | None = None) -> Views | 
     inside = None if mask is None else _reoriented(mask.data, mask.own_affine)[0] != 0
     names = _names(hemisphere, data)
     interest = inside if inside is not None else np.isin(data, list(names))  # type: ignore[arg-type]  # one is there
-    box = _box(interest, np.linalg.norm(affine[:3, :3], axis=0))
+    box: tuple[slice, ...] = tuple(slice(0, n) for n in interest.shape)
+    if interest.any():
+        hits = [np.asarray(interest.any(axis=axes)) for axes in ((1, 2), (0, 2), (0, 1))]
+        box = volumes.box_with_margin(hits, _MARGIN, affine)
     anatomy, unused = None, None
     if bids_dir is not None and interest.any():
         points = apply_affine(affine, np.argwhere(interest)[::7])
@@ -359,7 +361,7 @@ def read_views(hemisphere: Hemisphere, bids_dir: Path | None = None) -> Views | 
     return Views(
         labels=None if data is None else data[box].astype(np.int32),
         mask=None if inside is None else inside[box],
-        affine=_cropped(affine, box),
+        affine=volumes.moved(affine, (box[0].start, box[1].start, box[2].start)),
         names=names,
         missing=missing,
         anatomy=anatomy,
@@ -454,11 +456,11 @@ def _read_labels(
 def _reoriented(data: NDArray[np.generic], affine: Float) -> tuple[NDArray[np.generic], Float]:
     """Flip and swap axes so that they run to the right, anterior and superior."""
     orientation = io_orientation(affine)
-    moved = np.asarray(affine @ inv_ornt_aff(orientation, data.shape), dtype=np.float64)
-    return apply_orientation(data, orientation), moved
+    turned = np.asarray(affine @ inv_ornt_aff(orientation, data.shape), dtype=np.float64)
+    return apply_orientation(data, orientation), turned
 
 
-def _names(hemisphere: Hemisphere, data: NDArray[np.generic] | None) -> dict[int, LabelName]:
+def _names(hemisphere: Hemisphere, data: NDArray[np.generic] | None) -> dict[int, tuple[str, str]]:
     """Names and colors of the codes that occur."""
     if data is None:
         return {}
@@ -466,34 +468,13 @@ def _names(hemisphere: Hemisphere, data: NDArray[np.generic] | None) -> dict[int
     protocol = hemisphere.protocol
     if protocol is None:
         colors = palette(None, [f"label {code}" for code in codes])
-        return {
-            code: LabelName(name=name, color=color)
-            for code, (name, color) in zip(codes, colors.items(), strict=True)
-        }
+        return dict(zip(codes, colors.items(), strict=True))
     labels = {label.code: label for label in protocol.labels}
     offset = protocol.shift(hemisphere.result.name.hemi)
     # Files of one hemisphere may have the same codes on both sides.
     shift = offset if any(code - offset in labels for code in codes) else 0
     return {
-        code: LabelName(name=label.abbreviation or label.name, color=label.color)
+        code: (label.abbreviation or label.name, label.color)
         for code in codes
         if (label := labels.get(code - shift)) is not None
     }
-
-
-def _box(interest: NDArray[np.bool_], voxel: Float) -> tuple[slice, ...]:
-    """Smallest box of voxels that holds what is of interest, with a margin."""
-    box = []
-    for axis in range(interest.ndim):
-        axes = tuple(other for other in range(interest.ndim) if other != axis)
-        filled = np.flatnonzero(interest.any(axis=axes))
-        margin = int(np.ceil(_MARGIN / voxel[axis]))
-        first, last = (filled[0], filled[-1]) if len(filled) else (0, interest.shape[axis] - 1)
-        box.append(slice(max(0, first - margin), last + margin + 1))
-    return tuple(box)
-
-
-def _cropped(affine: Float, box: tuple[slice, ...]) -> Float:
-    moved = affine.copy()
-    moved[:3, 3] += affine[:3, :3] @ np.array([part.start for part in box])
-    return moved

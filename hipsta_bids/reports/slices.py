@@ -130,12 +130,8 @@ def _relative(path: Sequence[tuple[int, int]]) -> str:
     return start + "l" + " ".join(f"{dx / 100:g} {dy / 100:g}" for dx, dy in moves or [(0, 0)])
 
 
-def png_address(pixels: NDArray[np.uint8]) -> str:
-    """Encode (rows, columns, 3 or 4) pixels as a data address."""
-    return _address(pixels, "png")
-
-
-def _address(pixels: NDArray[np.uint8], kind: str, **options: int) -> str:
+def image_address(pixels: NDArray[np.uint8], kind: str, **options: int) -> str:
+    """Encode (rows, columns) grays, or (rows, columns, 4) pixels, as a data address."""
     from PIL import Image  # noqa: PLC0415  (slow to load)
 
     buffer = io.BytesIO()
@@ -177,7 +173,7 @@ def stack_of(views: Views) -> dict[str, Any]:
     scene = {
         "shape": views.shape,
         "affine": np.round(views.affine[:3], 4).tolist(),
-        "colors": [label.color for label in views.names.values()],
+        "colors": [color for _, color in views.names.values()],
         "body": views.mask is not None,
         "stack": _packed(stack),
         "pale": _PALE,
@@ -214,7 +210,7 @@ def _with_anatomy(panel: Panel, views: Views) -> Panel:
     index[..., up] = views.shape[up] - 0.5 - y[:, None] / views.voxel[up]
     index[..., across] = panel.at["level"]
     grays = views.anatomy.grays(apply_affine(views.affine, index))
-    return replace(panel, anatomy=_address(grays, "jpeg", quality=_QUALITY))
+    return replace(panel, anatomy=image_address(grays, "jpeg", quality=_QUALITY))
 
 
 def section_panels(
@@ -225,26 +221,17 @@ def section_panels(
     ``scale`` is the thickness at both ends of the colors, mm.
     """
     sheet = hemisphere.sheet
-    filled = sheet.shown_rows
-    rows = [int(filled[round(share * (len(filled) - 1))]) for share in POSITIONS]
-    return _same_windows(
-        [
-            _section(sheet, row, share, colors, scale)
-            for row, share in zip(rows, POSITIONS, strict=True)
-        ]
-    )
+    rows = zip(sheet.rows_at(POSITIONS), POSITIONS, strict=True)
+    return _same_windows([_section(sheet, row, share, colors, scale) for row, share in rows])
 
 
 def _centers(hemisphere: Hemisphere, views: Views) -> list[Float]:
     """Voxel indices of points inside the body at the positions that are shown; none without one."""
     if hemisphere.measured:
-        sheet = hemisphere.sheet
-        middle = views.to_index(sheet.points["midthickness"])
-        filled = sheet.shown_rows
-        rows = [filled[round(share * (len(filled) - 1))] for share in POSITIONS]
+        middle = views.to_index(hemisphere.sheet.points["midthickness"])
+        rows = hemisphere.sheet.rows_at(POSITIONS)
         return [np.asarray(np.nanmean(middle[:, row], axis=0)) for row in rows]
-    inside = views.mask if views.mask is not None else np.isin(views.labels, list(views.names))  # type: ignore[arg-type]  # one is there
-    index = np.argwhere(inside)
+    index = np.argwhere(views.body)
     if not len(index):
         return []
     low, high = index[:, 1].min(), index[:, 1].max()
@@ -257,18 +244,12 @@ def _centers(hemisphere: Hemisphere, views: Views) -> list[Float]:
 def _same_windows(panels: Sequence[Panel]) -> list[Panel]:
     """Give panels windows of one size about the same centers, so that they have one scale."""
     width, height = (max(panel.window[n] for panel in panels) for n in (2, 3))
-    return [
-        replace(
-            panel,
-            window=_window(
-                panel.window[0] + panel.window[2] / 2,
-                panel.window[1] + panel.window[3] / 2,
-                width,
-                height,
-            ),
-        )
-        for panel in panels
-    ]
+    resized = []
+    for panel in panels:
+        left, top, own_width, own_height = panel.window
+        window = _window(left + own_width / 2, top + own_height / 2, width, height)
+        resized.append(replace(panel, window=window))
+    return resized
 
 
 def _window(x: float, y: float, width: float, height: float) -> tuple[float, float, float, float]:
@@ -301,8 +282,7 @@ def _slice(
     span = np.array([[0.0, 0.0], [width, height]])
     paths = {}
     point = flat(np.asarray(center))
-    body = views.mask if views.mask is not None else np.isin(views.labels, list(views.names))  # type: ignore[arg-type]  # one is there
-    empty = not np.take(body, level, axis=across).any()
+    empty = not np.take(views.body, level, axis=across).any()
     if empty:
         span = np.stack([point - _MARGIN, point + _MARGIN])
         words = f"{words}: nothing of the body in this slice".removeprefix(": ")
@@ -373,12 +353,9 @@ def _label_image(views: Views, across: int, level: int, right: int, up: int) -> 
         return None
     plane = _picture(views.labels, across, level, right, up)
     pixels = np.zeros((*plane.shape, 4), dtype=np.uint8)
-    for code, name in views.names.items():
-        pixels[plane == code] = (
-            *(int(name.color[i : i + 2], 16) for i in (1, 3, 5)),
-            round(255 * _PALE),
-        )
-    return png_address(pixels.transpose(1, 0, 2)[::-1])
+    for code, (_, color) in views.names.items():
+        pixels[plane == code] = (*bytes.fromhex(color[1:]), round(255 * _PALE))
+    return image_address(pixels.transpose(1, 0, 2)[::-1], "png")
 
 
 def _section(

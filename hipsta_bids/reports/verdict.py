@@ -22,7 +22,7 @@ from hipsta_bids.derivatives.hemisphere import read_sheet
 from hipsta_bids.errors import InputError
 from hipsta_bids.geometry.findings import FLAG_REACH, spread_over
 from hipsta_bids.geometry.measures import layer_area, node_shares
-from hipsta_bids.reports.page import reason_sections
+from hipsta_bids.reports.page import read_table
 from hipsta_bids.reports.results import Finding, Hemisphere
 from hipsta_bids.types import Float, Status
 
@@ -106,15 +106,7 @@ class Verdict:
 def verdict_of(hemisphere: Hemisphere, reach: float = FLAG_REACH) -> Verdict:
     """Decide from the quality record, and from the tables where it lacks a consequence.
 
-    Parameters
-    ----------
-    hemisphere : Hemisphere
-    reach : float
-        Columns within this distance of a point are concerned, mm.
-
-    Returns
-    -------
-    Verdict
+    Columns within ``reach`` of a point, mm, are concerned.
     """
     if not hemisphere.measured:
         return Verdict(
@@ -226,7 +218,7 @@ def _mean(values: Float, weights: Float) -> float:
 
 def _remedy(reason: str) -> str:
     """Say what to do about a reason."""
-    for section in reason_sections():
-        if reason in section.reasons:
-            return " ".join(section.reasons[reason].remedy.split())
+    for section in read_table("reasons.toml")["section"]:
+        if reason in section["reasons"]:
+            return " ".join(section["reasons"][reason]["remedy"].split())
     return "correct the labels and measure again."

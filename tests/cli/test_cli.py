@@ -11,7 +11,9 @@ from stand_ins import make_input, stand_in_job
 
 from hipsta_bids import __version__
 from hipsta_bids.cli import main
+from hipsta_bids.cli.commands import meta_parser, phantom_parser, resample_parser, surrogate_parser
 from hipsta_bids.cli.main import EPILOG
+from hipsta_bids.cli.parser import help_texts
 from hipsta_bids.cli.participant import build_parser
 from hipsta_bids.errors import ExitCode, NothingToDoError
 from hipsta_bids.inputs import search
@@ -208,6 +210,34 @@ def test_everything_reaches_its_place(seen, tmp_path):
 def test_spellings_of_other_bids_apps(alias, field, value):
     options = build_parser().parse_args(["in", "out", "participant", *alias.split()])
     assert getattr(options, field) == value
+
+
+@pytest.mark.parametrize(
+    ("command", "make"),
+    [
+        ("participant", build_parser),
+        ("surrogate", surrogate_parser),
+        ("phantom", phantom_parser),
+        ("meta", meta_parser),
+        ("resample", resample_parser),
+    ],
+)
+def test_the_texts_of_the_help_have_no_leftovers(command, make):
+    actions = make()._actions
+    names = {(action.option_strings or [action.dest])[0]: action.help for action in actions}
+    texts = help_texts()[command]
+    assert {name: names.get(name) for name in texts if name not in {"description", "epilog"}} == {
+        name: text for name, text in texts.items() if name not in {"description", "epilog"}
+    }
+
+
+def test_options_without_meaning_are_remembered_with_the_reason():
+    given = ["--omp-nthreads", "4", "--notrack", "--notrack"]
+    options = build_parser().parse_args(["in", "out", "participant", *given])
+    assert dict(options.ignored) == {
+        "--omp-nthreads": "each hemisphere uses one processor; --n-procs says how many at a time",
+        "--notrack": "nothing is tracked",
+    }
 
 
 @pytest.mark.parametrize(

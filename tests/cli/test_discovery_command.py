@@ -32,7 +32,11 @@ def measured(monkeypatch):
 
 @pytest.fixture
 def dataset(tmp_path, monkeypatch):
-    """FreeSurfer's folders, one of them closed; the files say what the stand-in does."""
+    """FreeSurfer's folders, one of them closed; the files say what the stand-in does.
+
+    They are no images, whose labels a dry run could check.
+    """
+    monkeypatch.setattr("hipsta_bids.participant.job.check_item", lambda *_: [])
     root = tmp_path / "bids" / "derivatives" / "freesurfer"
     for name in ("sub-01", "sub-AD_05", "bert", "fsaverage", "sub-07"):
         for side in "lr":

@@ -199,10 +199,9 @@ def test_sources_get_distinct_names(tmp_path):
     assert dataset.source_address(tmp_path / "c", names) == str(tmp_path / "c")
 
 
-def test_citation_states_settings_and_protocols(tmp_path):
+def test_citation_states_settings_and_protocols():
     settings = Settings(body=BodySettings(layer_rule="nearest-label"))
-    dataset.write_citation(tmp_path, settings, [make_scheme()])
-    text = (tmp_path / "CITATION.md").read_text()
+    text = dataset.citation_text(settings, [make_scheme()])
     assert f"hipsta_bids {__version__}" in text
     assert "the dentate gyrus and CA4 included" in text
     assert "`body.layer_rule`: nearest-label" in text
@@ -261,3 +260,16 @@ def test_status_sidecar_defines_the_columns(tmp_path):
     write_sidecar(tmp_path)
     definitions = json.loads((tmp_path / "status.json").read_text())
     assert set(COLUMNS) < set(definitions)
+
+
+def test_the_methods_text_says_which_steps_are_as_published():
+    usual = dataset.citation_text(Settings(), [])
+    settings = Settings().changed(
+        body={"end_rule": "last-slice"}, boundaries={"operator": "published", "edges": "zero-lines"}
+    )
+    published = dataset.citation_text(settings, [])
+    for text in ("lay at the last slices with labels", "of the original method, without a thresh"):
+        assert text in published
+        assert text not in usual
+    assert "moved to the middle of the sheet's edges" in usual
+    assert "moved to the middle" not in published

@@ -23,7 +23,7 @@ from hipsta_bids.derivatives.hemisphere import (
 from hipsta_bids.derivatives.names import OUTPUTS, HemisphereName
 from hipsta_bids.errors import GeometryError, InputError
 from hipsta_bids.geometry.catalog import DIERS, MAPS, SECTIONS, SUMMARY
-from hipsta_bids.io.meshes import COORDINATE_NAMES
+from hipsta_bids.io.gifti import COORDINATE_NAMES
 from hipsta_bids.types import Flag
 
 HOLE = (2, 1)

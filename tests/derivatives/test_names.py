@@ -10,6 +10,7 @@ from hipsta_bids.derivatives.names import (
     IGNORED,
     OUTPUTS,
     SHARED,
+    TEXTS,
     HemisphereName,
     ignore_file,
     output_name,
@@ -59,6 +60,11 @@ def test_all_names_differ():
     names = [output_name(FULL, output.key) for output in OUTPUTS]
     assert len(set(names)) == len(names)
     assert len({output.key for output in OUTPUTS}) == len(OUTPUTS)
+
+
+def test_texts_of_outputs_have_no_leftovers():
+    described = {output.key for output in (*OUTPUTS, *EXTRA_OUTPUTS)}
+    assert TEXTS["outputs"].keys() - described == {"surface", "unfold"}  # of three surfaces each
 
 
 def test_quality_record_is_last():

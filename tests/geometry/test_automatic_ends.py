@@ -198,3 +198,31 @@ def test_impossible_planes_are_refused(given, reason):
     with pytest.raises(GeometryError, match="the given anterior end") as caught:
         ends_of(replace(drawn((0.8, 0.8, 0.8)), given_ends=(given,)))
     assert caught.value.reason == reason
+
+
+@pytest.mark.parametrize("voxel", [(0.4, 0.4, 0.4), (0.4, 2.0, 0.4)])
+@pytest.mark.parametrize("tilt", [(0.0, 0.0), (8.0, 0.0)])
+def test_the_published_rule_takes_the_last_slices(voxel, tilt):
+    """Posteriorly those with CA1 and CA2, anteriorly those with CA2; here from -15 to 11 mm."""
+    volume = drawn(voxel, tilt=tilt)
+    y = np.tensordot(volume.affine[1, :3], np.indices(volume.tissue.shape), 1)
+    y += volume.affine[1, 3]
+    gone = ((volume.tissue == Tissue.CA1) & (y < -15)) | ((volume.tissue == Tissue.CA2) & (y > 11))
+    volume = replace(volume, tissue=np.where(gone, 0, volume.tissue))
+    ends = ends_of(volume, BodySettings(end_rule="last-slice"))
+    middle = np.array([[0.0, 0.0, 0.5]])
+    # A slice, and what tilted slices and planes reach along y over 16 mm.
+    lean = tilt[0] + degrees_between(ends.axis, [0.0, 1.0, 0.0])
+    reach = voxel[1] + 8 * np.sin(np.radians(lean))
+    for end, place in (("posterior", -15.0), ("anterior", 11.0)):
+        assert ends[end].rule == "last-slice"
+        found = float(-ends.height(middle, end)[0] / ends[end].normal[1])
+        assert found == pytest.approx(place, abs=reach)
+        assert abs(found - places(volume)[end == "anterior"]) > 1.0  # graded evidence differs
+
+
+def test_the_published_rule_needs_a_slice_of_the_body():
+    volume = drawn()
+    volume = replace(volume, tissue=np.where(volume.tissue == Tissue.CA1, 0, volume.tissue))
+    with pytest.raises(GeometryError, match="no slice across the long axis has both"):
+        ends_of(volume, BodySettings(end_rule="last-slice"))

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from geometry_cases import resampled, short_phantom, solid_of
+from scipy import ndimage
 
 from hipsta_bids.geometry import completion
 from hipsta_bids.geometry.body import extract_body
@@ -92,3 +93,20 @@ def test_end_labels_between_the_planes_go_to_their_neighbors(volume):
     body, whole = (extract_body(v, BODY) for v in (mixed, volume))
     assert body.handed_over == pytest.approx(tail.sum(), abs=8)  # the plane hardly moves
     assert (body.inside[tail] == whole.inside[tail]).mean() > 0.95
+
+
+@pytest.mark.parametrize(
+    ("ratio", "doubtful"), [(0.8, False), (0.95, True), (1.05, True), (1.3, False)]
+)
+def test_a_cavity_near_to_a_limit_has_a_second_reading(volume, monkeypatch, ratio, doubtful):
+    """The radius of this cavity is ``ratio`` of the limit."""
+    hole = without(volume, within(volume, 1.0, PHANTOM.body.place(0.7, 0.5, -1.0)))
+    monkeypatch.setattr(completion, "CAVITY_RADIUS", 1e-3)
+    (cavity,) = extract_body(hole, BODY).cavities.wide
+    inside = np.zeros(volume.tissue.shape, dtype=bool)
+    inside[tuple(cavity.T)] = True
+    radius = ndimage.distance_transform_edt(inside, sampling=0.4).max()
+    monkeypatch.setattr(completion, "CAVITY_RADIUS", radius / ratio)
+    first, second = (extract_body(hole, BODY, second=second).cavities for second in (False, True))
+    assert first.doubtful is second.doubtful is doubtful
+    assert (len(first.wide) == len(second.wide)) is not doubtful

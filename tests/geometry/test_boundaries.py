@@ -51,7 +51,19 @@ def test_curves_run_in_the_middle_of_the_rims(case):
 
 
 def test_other_operators_lead_to_the_same_curves(case):
-    assert case.boundaries.doubt < 0.05
+    assert case.boundaries.tilt == 0
+    assert case.boundaries.doubt < boundaries.SAME_CURVES
+    assert case.boundaries.rival is None
+
+
+def test_curves_of_an_operator_that_lie_elsewhere_make_a_rival(arc, monkeypatch):
+    """Without bands, curves stay where the operator puts them: on the sides, if it is isotropic."""
+    monkeypatch.setattr(boundaries, "EDGE_BANDS", ())
+    monkeypatch.setattr(boundaries, "TILTS", ((1.0, 1.0), (1.0, 0.0)))
+    found = find_boundaries(arc.surface, arc.laplace, arc.body, SETTINGS)
+    assert found.doubt > boundaries.SAME_CURVES
+    gaps = [cKDTree(rim(arc, 1)).query(b.lateral_curve)[0].mean() for b in (found, found.rival)]
+    assert gaps[0] < gaps[1]
 
 
 def test_strips_hold_the_rims(case):
@@ -176,7 +188,7 @@ def test_curves_are_centered_from_any_start(arc):
     wall = Wall(arc.surface, SETTINGS)
     _, _, n = arc.phantom.body.locate(wall.vertices, hemi="L", reach=3.0).T
     n = np.nan_to_num(n)
-    ends = [center_curves(wall, n + shift, 2.0)[0] for shift in (-0.5, 0.0, 0.5)]
+    ends = [center_curves(wall, n + shift, 2.0)[-1][0] for shift in (-0.5, 0.0, 0.5)]
     for pair in (ends[0], ends[2]):
         for line, middle in zip(pair, ends[1], strict=True):
             assert cKDTree(middle).query(line)[0].mean() < 0.01
@@ -185,7 +197,7 @@ def test_curves_are_centered_from_any_start(arc):
 def test_weights_of_strips_fall_smoothly(arc):
     wall = Wall(arc.surface, SETTINGS)
     values = wall.operator(SETTINGS).eigenfunctions(1)[1][:, 0]
-    curves, smooth = center_curves(wall, values, 2.0)
+    curves, smooth = center_curves(wall, values, 2.0)[-1]
     weights, lines = facing_strips(wall, arc.laplace, curves, smooth, 2.0)
     for weight, line in zip(weights, lines, strict=True):
         assert weight.min() == 0.0
@@ -243,7 +255,7 @@ def test_lapys_own_solver_finds_the_same(case):
     for name in ("medial", "lateral", "interior", "exterior"):
         np.testing.assert_array_equal(getattr(found, name), getattr(case.boundaries, name))
     # Directions at the edges are solved for to 1e-6, and curves follow them.
-    np.testing.assert_allclose(found.medial_curve, case.boundaries.medial_curve, atol=1e-4)
+    np.testing.assert_allclose(found.medial_curve, case.boundaries.medial_curve, atol=3e-4)
     sheet = sample_sheet(case.mesh, solve_coordinates(laplace, found), SheetSettings())
     np.testing.assert_allclose(sheet.points, case.sheet.points, atol=1e-6)
 
@@ -262,3 +274,24 @@ def test_local_means_are_gaussian_in_the_distance():
     points, vectors = np.array([[1.0, 0, 0], [3.0, 0, 0]]), np.eye(3)[:2]
     found = boundaries._local_mean(np.zeros((1, 3)), points, vectors, np.array([1.0, 2.0]), sd=2.0)
     np.testing.assert_allclose(found, [[1.0, 2 * np.exp(-0.5 * (9 - 1) / 4), 0.0]], rtol=1e-12)
+
+
+@pytest.mark.parametrize("operator", ["sharp-bends", "published"])
+def test_published_boundaries_are_the_zero_lines(case, operator):
+    """Vertices beside a line, not the end faces; the sides reach to them."""
+    settings = BoundarySettings(operator=operator, edges="zero-lines")
+    laplace = volume_laplace(case.mesh, settings.solver)
+    found = find_boundaries(case.surface, laplace, case.body, settings)
+    assert 0 < found.strip_width < 0.7 < case.boundaries.strip_width
+    for u, curve, strip in (
+        (0, found.medial_curve, found.medial),
+        (1, found.lateral_curve, found.lateral),
+    ):
+        gap, _ = cKDTree(curve).query(case.surface.vertices[strip])
+        assert gap.max() < 0.4  # half of the longest edge of a mesh of 0.35 mm
+        assert cKDTree(rim(case, u)).query(curve)[0].max() < 1.0
+    sheet = sample_sheet(case.mesh, solve_coordinates(laplace, found), SheetSettings())
+    step = np.diff(sheet.points, axis=2)
+    thickness = np.linalg.norm(step, axis=3).sum(axis=2)
+    # Without end faces x does not converge beside the edges; in the middle half 2 mm are 2 mm.
+    assert np.nanmedian(thickness[10:31]) == pytest.approx(2.0, abs=0.05)

@@ -195,7 +195,7 @@ def banded(size, rows=slice(10, 11), columns=slice(10, 30)):
     return thickness
 
 
-@pytest.mark.parametrize(("size", "wanted"), [(1.5, "thickness-ridge"), (-1.5, "thickness-groove")])
+@pytest.mark.parametrize(("size", "wanted"), [(2.5, "thickness-ridge"), (-1.2, "thickness-groove")])
 @pytest.mark.parametrize("rows", [slice(10, 11), slice(9, 13)])
 def test_a_band_across_the_axis_is_flagged_where_it_is(size, wanted, rows):
     sheet = plates(thickness=1.7)

@@ -1,6 +1,7 @@
 """The working grid between two planes, and the smoothed mask on it."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hipsta_bids.errors import GeometryError
+from hipsta_bids.geometry import digital
 from hipsta_bids.geometry.ends import EndPlanes
 from hipsta_bids.geometry.grid import continued_nodes, in_plane_voxel
 from hipsta_bids.protocols.protocol import Tissue
@@ -203,3 +205,22 @@ def test_a_body_of_one_slice_at_an_end_goes_on_along_the_axis():
     found = replace(body, inside=inside).outward
     np.testing.assert_allclose(found["posterior"], -body.ends.axis, atol=EXACT)
     np.testing.assert_allclose(found["anterior"], body.ends.axis, atol=0.02)
+
+
+@pytest.mark.parametrize("growth", [0.0, 0.15])
+def test_cross_sections_go_on_changing_beyond_an_end_as_they_do_behind_it(growth):
+    """Two walls lean apart: each mm along the axis, the body is wider by a share of its width."""
+    body = box_body(voxel=0.3, length=9.0)
+    points = digital.voxel_points(np.ones(body.inside.shape, dtype=bool), body.affine)
+    half = 3.0 * (1 + growth * (points[:, 2] - 9.0))
+    inside = (np.abs(points[:, 0] - 3.0) <= half) & (points[:, 1] >= 0) & (points[:, 1] <= 2.4)
+    between = (points[:, 2] > 0) & (points[:, 2] < 9.0)
+    mask = (inside & between).reshape(body.inside.shape)
+    wedge = replace(body, tissue=mask.astype(np.uint8), inside=mask)
+    nodes = np.array([[x, 1.2, 10.5] for x in np.arange(-1.0, 3.0, 0.05)])
+    grid = SimpleNamespace(node_points=nodes.copy)
+    read = continued_nodes(grid, wedge, 0.0)
+    np.testing.assert_allclose(read[:, 2], 9.0, atol=1e-9)
+    expected = 3.0 + (nodes[:, 0] - 3.0) / (1 + 1.5 * growth)
+    # 0.45 mm at the wall without the change; walls are known to a quarter of a voxel.
+    np.testing.assert_allclose(read[:, 0], expected, atol=0.08)

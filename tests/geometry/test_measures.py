@@ -16,6 +16,7 @@ from hipsta_bids.geometry.measures import (
     mean_curvature,
     measure_thickness,
     node_shares,
+    pool_sd,
 )
 from hipsta_bids.settings import MeasureSettings
 
@@ -224,3 +225,15 @@ def test_phantom_curvature_is_the_truth(name, request):
         inner = mean_curvature(case.sheet, level, MEASURES)[6:-6, 4:-4]
         # Second derivatives of voxelized walls: the mean over the middle of the sheet.
         assert inner.mean() == pytest.approx(float(wanted), abs=0.02)
+
+
+def test_sds_are_averaged_as_variances_of_what_is_there():
+    sd = np.arange(1.0, 61.0).reshape(2, 6, 5)
+    sd[0, 2, 2] = np.nan
+    pooled = pool_sd(sd, 3)
+    assert np.isnan(pooled[0, 2, 2])
+    assert pooled[1, 3, 2] == pytest.approx(np.sqrt(np.mean(sd[1, 2:5, 1:4] ** 2)))
+    beside = np.delete(sd[0, 1:4, 2:5].ravel(), 3)  # without the missing one
+    assert pooled[0, 2, 3] == pytest.approx(np.sqrt(np.mean(beside**2)))
+    corner = np.pad(sd[1], 1, mode="edge")[:3, :3]
+    assert pooled[1, 0, 0] == pytest.approx(np.sqrt(np.mean(corner**2)))

@@ -25,6 +25,7 @@ def evidence(arc):
         whole=arc.sheet,
         settings=Settings(),
         coordinates=arc.coordinates,
+        image=(),
         side=5.0,
         solid=arc.solid,
         voxels_across=5.0,
@@ -33,6 +34,7 @@ def evidence(arc):
         label_order=0.95,
         bending=2.4,
         folded=0.0,
+        rivals={},
     )
 
 
@@ -85,11 +87,16 @@ def test_much_repaired(evidence, fraction, wanted):
     assert reasons(replace(evidence, solid=solid)) == wanted
 
 
-@pytest.mark.parametrize("doubt", [0.29, 0.31, float("nan")])
-def test_boundary_doubtful(evidence, doubt):
-    wanted = [] if doubt < 0.3 else ["boundary-doubtful"]
-    boundaries = replace(evidence.boundaries, doubt=doubt)
+@pytest.mark.parametrize(("tilt", "wanted"), [(0, []), (1, ["boundary-doubtful"])])
+def test_a_boundary_of_another_operator_is_flagged(evidence, tilt, wanted):
+    boundaries = replace(evidence.boundaries, tilt=tilt)
     assert reasons(replace(evidence, boundaries=boundaries)) == wanted
+
+
+@pytest.mark.parametrize(("step", "wanted"), [(0.11, []), (0.13, ["second-choice"])])
+def test_a_second_choice_that_moves_the_map_is_flagged(evidence, step, wanted):
+    rivals = {"repair": evidence.thickness + step}
+    assert reasons(replace(evidence, rivals=rivals)) == wanted
 
 
 @pytest.mark.parametrize(

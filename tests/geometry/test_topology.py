@@ -9,7 +9,7 @@ from geometry_cases import field_of, ribbon_mask, solid_of, straight_grid
 from scipy import ndimage
 
 from hipsta_bids.errors import GeometryError
-from hipsta_bids.geometry import digital, topology
+from hipsta_bids.geometry import membranes, topology
 from hipsta_bids.geometry.digital import euler_number
 from hipsta_bids.geometry.grid import Field
 from hipsta_bids.geometry.mesh import extract_surface
@@ -146,16 +146,30 @@ def test_a_strip_beside_a_hole_is_not_severed(monkeypatch):
     repair = only_repair(repaired(mask), "fill")
     at = np.radians(79.5)
     assert distance(repair, (MIDDLE + 12 * np.cos(at), MIDDLE + 12 * np.sin(at), 14)) < 2.5
-    monkeypatch.setattr(digital, "SEVER_FACTOR", 1.0)
+    monkeypatch.setattr(membranes, "SEVER_FACTOR", 1.0)
     careless = repaired(mask)
     assert only_repair(careless, "cut").cost < repair.cost
+
+
+def test_a_membrane_that_costs_little_more_is_a_second_choice(monkeypatch):
+    """Without the price of cuts that sever, filling the hole costs 5.4 times as much as a cut."""
+    monkeypatch.setattr(membranes, "SEVER_FACTOR", 1.0)
+    assert repaired(with_hole_at_the_edge()).rival is None
+    monkeypatch.setattr(membranes, "RIVAL_PRICE", 6.0)
+    solid = repaired(with_hole_at_the_edge())
+    assert only_repair(solid, "cut")
+    hole = with_hole_at_the_edge() != ribbon_mask()
+    hole[ndimage.distance_transform_edt(ribbon_mask()) < 2] = False  # the middle of the wall
+    assert (solid.field.values[hole] < 0).mean() > 0.5
+    assert (solid.rival.values[hole] > 0).mean() > 0.5
+    assert solid_of(solid.rival, TOPOLOGY).euler_after == 1
 
 
 def test_a_cut_that_severs_the_ribbon_is_large_where_nothing_else_helps(monkeypatch):
     mask, *_ = with_bridge()
     assert not only_repair(repaired(mask, flag_cut_cost=1e9), "cut").large
-    monkeypatch.setattr(digital, "SEVER_ALONG", -1.0)
-    monkeypatch.setattr(digital, "SEVER_FACTOR", 1.001)
+    monkeypatch.setattr(membranes, "SEVER_ALONG", -1.0)
+    monkeypatch.setattr(membranes, "SEVER_FACTOR", 1.001)
     assert only_repair(repaired(mask, flag_cut_cost=1e9), "cut").large
 
 

@@ -100,6 +100,20 @@ def test_without_anisotropy_diffusion_is_even(slab):
         assert difference < 1e-10 * abs(plain.stiffness).max()
 
 
+def test_the_published_operator_is_lapys(slab):
+    """Both principal curvatures slow diffusion, without a threshold."""
+    settings = BoundarySettings(operator="published", anisotropy=40.0)
+    wall = Wall(slab.surface, settings)
+    mesh = type("TriaMesh", (_Mesh,), {})(wall.vertices, wall.triangles)  # LaPy asks for its name
+    lapys = Solver(mesh, lump=True, aniso=(40.0, 40.0), aniso_smooth=CURVATURE_SMOOTHING)
+    difference = abs(wall.operator(settings).stiffness - lapys.stiffness).max()
+    assert difference < 1e-10 * abs(lapys.stiffness).max()  # rounding
+    assert abs(wall.operator(SETTINGS).stiffness - lapys.stiffness).max() > 0.01
+    # Curves are moved to the middle of the edges by the operator with a threshold and a floor.
+    usual = Wall(slab.surface, BoundarySettings(anisotropy=40.0)).evenly_aware
+    assert abs(wall.evenly_aware.stiffness - usual.stiffness).max() == 0
+
+
 def test_curvature_is_from_the_edges_that_lapy_lists(wall):
     """Ours takes an eighth of the time."""
     quick = _Mesh(wall.vertices, wall.triangles)

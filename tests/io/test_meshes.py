@@ -3,8 +3,7 @@ import numpy as np
 import pytest
 
 from hipsta_bids.errors import InputError, UsageError
-from hipsta_bids.io.gifti import sheet_triangles
-from hipsta_bids.io.meshes import ENDINGS, read_surface, write_surface
+from hipsta_bids.io.gifti import ENDINGS, read_surface, sheet_triangles, write_surface
 from hipsta_bids.types import Mesh
 
 NX, NY = 5, 4

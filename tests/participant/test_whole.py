@@ -321,7 +321,7 @@ def test_uncertainty_is_that_of_the_whole_sheet(out: Path) -> None:
     sheet, sd = sheet_of(out), pd.read_csv(path, sep="\t").thickness_sd
     assert sd[sheet.thickness.isna()].isna().all()
     assert sd[sheet.thickness.notna()].notna().mean() > 0.9
-    assert 0 < sd.median() < 0.2
+    assert 0.1 < sd.median() < 0.4  # mm; boundaries are drawn 0.3 mm elsewhere
     record = json.loads(next(out.glob("sub-01/anat/*_desc-qc_metrics.json")).read_text())
     assert record["metrics"]["uncertainty_failed"] == 0
 

@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 
 from hipsta_bids.cli import main
-from hipsta_bids.cli.commands import PHANTOM_EPILOG
+from hipsta_bids.cli.commands import phantom_parser
 from hipsta_bids.errors import ExitCode, UsageError
 from hipsta_bids.inputs.scan import InputRequest
 from hipsta_bids.inputs.search import find_hemispheres
@@ -162,7 +162,7 @@ def test_every_region_can_be_thinned(region):
 
 
 def test_help_names_the_regions():
-    words = PHANTOM_EPILOG.split("\n", maxsplit=1)[0]
+    words = phantom_parser().epilog.split("\n", maxsplit=1)[0]
     assert all(name.removesuffix("-anterior").removesuffix("-posterior") in words
                for name in REGIONS)  # fmt: skip
 

@@ -14,10 +14,11 @@ from reference_pages import reasons_page
 from hipsta_bids.cli.group import group_parser
 from hipsta_bids.cli.participant import build_parser
 from hipsta_bids.errors import HipstaError
-from hipsta_bids.reports.page import reason_actions, reason_sections
+from hipsta_bids.reports.page import read_table
 from hipsta_bids.types import Flag
 
-ROWS = [(name, row) for section in reason_sections() for name, row in section.reasons.items()]
+TABLE = read_table("reasons.toml")
+ROWS = [pair for section in TABLE["section"] for pair in section["reasons"].items()]
 
 
 def test_each_reason_has_one_row():
@@ -35,17 +36,17 @@ def test_an_unknown_reason_is_noticed(kind):
 
 
 def test_each_reason_says_what_kind_of_thing_to_do():
-    assert {row.action for _, row in ROWS} == set(reason_actions())
+    assert {row["action"] for _, row in ROWS} == set(TABLE["actions"])
 
 
 def test_the_page_has_each_reason_under_what_to_do():
     page = reasons_page()
     for (action, title), following in zip(
-        reason_actions().items(), [*list(reason_actions().values())[1:], "Exit codes"], strict=True
+        TABLE["actions"].items(), [*list(TABLE["actions"].values())[1:], "Exit codes"], strict=True
     ):
         part = page.split(f"\n## {title}\n")[1].split(f"\n## {following}\n")[0]
         names = re.findall(r"^#### `(.+)`$", part, re.MULTILINE)
-        assert sorted(names) == sorted(name for name, row in ROWS if row.action == action)
+        assert sorted(names) == sorted(name for name, row in ROWS if row["action"] == action)
 
 
 def test_the_table_has_no_leftovers():
@@ -61,11 +62,11 @@ def test_options_in_remedies_exist():
         for action in parser._actions
         for name in action.option_strings
     }
-    words = " ".join(f"{row.meaning} {row.remedy}" for _, row in ROWS)
+    words = " ".join(f"{row['meaning']} {row['remedy']}" for _, row in ROWS)
     assert set(re.findall(r"--[a-z][a-z-]+", words)) - {"--array"} <= known
 
 
 def test_meanings_and_remedies_are_sentences():
     for name, row in ROWS:
-        assert row.meaning.endswith("."), name
-        assert row.remedy.endswith("."), name
+        assert row["meaning"].endswith("."), name
+        assert row["remedy"].endswith("."), name

@@ -26,7 +26,7 @@ def make(root, subject, values, *, hemi="L", status="ok", **record):
     result.path("qc").parent.mkdir(parents=True, exist_ok=True)
     result.path("qc").write_text(json.dumps({"status": status, **record}))
     if status != "failed":
-        names = [measure.name for measure in MEASURES]
+        names = list(MEASURES)
         result.path("summary").write_text(
             "\t".join(names) + "\n" + "\t".join(f"{v}" for v in values) + "\n"
         )
@@ -57,7 +57,7 @@ def test_one_who_stands_apart_is_found_and_named(tmp_path):
     found = distances(cohort, {})
     farthest = max(found, key=lambda title: found[title][0])
     assert farthest == "sub-03_hemi-L_seg-P"
-    assert found[farthest][1] == MEASURES[2].title
+    assert found[farthest][1] == list(MEASURES.values())[2]["title"]
     assert found[farthest][0] > 30  # 1.0 away where the SD is 0.01, known to a third
 
 
@@ -84,7 +84,7 @@ def test_failed_ones_and_other_sides_are_not_in_the_range(tmp_path):
     make(tmp_path, "03", (), status="failed")
     cohort = read_cohort(tmp_path)
     assert len(cohort.hemispheres) == 3
-    assert cohort.values(name, MEASURES[0].name).tolist() == [1.0]
+    assert cohort.values(name, next(iter(MEASURES))).tolist() == [1.0]
 
 
 def test_damaged_records_are_left_out(tmp_path):
@@ -103,8 +103,7 @@ def test_the_last_run_that_measured_a_hemisphere_is_its_origin(tmp_path):
     for day, outcome in ((1, "ok"), (2, "repaired"), (3, "unchanged, skipped (repaired)")):
         text = line.format(day, f"command: run {day}") + line.format(day, f"{title}: {outcome}")
         (logs / f"run-2026010{day}T100000-1.log").write_text(text)
-    origin = read_cohort(tmp_path).origins[title]
-    assert (origin.command, origin.time) == ("run 2", "2026-01-02 10:00")
+    assert read_cohort(tmp_path).origins[title] == ("run 2", "2026-01-02 10:00")
 
 
 def test_places_in_messages_are_found_and_folders_are_not_told(tmp_path):

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from hipsta_bids.reports.cells import FILTERS
 from hipsta_bids.reports.participant import _quality_numbers
-from hipsta_bids.reports.slices import cut, outline, path_data, png_address
+from hipsta_bids.reports.slices import cut, image_address, outline, path_data
 
 
 def test_a_cut_through_a_tilted_plane_is_a_straight_line():
@@ -58,7 +59,7 @@ def test_lines_that_meet_are_joined_whichever_way_they_run():
 
 def test_pictures_come_back_as_they_were():
     pixels = np.arange(2 * 3 * 4, dtype=np.uint8).reshape(2, 3, 4)
-    encoded = png_address(pixels).removeprefix("data:image/png;base64,")
+    encoded = image_address(pixels, "png").removeprefix("data:image/png;base64,")
     read = np.asarray(Image.open(io.BytesIO(base64.b64decode(encoded))))
     np.testing.assert_array_equal(read, pixels)
 
@@ -78,12 +79,14 @@ def test_bodies_of_both_sides_of_quite_different_length_are_marked(lengths, mark
         cohort = SimpleNamespace(settings={})
         series = SimpleNamespace(measured=list(sides), cohort=cohort, whole=False)
         rows = _quality_numbers(series)["rows"]
-        return {usual.title: (usual, values) for usual, values in rows}.get(
+        return {usual["title"]: (usual, values) for usual, values in rows}.get(
             "Difference of these distances"
         )
 
     usual, values = row(*measured)
     difference = lengths[0] - lengths[1]
-    assert [usual.text(value) for value in values] == [f"{difference:g} mm", f"{-difference:g} mm"]
-    assert [usual.excludes(value) for value in values] == [marked, marked]
+    texts = [FILTERS["quality"](value, usual) for value in values]
+    assert texts == [f"{difference:g} mm", f"{-difference:g} mm"]
+    assert [usual["low"] <= value <= usual["high"] for value in values] == [not marked] * 2
+    assert FILTERS["usual_range"](usual) == f"{usual['low']:g} mm to {usual['high']:g} mm"
     assert row(measured[0]) is None  # there is nothing to compare

@@ -211,9 +211,8 @@ def test_reports_only_of_nothing_says_so(tmp_path, capsys):
 
 def test_a_page_that_cannot_be_made_is_a_warning(copy, monkeypatch):
     monkeypatch.setattr("hipsta_bids.reports.participant.participant_page", lambda *_: 1 / 0)
-    job = reporting.PageJob(root=copy, visit=("01", None))
-    problem = reporting.make_page(job)
-    assert problem.message == "sub-01.html: not made (ZeroDivisionError: division by zero)"
+    problem = reporting.make_page((copy, ("01", None), None))
+    assert str(problem) == "sub-01.html: not made (ZeroDivisionError: division by zero)"
 
 
 def run_block(root, error=None, *, wanted=True):

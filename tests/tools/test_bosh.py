@@ -46,7 +46,7 @@ SAMPLES = {
     "visits": "0,12,24",
     "contrast": ["group[NAME]-group[SEG]", "age"],
     "formula": "thickness ~ group * age",
-    "exclude_qc": "a > 1 or b < 2",
+    "exclude_qc": ["a > 1", "b < 2"],
 }
 
 

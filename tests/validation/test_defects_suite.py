@@ -119,7 +119,7 @@ def test_the_tables_show_every_case_and_miss_crashes(monkeypatch):
         results[2] = Refusal(reason="crash", message="bug")
         return results
 
-    monkeypatch.setattr(defects, "run_cases", some)
+    monkeypatch.setattr(defects.cases, "run_cases", some)
     suite = defects.run(False)
     cases, totals = suite.tables
     assert len(cases.rows) == len(defects.PLAN[::3])

@@ -9,7 +9,7 @@ from hipsta_bids.geometry import ends as geometry_ends
 from hipsta_bids.settings import Settings
 from validation import ends
 from validation.cases import Refusal, measure_body
-from validation.ends import ENDS, FOUND, KEPT, Found, Job, Oblique, find_ends
+from validation.ends import ENDS, FOUND, KEPT, Found, Job, find_ends
 
 JOB = Job(body=ends.PHANTOMS[0], copies=((0.4, 0.5, 0.0), (2.0, 0.0, 8.0)))
 
@@ -75,25 +75,29 @@ def test_spreads_are_judged(result, met):
 
 @pytest.mark.long
 def test_rows_at_oblique_planes_meet_the_target_and_miss_it_where_the_mesh_ends_there(monkeypatch):
-    case = Oblique(spec=replace(ends.OBLIQUE[0], length=14.0), degrees=35.0, about="thickness")
+    case = replace(ends.OBLIQUE[0], length=14.0), 35.0, "thickness"
     right = ends.measure_oblique(case)
     up_to_the_planes = Settings().changed(grid={"beyond": 0.0})
     monkeypatch.setattr(
-        ends, "measure_body", lambda volume, hemi: measure_body(volume, hemi, up_to_the_planes)
+        ends.cases,
+        "measure_body",
+        lambda volume, hemi: measure_body(volume, hemi, up_to_the_planes),
     )
     rows = ends._oblique_table([case, case], [right, ends.measure_oblique(case)]).rows
     assert [row["met"] for row in rows] == [True, False]
 
 
 def test_refused_planes_miss_the_target_and_are_explained():
-    case = Oblique(spec=ends.OBLIQUE[0], degrees=35.0, about="width")
+    case = ends.OBLIQUE[0], 35.0, "width"
     table = ends._oblique_table([case], [Refusal(reason="topology", message="a knot")])
     assert table.rows[0]["met"] is False
     assert "35° about the width: topology: a knot" in table.notes
 
 
 def test_a_short_run_says_what_was_left_out(monkeypatch):
-    monkeypatch.setattr(ends, "run_cases", lambda work, cases, **_: [work(case) for case in cases])
+    monkeypatch.setattr(
+        ends.cases, "run_cases", lambda work, group, **_: [work(one) for one in group]
+    )
     suite = ends.run(False)
     assert "Real labels were left out" in suite.text
     assert [table.missed for table in suite.tables] == [0, 0, 0]

@@ -27,7 +27,7 @@ def test_registered_must_pass_and_unregistered_must_fail(monkeypatch, unregister
     for name in ("_corrections", "_amplitudes", "_together", "repeated_visits"):
         monkeypatch.setattr(group, name, lambda *_: "")
     (table,) = group.run(full=False).tables
-    assert table.targets == 3
+    assert table.targets == 2
     assert table.missed == missed
 
 

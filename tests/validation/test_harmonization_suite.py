@@ -7,12 +7,7 @@ import pytest
 
 from hipsta_bids.group.design.settings import GroupSettings
 from validation import harmonization
-from validation.harmonization import (
-    SitesPlan,
-    analyze_sites,
-    left_over,
-    simulate_sites,
-)
+from validation.harmonization import SitesPlan, analyze_sites, left_over, simulate_sites
 
 PLAN = SitesPlan(nodes=(11, 9))
 SETTINGS = GroupSettings()
@@ -20,12 +15,13 @@ SEEDS = range(12)
 
 
 def test_cohort_has_what_was_planted():
-    cohort = simulate_sites(replace(PLAN, sizes=(400,) * 5, missing=0.0), 1)
-    sd = np.array([cohort.values[cohort.site == site].std(axis=0).mean() for site in range(5)])
+    plan = replace(PLAN, sizes=(400,) * 5, missing=0.0)
+    values, visits, shift, scale = simulate_sites(plan, 1)
+    sd = np.array([values[visits.site == site].std(axis=0).mean() for site in range(5)])
     # The group and age add 0.35 to the SD of 1, squared.
-    expected = np.sqrt(np.mean(cohort.scale**2, axis=1) + 0.1)
+    expected = np.sqrt(np.mean(scale**2, axis=1) + 0.1)
     np.testing.assert_allclose(sd, expected, rtol=0.06)
-    assert np.ptp(cohort.shift.mean(axis=1)) == pytest.approx(1.1, abs=0.15)
+    assert np.ptp(shift.mean(axis=1)) == pytest.approx(1.1, abs=0.15)
 
 
 def test_means_of_sites_are_taken_out():

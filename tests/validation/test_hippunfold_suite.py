@@ -1,21 +1,10 @@
 """The suite about HippUnfold: two maps are compared, and the suite says where there are none."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
 from validation.cases import Refusal
-from validation.hippunfold import (
-    DRAWN,
-    OWN,
-    Pair,
-    _alone_row,
-    _fill,
-    _row,
-    _whole_rows,
-    run,
-)
+from validation.hippunfold import DRAWN, OWN, _alone_row, _fill, _row, _whole_rows, run
 from validation.report import page
 
 RANDOM = np.random.default_rng(3)
@@ -25,8 +14,7 @@ THEIRS = RANDOM.uniform(1.0, 2.0, (41, 21))
 def pair(bias=0.0, noise=0.0, edges=0.0):
     ours = THEIRS + bias + noise * RANDOM.normal(size=THEIRS.shape)
     ours[:4] += edges
-    maps = SimpleNamespace(thickness=ours)
-    return Pair(maps=maps, theirs=THEIRS)
+    return ours, THEIRS
 
 
 @pytest.mark.parametrize(

@@ -96,7 +96,7 @@ def test_a_short_run_plants_one_of_each_in_a_phantom(monkeypatch):
         lost = Refusal(reason="crash", message="bug")
         return {name: [lost for _ in cases] for name, cases in groups.items()}
 
-    monkeypatch.setattr(mending, "run_groups", none)
+    monkeypatch.setattr(mending.cases, "run_groups", none)
     suite = mending.run(False)
     assert "Real labels were left out" in suite.text
     assert [(table.targets, table.missed) for table in suite.tables] == [(1, 1)] * 3

@@ -28,7 +28,7 @@ def compared(*, noise=0.0, problems=()):
 
 
 def run_with(monkeypatch, results, *, full=False):
-    monkeypatch.setattr(surrogate, "run_cases", lambda _, bodies: results[: len(bodies)])
+    monkeypatch.setattr(surrogate.cases, "run_cases", lambda _, bodies: results[: len(bodies)])
     return surrogate.run(full)
 
 

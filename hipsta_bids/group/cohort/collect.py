@@ -14,7 +14,7 @@ from hipsta_bids.derivatives.dataset import NOT_FINISHED, name_of, read_status
 from hipsta_bids.derivatives.names import DATASET_FILES, HemisphereName
 from hipsta_bids.errors import InputError, NothingToDoError
 from hipsta_bids.group.cohort.covariates import relocate
-from hipsta_bids.group.cohort.exclusions import SHOWN, Choices, QualityCondition, read_choices
+from hipsta_bids.group.cohort.exclusions import SHOWN, Choices, Condition, fulfilled
 from hipsta_bids.io import files
 from hipsta_bids.io.files import checked_foreign
 from hipsta_bids.protocols.toml import settings_hash
@@ -39,7 +39,7 @@ class GroupRequest:
     sessions: tuple[str, ...] = ()
     """Labels without ``ses-``; empty is all."""
     exclude_flagged: bool = False
-    exclude_quality: QualityCondition | None = None
+    exclude_qc: tuple[Condition, ...] = ()
     exclude_table: Path | None = None
     """Participants, or single sessions and hemispheres, to leave out."""
     ratings: Path | None = None
@@ -131,7 +131,7 @@ def collect_sheets(request: GroupRequest, *, may_lack: bool = False) -> Collecti
     seg = _one_protocol(places, results, request)
     places = [result for result in places if result.name.seg == seg]
     _refuse_twice(places)
-    choices = read_choices(request.exclude_table, request.ratings)
+    choices = Choices(request.exclude_table, request.ratings)
     records: list[SheetRecord] = []
     left_out: list[Exclusion] = []
     for result in sorted(places, key=_key):
@@ -187,7 +187,7 @@ def _several_versions(records: Sequence[SheetRecord]) -> tuple[str, ...]:
 
 def wanted_by(request: GroupRequest) -> Callable[[str, str | None, str], bool]:
     """Tell whether a hemisphere is asked for, and not in a table of those to leave out."""
-    choices = read_choices(request.exclude_table, request.ratings)
+    choices = Choices(request.exclude_table, request.ratings)
 
     def is_wanted(subject: str, session: str | None, hemi: str) -> bool:
         name = HemisphereName(subject=subject, session=session, hemi=hemi, seg="")
@@ -274,8 +274,8 @@ def _judge(
         reason = f"failed: {reason}"
     elif request.exclude_flagged and status == Status.FLAGGED:
         reason = f"flagged: {reason}"
-    elif request.exclude_quality is not None and request.exclude_quality.holds(_metrics(record)):
-        reason, message = "quality", request.exclude_quality.text
+    elif request.exclude_qc and (condition := fulfilled(request.exclude_qc, _metrics(record))):
+        reason, message = "quality", condition
     else:
         inputs = record.get("inputs") or [{}]
         return SheetRecord(

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Mapping, Sequence
+from functools import cache
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -29,13 +30,9 @@ _LONGEST_NAME = 40
 
 def locate_sources(sources: Sequence[str], roots: Sequence[Path]) -> list[Path | None]:
     """Paths of segmentations, from their addresses in the quality records of datasets."""
-    links: dict[Path, Mapping[str, str]] = {}
-    result = []
-    for source, root in zip(sources, roots, strict=True):
-        if root not in links:
-            links[root] = read_links(root)
-        result.append(linked_path(source, root, links[root]))
-    return result
+    links = cache(read_links)
+    pairs = zip(sources, roots, strict=True)
+    return [linked_path(source, root, links(root)) for source, root in pairs]
 
 
 def relocate(source: str, folders: Sequence[Path]) -> str:
@@ -136,12 +133,9 @@ def _cleaned(table: pd.DataFrame) -> pd.DataFrame:
     table = table.map(str.strip)
     for column, prefix in ((PARTICIPANT, "sub-"), (SESSION, "ses-")):
         if column in table.columns:
-            table[column] = [_prefixed(cell, prefix) for cell in table[column]]
+            has_prefix = (table[column] == files.MISSING) | table[column].str.startswith(prefix)
+            table[column] = table[column].where(has_prefix, prefix + table[column])
     return table.where(table != files.MISSING, None)
-
-
-def _prefixed(cell: str, prefix: str) -> str:
-    return cell if cell == files.MISSING or cell.startswith(prefix) else prefix + cell
 
 
 def _join_sessions(joined: pd.DataFrame, bids_dir: Path) -> pd.DataFrame:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.design.formula import listed
-from hipsta_bids.group.design.model import BOTH, Comparison, asymmetry, asymmetry_name
+from hipsta_bids.group.design.model import BOTH, Comparison, asymmetry_name
 from hipsta_bids.group.stats.arrays import Bool, Float, Int, SideMaps
 from hipsta_bids.types import PARTICIPANT, SESSION
 
@@ -166,14 +166,15 @@ def asymmetry_maps(cohort: Cohort, measures: Sequence[str], relative: Sequence[s
         raise ModelError("asymmetry: no participant has both hemispheres")
     names = tuple(dict.fromkeys((*left.names, *right.names)))
     codes = np.array([*(names.index(name) for name in left.names), -1], dtype=np.int8)
+    maps = {}
+    for name in measures:
+        of_left, of_right = left.maps[name][a], right.maps[name][b]
+        mean = (of_left + of_right) / 2
+        unit = np.where(mean > 0, mean, np.nan) if name in relative else 1.0
+        maps[asymmetry_name(name)] = (of_left - of_right) / unit
     return SideMaps(
         rows=rows,
-        maps={
-            asymmetry_name(name): asymmetry(
-                left.maps[name][a], right.maps[name][b], relative=name in relative
-            )
-            for name in measures
-        },
+        maps=maps,
         subfield=codes[left.subfield[a]],
         names=names,
         summary=pd.DataFrame(index=range(len(rows))),

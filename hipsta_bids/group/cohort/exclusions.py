@@ -1,12 +1,10 @@
 """Which hemispheres a person leaves out: tables, ratings, and conditions on quality metrics."""
 
-import ast
 import difflib
 import operator
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -19,20 +17,18 @@ from hipsta_bids.reports.verdict import RATINGS
 SHOWN = 4
 _RATING, _HASH = "rating", "input_hash"
 _NO_RATING = "unrated"
-_ALLOWED = "may hold comparisons, and, or, not, + - * / only"
-_LONGEST = 500  # characters of a condition
-_OPERATORS: Mapping[type[ast.AST], Callable[[Any, Any], Any]] = {
-    ast.Lt: operator.lt,
-    ast.LtE: operator.le,
-    ast.Gt: operator.gt,
-    ast.GtE: operator.ge,
-    ast.Eq: operator.eq,
-    ast.NotEq: operator.ne,
-    ast.Add: operator.add,
-    ast.Sub: operator.sub,
-    ast.Mult: operator.mul,
-    ast.Div: operator.truediv,
+#: Comparisons of a condition on a quality metric.
+_OPERATORS: Mapping[str, Callable[[float, float], bool]] = {
+    "<": operator.lt,
+    "<=": operator.le,
+    ">": operator.gt,
+    ">=": operator.ge,
+    "==": operator.eq,
+    "!=": operator.ne,
 }
+
+Condition = tuple[str, str, float]
+"""Quality metric, a key of ``_OPERATORS``, and the number to compare with."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,14 +83,19 @@ class UserTable:
         return notes
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
 class Choices:
-    """What a person says about hemispheres."""
+    """What a person says about hemispheres: a table of those to leave out, and one of ratings.
 
-    excluded: UserTable
-    """To leave out."""
-    rated: UserTable
-    """To use or to leave out."""
+    A table of ratings may stand for one of exclusions. InputError if a table lacks a column, or has
+    another rating than `RATINGS`.
+    """
+
+    def __init__(self, exclusions: Path | None, ratings: Path | None) -> None:
+        excluded = [] if exclusions is None else _read(exclusions, ())
+        rated = [] if ratings is None else _read(ratings, (_RATING,))
+        last = [row for row in excluded if row.get(_RATING, RATINGS[-1]) == RATINGS[-1]]
+        self.excluded = UserTable(exclusions, tuple(last))
+        self.rated = UserTable(ratings, tuple(rated))
 
     def reason_to_leave_out(
         self, name: HemisphereName, digest: str | None
@@ -116,22 +117,6 @@ class Choices:
             ratings = {row[_RATING] for row in self.rated.applying(name, digest)}
             counts[next((word for word in reversed(RATINGS) if word in ratings), _NO_RATING)] += 1
         return counts
-
-
-def read_choices(exclusions: Path | None, ratings: Path | None) -> Choices:
-    """Read the user's tables; one of ratings may stand for one of exclusions.
-
-    InputError if a table lacks a column, or has another rating than `RATINGS`.
-    """
-    excluded = [] if exclusions is None else _read(exclusions, ())
-    rated = [] if ratings is None else _read(ratings, (_RATING,))
-    return Choices(
-        excluded=UserTable(
-            exclusions,
-            tuple(row for row in excluded if row.get(_RATING, RATINGS[-1]) == RATINGS[-1]),
-        ),
-        rated=UserTable(ratings, tuple(rated)),
-    )
 
 
 def _read(path: Path, needed: Sequence[str]) -> list[dict[str, str]]:
@@ -181,72 +166,18 @@ def is_listed(name: HemisphereName, row: Mapping[str, str]) -> bool:
     return True
 
 
-class QualityCondition:
-    """A condition on quality metrics, such as ``filled_fraction > 0.01 or voxels_across < 3``."""
-
-    def __init__(self, text: str) -> None:
-        self.text = text[:_LONGEST]
-        if len(text) > _LONGEST:
-            raise self._refusal(f"... is too long; {_LONGEST} characters are the limit")
-        try:
-            self._tree = ast.parse(text.strip(), mode="eval").body
-        except (SyntaxError, ValueError) as error:  # ValueError: a null byte
-            raise self._refusal("cannot be read; write it as filled_fraction > 0.01") from error
-
-    def holds(self, metrics: Mapping[str, Any]) -> bool:
-        """Evaluate the condition; comparisons with missing metrics do not hold."""
-        return self._true(self._tree, metrics)
-
-    def _true(self, node: ast.expr, metrics: Mapping[str, Any]) -> bool:
-        value = self._value(node, metrics)
-        if not isinstance(value, (bool, type(None))):
-            raise self._refusal("has a part that compares nothing; write filled_fraction > 0.01")
-        return bool(value)
-
-    def _value(self, node: ast.expr, metrics: Mapping[str, Any]) -> Any:  # noqa: ANN401 -- of the metric
-        value: Any = None
-        match node:
-            case ast.Constant():
-                value = node.value
-            case ast.Name(id=name):
-                value = self._metric(name, metrics)
-            case ast.Compare():
-                values = [self._value(part, metrics) for part in (node.left, *node.comparators)]
-                pairs = zip(node.ops, pairwise(values), strict=True)
-                value = all(self._act(sign, a, b) for sign, (a, b) in pairs)
-            case ast.BoolOp(op=ast.And()):
-                value = all(self._true(part, metrics) for part in node.values)
-            case ast.BoolOp():
-                value = any(self._true(part, metrics) for part in node.values)
-            case ast.UnaryOp(op=ast.Not()):
-                value = not self._true(node.operand, metrics)
-            case ast.UnaryOp(op=ast.USub()):
-                value = self._act(ast.Sub(), 0, self._value(node.operand, metrics))
-            case ast.BinOp():
-                a, b = self._value(node.left, metrics), self._value(node.right, metrics)
-                value = self._act(node.op, a, b)
-            case _:
-                raise self._refusal(_ALLOWED)
-        return value
-
-    def _act(self, sign: ast.AST, a: Any, b: Any) -> Any:  # noqa: ANN401 -- as above
-        if type(sign) not in _OPERATORS:
-            raise self._refusal(_ALLOWED)
-        if a is None or b is None:
-            return None
-        if isinstance(sign, ast.operator) and (isinstance(a, str) or isinstance(b, str)):
-            raise self._refusal(f"cannot combine {a!r} and {b!r}")
-        try:
-            return _OPERATORS[type(sign)](a, b)
-        except (TypeError, ZeroDivisionError) as error:
-            raise self._refusal(f"cannot combine {a!r} and {b!r}") from error
-
-    def _metric(self, name: str, metrics: Mapping[str, Any]) -> Any:  # noqa: ANN401 -- as above
+def fulfilled(conditions: Sequence[Condition], metrics: Mapping[str, Any]) -> str | None:
+    """Return the first condition that quality metrics fulfill; missing ones fulfill none."""
+    for name, sign, limit in conditions:
         if name not in metrics:
             near = difflib.get_close_matches(name, metrics, n=1)
             hint = f"did you mean {near[0]}?" if near else "see the desc-qc_metrics.json files"
-            raise self._refusal(f"has {name!r}, which is no quality metric; {hint}")
-        return metrics[name]
-
-    def _refusal(self, problem: str) -> UsageError:
-        return UsageError(f"--exclude-qc {self.text!r} {problem}")
+            raise UsageError(f"--exclude-qc: {name!r} is no quality metric; {hint}")
+        value = metrics[name]
+        if value is None:
+            continue
+        if not isinstance(value, int | float):
+            raise UsageError(f"--exclude-qc: {name} is {value!r}, no number; choose another metric")
+        if _OPERATORS[sign](value, limit):
+            return f"{name} {sign} {limit:.10g}"
+    return None

@@ -12,7 +12,7 @@ import pandas as pd
 
 from hipsta_bids import opening
 from hipsta_bids.errors import InputError, NothingToDoError, UsageError
-from hipsta_bids.geometry.catalog import MAPS, why_impossible
+from hipsta_bids.geometry.catalog import why_impossible
 from hipsta_bids.group.cohort.collect import SheetRecord
 from hipsta_bids.group.cohort.covariates import locate_sources
 from hipsta_bids.group.cohort.data import Cohort
@@ -22,8 +22,7 @@ from hipsta_bids.inputs.layouts import volume_table
 from hipsta_bids.inputs.maps import Found, check_pattern, fields_of, fill, find, scan
 from hipsta_bids.io import files
 from hipsta_bids.io.files import entities
-from hipsta_bids.io.gifti import DENSE_SCALARS, PointMap, cifti_sides, read_map
-from hipsta_bids.io.meshes import read_surface
+from hipsta_bids.io.gifti import DENSE_SCALARS, PointMap, cifti_sides, read_map, read_surface
 from hipsta_bids.types import Mesh, VisitKey
 
 
@@ -86,11 +85,6 @@ def map_patterns(
         MapPattern(name=name, pattern=pattern, surface=pattern_of.get(name, pattern_of.get(None)))
         for name, pattern in patterns
     )
-
-
-def taken_names(*, with_sheets: bool) -> tuple[str, ...]:
-    """Names that are taken by the maps of the sheets."""
-    return tuple(row.name for row in MAPS) if with_sheets else ()
 
 
 def find_maps(
@@ -286,7 +280,7 @@ def add_external(
             on_mesh = any(side.mesh is not None for side in sides_of_map.values())
             axes = measured if on_mesh else _on_grid(measured, _nodes(sides_of_map))
             cohorts[name] = Cohort(
-                table=measured.visits, sides=sides_of_map, x=axes.x, y=axes.y, units=units
+                table=measured.table, sides=sides_of_map, x=axes.x, y=axes.y, units=units
             )
     if cohorts:
         notes.append(f"maps {', '.join(cohorts)}: not registered, their points are to correspond")
@@ -475,7 +469,7 @@ def add_volumes(
     tables = [table for table in _beside(records) if table.name not in named]
     for name, pattern in patterns:
         tables += _matching(name, pattern, root, measured)
-    frames, notes = join_volumes(tables, measured.visits.index, strict=named)
+    frames, notes = join_volumes(tables, measured.table.index, strict=named)
     sides = {
         hemi: side.with_summary(frames[hemi].iloc[side.rows]) if hemi in frames else side
         for hemi, side in measured.sides.items()
@@ -503,7 +497,7 @@ def _matching(name: str, pattern: str, root: Path, measured: Measured) -> list[V
     tables = [
         VolumeTable(name=name, visit=visit, path=one.path, hemi=one.hemi)
         for visit, one in matches
-        if visit in measured.visits.index
+        if visit in measured.table.index
     ]
     if not tables:
         raise NothingToDoError(

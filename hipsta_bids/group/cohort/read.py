@@ -2,20 +2,19 @@
 
 import difflib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from scipy.ndimage import uniform_filter
 
 from hipsta_bids.derivatives import hemisphere
 from hipsta_bids.errors import InputError
 from hipsta_bids.geometry.catalog import MAPS, why_impossible
 from hipsta_bids.geometry.sheet import sheet_levels
 from hipsta_bids.group.cohort.collect import Exclusion, SheetRecord
-from hipsta_bids.group.cohort.data import Measures
+from hipsta_bids.group.cohort.data import Cohort, Measures
 from hipsta_bids.group.stats.arrays import MOST_KEPT, Float, SideMaps, blocks
 from hipsta_bids.protocols import EXPERIMENTAL
 from hipsta_bids.settings import SheetSettings
@@ -45,11 +44,15 @@ def choose_measures(
     """Tell maps from summary measures."""
     if not requested:
         return Measures(maps=(*(DEFAULT if records else ()), *further))
-    summaries = _summary_names(records)
+    summaries = tuple(hemisphere.read_summary(records[0].result)) if records else ()
     available = [*(SHEET_MAPS if records else ()), *further, *_sampled(records), *summaries]
     maps, numbers = [], []
     for name in requested:
-        if name in further or (records and name in SHEET_MAPS) or _is_sampled(name, records):
+        if (
+            name in further
+            or (records and name in SHEET_MAPS)
+            or any(_sampled_table(record, name).is_file() for record in records)
+        ):
             maps.append(name)
         elif name in summaries or name.startswith(VOLUME):
             numbers.append(name)
@@ -75,10 +78,6 @@ def _unknown(name: str, available: Sequence[str], hint: str) -> InputError:
     return InputError(f"no measure is called {name!r}; {hint}")
 
 
-def _is_sampled(name: str, records: Sequence[SheetRecord]) -> bool:
-    return any(_sampled_table(record, name).is_file() for record in records)
-
-
 def _sampled(records: Sequence[SheetRecord]) -> list[str]:
     """Names of the sampled maps of the first hemisphere."""
     if not records:
@@ -89,20 +88,10 @@ def _sampled(records: Sequence[SheetRecord]) -> list[str]:
     return sorted(path.name.removeprefix(start).removesuffix(end) for path in paths)
 
 
-def _summary_names(records: Sequence[SheetRecord]) -> tuple[str, ...]:
-    return tuple(hemisphere.read_summary(records[0].result)) if records else ()
-
-
-@dataclass(frozen=True, kw_only=True)
-class Measured:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Measured(Cohort):
     """Sheets and summaries, before covariates are known."""
 
-    visits: pd.DataFrame
-    """Participant and session, one row per visit; the index has the names of visits."""
-    sides: Mapping[str, SideMaps]
-    x: Float
-    y: Float
-    units: Mapping[str, str]
     sources: Mapping[str, tuple[str, Path]]
     """Address of one segmentation, and the dataset whose record has it, of visits with sheets."""
     damaged: tuple[Exclusion, ...] = ()
@@ -116,15 +105,12 @@ def read_sheets(
     visits: Sequence[VisitKey] | None = None,
     *,
     max_gap: float,
-    error_window: int = 0,
 ) -> Measured:
-    """Read all sheets and summaries, and the SDs of the maps if they have a window.
+    """Read all sheets and summaries.
 
     Hemispheres with empty or impossible maps or summaries are left out, as those of which a larger
     share of the curvature profile than ``max_gap`` has no value.
     """
-    if error_window:
-        _check_errors(records, maps)
     region = records[0].result.name.region if records else "body"
     x, y = node_coordinates(grid, region)
     shape = len(x), len(y)
@@ -159,9 +145,6 @@ def read_sheets(
             if region in EXPERIMENTAL:
                 for values in sides[hemi].maps.values():
                     leave_rare(values)
-        if records_of_side and error_window:
-            errors = _read_errors(records_of_side, shape, maps, error_window)
-            sides[hemi] = replace(sides[hemi], errors=errors)
     table = pd.DataFrame(
         {
             PARTICIPANT: [f"sub-{subject}" for subject, _ in visits],
@@ -170,7 +153,7 @@ def read_sheets(
         index=[visit_name(*visit) for visit in visits],
     )
     return Measured(
-        visits=table,
+        table=table,
         sides=sides,
         x=x,
         y=y,
@@ -203,44 +186,6 @@ def _damage(side: SideMaps, i: int, doubtful: Mapping[str, Float], max_gap: floa
     values += [(name, column[i : i + 1]) for name, column in doubtful.items()]
     problems = (why_impossible(name, one) for name, one in values)
     return next((text for text in problems if text), None)
-
-
-def _check_errors(records: Sequence[SheetRecord], maps: Sequence[str]) -> None:
-    """Refuse weights by uncertainty where an SD is missing."""
-    if unsupported := [name for name in maps if name not in SHEET_MAPS]:
-        raise InputError(
-            f"--weights uncertainty: there are no SDs of {', '.join(unsupported)}; leave these maps"
-            " out by --measures, or the weights"
-        )
-    lacking = [r.result.name.stem for r in records if not r.result.path("uncertainty").is_file()]
-    if lacking:
-        names = ", ".join(lacking[:_MOST_NAMES]) + (" ..." if len(lacking) > _MOST_NAMES else "")
-        raise InputError(
-            f"--weights uncertainty: {len(lacking)} of {len(records)} hemispheres have no SD maps"
-            f" ({names}); run the participant level again with --uncertainty 8, or leave them"
-            " out by --exclude"
-        )
-
-
-def _read_errors(
-    records: Sequence[SheetRecord], shape: tuple[int, int], maps: Sequence[str], window: int
-) -> dict[str, Float]:
-    """(sheets, x, y) SD of each map, from squares averaged over ``window`` nodes on both axes."""
-    columns = [hemisphere.spread_name(name) for name in maps]
-    tables = [
-        hemisphere.read_sheet(r.result.path("uncertainty"), columns, shape=shape) for r in records
-    ]
-    errors = {}
-    for name in maps:
-        squares = np.stack([t[hemisphere.spread_name(name)] for t in tables]) ** 2
-        finite = np.isfinite(squares)
-        total, count = (
-            uniform_filter(values, (1, window, window), mode="nearest")
-            for values in (np.where(finite, squares, 0.0), finite.astype(np.float64))
-        )
-        mean = total / np.where(finite, count, 1.0)
-        errors[name] = np.where(finite, np.sqrt(np.maximum(mean, 0.0)), np.nan)
-    return errors
 
 
 def visits_of(records: Sequence[SheetRecord]) -> list[VisitKey]:

@@ -468,7 +468,12 @@ def set_levels(
         name = str(column)
         if pd.api.types.is_numeric_dtype(variables[name]):
             check_numbers(variables[name], settings)
-            _check_varies(variables[name], name)
+            numbers = variables[name].to_numpy(dtype=np.float64)
+            if numbers.min() == numbers.max():
+                raise ModelError(
+                    f"model: {name!r} is {numbers[0]:g} in all {len(numbers)} complete rows; leave"
+                    " it out"
+                )
         else:
             levels[name] = _levels(variables[name], name, references.get(name), settings)
             variables[name] = pd.Categorical(variables[name], categories=levels[name])
@@ -477,14 +482,6 @@ def set_levels(
             f"model: reference level given for {listed(unknown)}, which is no factor of the model"
         )
     return levels
-
-
-def _check_varies(values: pd.Series, name: str) -> None:
-    numbers = values.to_numpy(dtype=np.float64)
-    if numbers.min() == numbers.max():
-        raise ModelError(
-            f"model: {name!r} is {numbers[0]:g} in all {len(numbers)} complete rows; leave it out"
-        )
 
 
 def _levels(

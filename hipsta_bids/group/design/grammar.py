@@ -161,12 +161,11 @@ def _check_call(text: str, tokens: Sequence[_Token]) -> list[str]:
     return _Call(text, quoted).columns(tree)
 
 
-@dataclass(frozen=True)
 class _Call:
     """Walks through the syntax tree of a call; what no rule names is refused."""
 
-    text: str
-    quoted: Sequence[str]
+    def __init__(self, text: str, quoted: Sequence[str]) -> None:
+        self.text, self.quoted = text, quoted
 
     def columns(self, node: ast.expr) -> list[str]:
         """Columns in arithmetic or in a call."""

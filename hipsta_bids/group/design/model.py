@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from formulaic import Formula
+from formulaic import Formula, ModelMatrix
 from scipy.linalg import null_space
 
 from hipsta_bids.errors import ModelError, UsageError
@@ -148,15 +148,6 @@ class VisitTime:
     """Column of the time; None if it is not known."""
     covariates: tuple[str, ...]
     """Names of covariates of the default model, with age at the first visit."""
-
-
-def asymmetry(left: Float, right: Float, *, relative: bool) -> Float:
-    """Left minus right, on sheets whose axes mean the same on both sides."""
-    difference: Float = left - right
-    if relative:
-        mean = (left + right) / 2
-        difference = difference / np.where(mean > 0, mean, np.nan)
-    return difference
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -330,7 +321,13 @@ def build_design(
 ) -> Design:
     """Make the design matrix of a model, or say what keeps it from being fitted."""
     closed = closed_formula(model.formula)
-    formula = _read_formula(closed.text)
+    try:
+        formula = Formula(closed.text)
+    except Exception as error:  # formulaic raises all kinds where a formula makes no sense
+        raise ModelError(
+            f"formula {closed.text!r} cannot be read; write it as group + age, and names with"
+            " blanks in backticks"
+        ) from error
     names = sorted(closed.names)
     formulas.check_names(names, table.columns)
     variables = table[names].copy()
@@ -355,11 +352,16 @@ def build_design(
         raise ModelError(
             f"formula {model.formula!r}: {str(error).partition(chr(10))[0]}"
         ) from error
-    columns = tuple(str(column) for column in model_matrix.columns)
-    matrix: Float = np.asarray(model_matrix, dtype=np.float64)
+    terms = _Terms(model_matrix, variables, levels_used)
+    matrix, columns = terms.matrix, terms.columns
     _check_matrix(matrix, columns, variables.index, settings)
-    terms = _Terms(columns, variables, model_matrix.model_spec, levels_used, matrix)
-    specs = (*model.contrasts, *_dummies(columns, model.dummy))
+    specs = model.contrasts
+    if model.dummy is not None:
+        specs += tuple(
+            formulas.ContrastSpec(name, (name,), ((1.0,),), model.dummy)
+            for name in columns
+            if name != formulas.INTERCEPT
+        )
     return Design(
         matrix=matrix,
         columns=columns,
@@ -372,15 +374,15 @@ def build_design(
     )
 
 
-@dataclass(frozen=True)
 class _Terms:
     """What contrasts can name, as rows of weights of the columns."""
 
-    columns: tuple[str, ...]
-    table: pd.DataFrame
-    spec: Any
-    levels: Mapping[str, list[str]]
-    matrix: Float
+    def __init__(
+        self, matrix: ModelMatrix, table: pd.DataFrame, levels: Mapping[str, list[str]]
+    ) -> None:
+        self.matrix: Float = np.asarray(matrix, dtype=np.float64)
+        self.columns = tuple(str(column) for column in matrix.columns)
+        self.spec, self.table, self.levels = matrix.model_spec, table, levels
 
     def contrast(self, spec: formulas.ContrastSpec) -> formulas.Contrast:
         variable = re.fullmatch(rf"{_NONLINEAR}\(`?([^`]+)`?\)", spec.conditions[0])
@@ -469,26 +471,6 @@ def _check_possible(values: pd.Series, name: str) -> None:
             f"model: column {values.name!r} has {rows_text}, which nobody has; correct them, or"
             " mark them n/a"
         )
-
-
-def _dummies(columns: tuple[str, ...], test: str | None) -> list[formulas.ContrastSpec]:
-    if test is None:
-        return []
-    return [
-        formulas.ContrastSpec(one, (one,), ((1.0,),), test)
-        for one in columns
-        if one != formulas.INTERCEPT
-    ]
-
-
-def _read_formula(text: str) -> Formula:
-    try:
-        return Formula(text)
-    except Exception as error:  # formulaic raises all kinds where a formula makes no sense
-        raise ModelError(
-            f"formula {text!r} cannot be read; write it as group + age, and names with blanks in"
-            " backticks"
-        ) from error
 
 
 def _check_matrix(

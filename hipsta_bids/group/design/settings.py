@@ -27,12 +27,11 @@ class RegistrationSettings(toml.SettingsTable):
     """Registration of curvature profiles along x.
 
     The numbers of splines, components and iterations are those of the paper (Diers et al. 2023,
-    appendix B) and of R's ``registr``; the method ``penalized`` has its own.
+    appendix B) and of R's ``registr``.
     """
 
-    align: Literal["registr", "penalized", "none"] = "registr"
-    """``registr`` (Wrobel et al. 2018), ``penalized`` (finer warps, held back by a penalty that is
-    estimated) or ``none``."""
+    align: Literal["registr", "none"] = "registr"
+    """``registr`` (Wrobel et al. 2018) or ``none``."""
     standardize: bool = True
     """Subtract each profile's mean and divide it by its own standard deviation, so that curvature
     that is larger everywhere is not taken for a displacement; R's ``registr`` does not."""
@@ -106,10 +105,6 @@ class GlmSettings(toml.SettingsTable):
     covariance: Literal["ordinary", "hc3"] = "ordinary"
     """Of the coefficients: ``ordinary`` (equal variances) or ``hc3`` (any variances; MacKinnon and
     White 1985)."""
-    weights: Literal["none", "uncertainty"] = "none"
-    """``uncertainty``: maps count by 1 / (variance between participants + squared SD of the
-    measurement), from ``--uncertainty`` of the participant level, with HC3 standard errors; summary
-    measures are not weighted."""
     confidence: toml.OpenFraction = 0.95
     """Coverage of two-sided confidence limits, fraction."""
     min_residual_df: PositiveInt = 3

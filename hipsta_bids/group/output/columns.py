@@ -132,51 +132,30 @@ def peak_table(
         **effect_columns(test),
     }
     del values["estimate"], values["se"]
+    clusters = find_clusters(discoveries.rejected.ravel(), test.statistic, frame.subfield, edges)
     return pd.DataFrame(
         [
             {
                 "contrast": test.contrast.name,
                 "test": test.kind,
-                **frame.at(one.peak),
-                **{
-                    name: own if isinstance(own, str) else own[one.peak]
-                    for name, own in values.items()
-                },
-                **one.columns,
+                **frame.at(peak),
+                **{name: v if isinstance(v, str) else v[peak] for name, v in values.items()},
+                **cluster,
             }
-            for one in find_clusters(
-                discoveries.rejected.ravel(), test.statistic, frame.subfield, edges
-            )
+            for peak, cluster in clusters
         ]
     )
 
 
-@dataclass(frozen=True)
-class Cluster:
-    """Adjacent points that survive, with effects of one sign."""
-
-    extent: int
-    """Points."""
-    peak: int
-    """Point with the largest statistic."""
-    shares: Mapping[str, float]
-    """Fraction of the points in each subfield."""
-
-    @property
-    def columns(self) -> dict[str, object]:
-        """Columns of tables of peaks."""
-        shares = (f"{name} {share:.0%}" for name, share in self.shares.items())
-        return {"extent": self.extent, "shares": "; ".join(shares)}
-
-
 def find_clusters(
     significant: Bool, statistic: Float, subfield: NDArray[np.str_], edges: Int
-) -> list[Cluster]:
+) -> list[tuple[int, dict[str, object]]]:
     """Find connected regions of one sign among points, largest first.
 
-    Without any, the peak of the whole map, if it has one, is a cluster of no points.
+    Returns the point with the largest statistic, and the columns of tables of peaks. Without any
+    region, the peak of the whole map, if it has one, is a cluster of no points.
     """
-    clusters = []
+    clusters: list[tuple[int, int, str]] = []
     for sign in (1, -1):
         labels, count = label_regions(significant & (sign * statistic > 0), edges)
         for number in range(1, count + 1):
@@ -184,8 +163,9 @@ def find_clusters(
             peak = int(members[np.argmax(np.abs(statistic[members]))])
             codes = subfield[members]
             names, counts = np.unique(codes[codes != MISSING], return_counts=True)
-            shares = dict(zip(names.tolist(), (counts / len(members)).tolist(), strict=True))
-            clusters.append(Cluster(len(members), peak, shares))
+            shares = [f"{n} {c / len(members):.0%}" for n, c in zip(names, counts, strict=True)]
+            clusters.append((len(members), peak, "; ".join(shares)))
     if not clusters and np.isfinite(statistic).any():
-        return [Cluster(0, int(np.nanargmax(np.abs(statistic))), {})]
-    return sorted(clusters, key=lambda cluster: -cluster.extent)
+        clusters = [(0, int(np.nanargmax(np.abs(statistic))), "")]
+    clusters.sort(key=lambda cluster: -cluster[0])
+    return [(peak, {"extent": extent, "shares": shares}) for extent, peak, shares in clusters]

@@ -139,7 +139,7 @@ def draw_roc(analysis: Analysis) -> "list[Figure]":
 
     def line(axis: "Axes", result: ClassifierResult, color: str) -> str:
         axis.plot(*result.curve, color=color)
-        area, left_out = result.auc, result.cross_validation.auc
+        area, left_out = result.auc, result.validated[0]
         return f"{area.area:.2f} ({area.low:.2f} to {area.high:.2f}),\n   left out {left_out:.2f}"
 
     labels = "1 - specificity", "sensitivity"
@@ -211,20 +211,21 @@ def _draw_pairs(
 
 def draw_registration(cohort: Cohort, analysis: Analysis) -> "list[Figure]":
     """Draw curvature from medial to lateral before and after registration, and the warps."""
-    figure, axes = _panels(len(analysis.sides), 3, (panels.TWO_COLUMNS, 48 * len(analysis.sides)))
+    sides = analysis.registered
+    figure, axes = _panels(len(sides), 3, (panels.TWO_COLUMNS, 48 * len(sides)))
     label = with_brackets("curvature", cohort.units.get("curvature", "1"))
-    for (before, after, shifts), (hemi, side) in zip(axes, analysis.sides.items(), strict=True):
-        members = members_of(analysis, cohort.table.iloc[side.registered.rows])
+    for (before, after, shifts), (hemi, side) in zip(axes, sides.items(), strict=True):
+        members = members_of(analysis, cohort.table.iloc[side.rows])
         for axis, source, state in (
             (before, cohort.sides[hemi], "before"),
-            (after, side.registered, "after"),
+            (after, side, "after"),
         ):
             curves = (profiles_of(source.maps, "curvature", member) for member in members.values())
             _curves(axis, cohort.x, members, curves)
             axis.set_title(f"{SIDES[hemi]}, {state} registration")
             axis.set_ylabel(label)
         after.sharey(before)
-        moved = side.registration.shifts
+        moved = analysis.registrations[hemi].shifts
         step = -(-len(moved) // _MOST_LINES)
         for color, member in zip(cycle(COLORS), members.values(), strict=False):
             shifts.plot(cohort.x, moved[member][::step].T, color=color, alpha=0.25, linewidth=0.4)
@@ -449,11 +450,10 @@ def draw_figures(
             partial(panels.draw_measure, cohort, analysis, shapes, views, measure),
         )
     if analysis.harmonization is not None and analysis.fitted:
-        name = "sites" if analysis.sides else f"{next(iter(analysis.measured.maps))}_sites"
+        name = "sites" if analysis.registered else f"{next(iter(analysis.measured.maps))}_sites"
         yield name, partial(draw_sites, cohort, analysis)
-    if analysis.sides and all(
-        side.registration.template is not None for side in analysis.sides.values()
-    ):
+    templates = [one.template for one in analysis.registrations.values()]
+    if templates and None not in templates:
         yield "registration", partial(draw_registration, cohort, analysis)
     if shapes:
         yield "sections", partial(draw_sections, cohort, analysis, shapes)

@@ -12,7 +12,7 @@ from hipsta_bids.derivatives.dataset import references
 from hipsta_bids.group.cohort.data import Cohort
 from hipsta_bids.group.cohort.read import LEAST_SHARE
 from hipsta_bids.group.design import settings as group_settings
-from hipsta_bids.group.output.results import Analysis, RetestCohort, Scores
+from hipsta_bids.group.output.results import Analysis
 from hipsta_bids.group.output.saved import NormsFile
 from hipsta_bids.group.stats.clusters import TFCE_EXTENT, TFCE_HEIGHT
 from hipsta_bids.group.stats.exchangeability import exchange_text
@@ -84,7 +84,7 @@ def methods_text(
             f" Hemispheres were rated on their report pages ({counts}); those rated exclude were"
             " left out."
         )
-    aligned = [_registration(analysis, settings, cite)] if analysis.sides else []
+    aligned = [_registration(analysis, settings, cite)] if analysis.registrations else []
     if surfaces:
         aligned.append(
             f"Maps of other programs ({', '.join(surfaces)}) were taken as they are, point by"
@@ -99,8 +99,9 @@ def methods_text(
     paragraphs += [_joint(settings, cite)] if settings.joint.measures else []
     if analysis.comparison.asymmetry:
         paragraphs.append(_asymmetry(analysis, settings, cite))
-    if analysis.scores is not None:
-        paragraphs.append(_normative(analysis.scores, settings, cite("normative")))
+    if analysis.reference is not None:
+        group = " ".join(analysis.comparison.normative or ())
+        paragraphs.append(_normative(*analysis.reference, group, settings, cite("normative")))
     if analysis.pairs:
         paragraphs.append(_classification(analysis, settings, cite))
     if analysis.found:
@@ -140,22 +141,19 @@ def _registration(
     if rules.align == "none":
         return "Maps were not registered to each other."
     method = f"alternating fits of a template and of monotone B-spline warps {cite('registr')}"
-    if rules.align == "penalized":
-        method += ", with a penalty on local stretch that was estimated from the data"
     shares = "; ".join(
-        f"{hemi}: {side.registration.explained_before:.0%} to"
-        f" {side.registration.explained_after:.0%}"
-        for hemi, side in analysis.sides.items()
+        f"{hemi}: {one.explained_before:.0%} to {one.explained_after:.0%}"
+        for hemi, one in analysis.registrations.items()
     )
-    extreme = sum(int(side.registration.extreme.sum()) for side in analysis.sides.values())
+    extreme = sum(int(one.extreme.sum()) for one in analysis.registrations.values())
     standardization = (
         ", each less its mean and over its standard deviation," if rules.standardize else ""
     )
-    differences = {hemi: side.difference for hemi, side in analysis.sides.items()}
     groups = "; ".join(
-        f"{hemi}: {columns['difference']:.2f} nodes, p = {columns['difference_p']:.2g}"
-        for hemi, columns in differences.items()
-        if columns
+        f"{hemi}: {one.difference['difference']:.2f} nodes,"
+        f" p = {one.difference['difference_p']:.2g}"
+        for hemi, one in analysis.registrations.items()
+        if one.difference
     )
     moved = (
         " The largest difference of mean displacement between groups, with its p-value corrected"
@@ -192,12 +190,12 @@ def _harmonization(analysis: Analysis, cite: Callable[[str], str]) -> list[str]:
     plan = harmonization.plan
     counts = ", ".join(f"{site} {n}" for site, n in plan.counts.items())
     sources = f"{cite('johnson')}, {cite('combat')}"
-    preserved = f"`{plan.kept.formula}`" if plan.kept.names else "no variable"
+    preserved = f"`{plan.formula}`" if plan.names else "no variable"
     if plan.icv is not None:
         preserved += f", for volumes also {plan.icv}"
     text = (
         f"Effects of {plan.column} ({counts} participants) were taken out of"
-        f"{' the registered' if analysis.sides else ''} maps and summary measures by ComBat"
+        f"{' the registered' if analysis.registered else ''} maps and summary measures by ComBat"
         f" {sources}: at each point, a shift and a scale of the residuals of a linear model that"
         f" keeps {preserved}. The two were pooled over the points of a map by empirical Bayes, and"
         " estimated for each summary measure by itself; missing values were left out point by"
@@ -235,12 +233,6 @@ def _models(
     levels = ", ".join(f"{name} {level}" for name, level in analysis.design.references.items())
     errors = " with HC3 standard errors" if settings.glm.covariance == "hc3" else ""
     kind, subject, d = "linear model", "", "estimate over residual standard deviation"
-    if settings.glm.weights != "none":
-        errors = (
-            " by weighted least squares, with weights 1 / (variance between participants + squared"
-            f" standard deviation of the measurement), the former estimated by moments"
-            f" {cite('moments')}, and HC3 standard errors"
-        )
     if analysis.comparison.pair:
         first, second = analysis.comparison.pair
         subject = f" to the change from {first} to {second}, with the covariates of {first}"
@@ -254,7 +246,7 @@ def _models(
         )
         d = "estimate over the standard deviation of single visits"
     corrected = _correction(settings.multiplicity, cite, analysis)
-    adjusted = any(one.formula != analysis.model.formula for one in analysis.measures)
+    adjusted = any(formula != analysis.model.formula for _, formula in analysis.measures)
     volumes = ", volumes also with intracranial volume" if adjusted else ""
     return (
         f"At each point of the sheet a {kind} `{analysis.model.formula}` was"
@@ -290,7 +282,10 @@ def _nonlinear(analysis: Analysis, settings: group_settings.GroupSettings) -> st
         return ""
     curve = "its square" if settings.model.age == "quadratic" else "a natural cubic spline"
     p = [
-        test.p for one in analysis.measures for test in one.fit.tests if test.contrast.name in names
+        test.p
+        for _, fit, _ in analysis.measures.values()
+        for test in fit.tests
+        if test.contrast.name in names
     ]
     result = control_fdr(np.concatenate(p or [np.empty(0)]), settings.multiplicity.alpha)
     return (
@@ -436,13 +431,15 @@ def _asymmetry(analysis: Analysis, settings: group_settings.GroupSettings, cite:
     )
 
 
-def _normative(scores: Scores, settings: group_settings.GroupSettings, source: str) -> str:
+def _normative(
+    formula: str, n_reference: int, group: str, settings: group_settings.GroupSettings, source: str
+) -> str:
     return (
-        f"Each participant was scored against {scores.n_reference} with {scores.factor}"
-        f" {scores.level}: w is the difference from what a linear model `{scores.formula}` of these"
-        f" expects, over its residual standard deviation {source}. Members of the reference group"
-        " were scored by the model without themselves. Points count as low or high where the"
-        " two-sided p, with the uncertainty of the model, is below"
+        f"Each participant was scored against {n_reference} with {group}: w is the difference from"
+        f" what a linear model `{formula}` of these expects, over its residual standard deviation"
+        f" {source}. Members of the reference group were scored by the model without themselves."
+        " Points count as low or high where the two-sided p, with the uncertainty of the model, is"
+        " below"
         f" {1 - settings.glm.confidence:.2g}."
     )
 
@@ -523,11 +520,11 @@ def power_text(
 
 
 def retest_text(
-    retest: RetestCohort, settings: group_settings.RetestSettings, cite: Callable[[str], str]
+    sessions: int, participants: int, settings: group_settings.RetestSettings, cite: Cite
 ) -> str:
     """Word how agreement was measured."""
     return (
-        f"Agreement between {len(retest.sessions)} sessions of {len(retest.participants)}"
+        f"Agreement between {sessions} sessions of {participants}"
         " participants was estimated at each point of the maps and for each summary measure. The"
         " within-subject standard deviation is the root of the mean variance of a participant's"
         f" values {cite('bland')}; a change beyond 1.96 √2 times this is unlikely to be measurement"

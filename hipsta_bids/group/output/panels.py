@@ -60,8 +60,8 @@ _EXTEND["agreement"] = "min"
 
 Scale = Mapping[str, Any]
 """Color map and the values at its ends, as matplotlib's arguments."""
-Views = dict[tuple[Any, ...], "Seen"]
-"""Views by side, direction, size, and what they are of."""
+Views = dict[tuple[Any, ...], tuple[View, Bool]]
+"""Views with borders of subfields, by side, direction, size, and what they are of."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -108,15 +108,15 @@ def draw_measure(
     blocks = [[row] for row in _means(cohort, analysis, sides, measure)]
     tests = {h: {m: fit.tests for m, fit in a.fits.items()} for h, a in analysis.fitted.items()}
     blocks += contrasts(tests, analysis.found, measure)
-    return draw_pages(cohort, sides, shapes, views, blocks)
+    return draw_pages(cohort, sides, blocks, shapes, views)
 
 
 def draw_pages(
     cohort: Cohort,
     sides: Mapping[str, FittedMaps],
-    shapes: Mapping[str, AverageShape],
-    views: Views,
     blocks: Sequence[list[Row]],
+    shapes: Mapping[str, AverageShape] | None = None,
+    views: Views | None = None,
 ) -> "list[Figure]":
     """Draw rows, of which those of a block are on the same figure."""
     pages: list[list[Row]] = [[]]
@@ -124,7 +124,8 @@ def draw_pages(
         if len(pages[-1]) + len(block) > _MOST_ROWS:
             pages.append([])
         pages[-1] += block
-    return [draw_rows(cohort, sides, shapes, rows, views) for rows in pages]
+    shapes, views = shapes or {}, {} if views is None else views
+    return [_draw_rows(cohort, sides, rows, shapes, views) for rows in pages]
 
 
 def _means(
@@ -183,18 +184,11 @@ def contrasts(
     contrasts of which other functions take these.
     """
     tests = {hemi: own[measure] for hemi, own in every_test.items() if measure in own}
-    sides = list(tests)
-    found = {
-        (test.contrast.name, hemi): discoveries[MapKey(measure, test.contrast.name, hemi)]
-        for hemi, own in tests.items()
-        for test in own
-    }
     signed = {
-        (test.contrast.name, hemi): signed_logarithm(
-            found[test.contrast.name, hemi].adjusted, test.statistic
-        )
+        key: signed_logarithm(discoveries[key].adjusted, test.statistic)
         for hemi, own in tests.items()
         for test in own
+        for key in [MapKey(measure, test.contrast.name, hemi)]
     }
     top = display.significance_reach(list(signed.values()))
     for index, test in enumerate(next(iter(tests.values()))):
@@ -208,8 +202,9 @@ def contrasts(
         ]
         reach = display.effect_reach(scales)
         low, colors, p_colors = display.effect_colors(test.kind)
-        survive = {hemi: found[name, hemi].rejected for hemi in sides}
-        tested = {hemi: int(np.isfinite(found[name, hemi].adjusted).sum()) for hemi in sides}
+        found = {hemi: discoveries[MapKey(measure, name, hemi)] for hemi in tests}
+        survive = {hemi: one.rejected for hemi, one in found.items()}
+        tested = {hemi: int(np.isfinite(one.adjusted).sum()) for hemi, one in found.items()}
         uniform = len(set(tested.values())) == 1
         counts = ", ".join(
             f"{int(own.sum())} {'' if uniform else f'of {tested[hemi]} '}{SIDES[hemi]}"
@@ -232,44 +227,38 @@ def contrasts(
                 title=f"Significant: {counts}",
                 label="corrected p" + (", signed" if low else ""),
                 scale={"cmap": p_colors, "vmin": low * top, "vmax": top},
-                values={hemi: signed[name, hemi] for hemi in sides},
+                values={hemi: signed[MapKey(measure, name, hemi)] for hemi in tests},
                 survive=survive,
-                level=found[name, sides[0]].alpha,
+                level=next(iter(found.values())).alpha,
             ),
         ]
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class _Surface:
-    """A surface in three dimensions, and the directions from which it is seen."""
+def _surface_of(
+    fitted: FittedMaps, shape: AverageShape | None, hemi: str
+) -> tuple[Mesh, dict[str, Float]] | None:
+    """Find a surface in three dimensions, and the axes (3, 3) of its views, by name."""
+    mesh = fitted.maps.mesh
+    if mesh is not None and mesh.flat:
+        return None
+    if mesh is not None:
+        along = np.linalg.svd(mesh.points - mesh.points.mean(axis=0), full_matrices=False)[2][0]
+        along = along * np.sign(along[1] or 1.0)  # to anterior
+    elif shape is not None:
+        mesh = shape.middle
+        grid = mesh.points.reshape(*fitted.maps.shape, 3)
+        along = grid[:, -1].mean(axis=0) - grid[:, 0].mean(axis=0)
+    else:
+        return None
+    lateral = np.array([1.0 if hemi == "R" else -1.0, 0.0, 0.0])
+    views = {"superior": False, "inferior": True}
+    return mesh, {name: across(along, lateral, below=below) for name, below in views.items()}
 
-    mesh: Mesh
-    axes: Mapping[str, Float]
-    """(3, 3) of each, by name."""
 
-    @classmethod
-    def build(cls, fitted: FittedMaps, shape: AverageShape | None, hemi: str) -> "_Surface | None":
-        if fitted.maps.mesh is not None:
-            mesh = fitted.maps.mesh
-            if _unfolded(fitted):
-                return None
-            along = np.linalg.svd(mesh.points - mesh.points.mean(axis=0), full_matrices=False)[2][0]
-            along = along * np.sign(along[1] or 1.0)  # to anterior
-        elif shape is not None:
-            mesh = shape.middle
-            grid = mesh.points.reshape(*fitted.maps.shape, 3)
-            along = grid[:, -1].mean(axis=0) - grid[:, 0].mean(axis=0)
-        else:
-            return None
-        lateral = np.array([1.0 if hemi == "R" else -1.0, 0.0, 0.0])
-        views = {"superior": False, "inferior": True}
-        axes = {name: across(along, lateral, below=below) for name, below in views.items()}
-        return cls(mesh=mesh, axes=axes)
-
-    def fitting(self, size: tuple[int, int]) -> float:
-        """Pixels per mm at which all views fit pictures of a height and width."""
-        spans = [np.ptp(self.mesh.points @ axes.T, axis=0) for axes in self.axes.values()]
-        return float(min(_LARGEST * size[1 - i] / span[i] for span in spans for i in (0, 1)))
+def _fitting(mesh: Mesh, views: Mapping[str, Float], size: tuple[int, int]) -> float:
+    """Pixels per mm at which all views fit pictures of a height and width."""
+    spans = [np.ptp(mesh.points @ axes.T, axis=0) for axes in views.values()]
+    return float(min(_LARGEST * size[1 - i] / span[i] for span in spans for i in (0, 1)))
 
 
 def _unfolded(fitted: FittedMaps) -> bool:
@@ -277,37 +266,29 @@ def _unfolded(fitted: FittedMaps) -> bool:
     return fitted.maps.mesh is None or fitted.maps.mesh.flat
 
 
-@dataclass(frozen=True, eq=False)
-class Seen:
-    """A view of a surface, and lines between its subfields."""
+def _borders(view: View, fitted: FittedMaps) -> Bool:
+    """Draw lines between subfields in a view."""
+    lines = np.zeros(view.triangle.shape, dtype=bool)
+    for number in range(len(fitted.maps.names)):
+        region = view.region(fitted.subfield.ravel(), number)
+        lines |= view.border(region, _FIELD_LINE * _POINT)
+    return lines
 
-    view: View
-    borders: Bool
 
-    @classmethod
-    def build(cls, view: View, fitted: FittedMaps) -> "Seen":
-        """Draw the lines."""
-        lines = np.zeros(view.triangle.shape, dtype=bool)
-        for number in range(len(fitted.maps.names)):
-            region = view.region(fitted.subfield.ravel(), number)
-            lines |= view.border(region, _FIELD_LINE * _POINT)
-        return cls(view, lines)
+def draw_view(
+    view: View, borders: Bool, values: Float, scale: Scale, survive: Bool | None
+) -> NDArray[np.uint8]:
+    """Draw a map (points,) in the colors of a scale, with a line round what survives."""
+    from matplotlib import colormaps  # noqa: PLC0415  (slow to load)
 
-    def picture(
-        self, values: Float, scale: Mapping[str, Any], survive: Bool | None
-    ) -> NDArray[np.uint8]:
-        """Draw a map (points,) in the colors of a scale, with a line round what survives."""
-        from matplotlib import colormaps  # noqa: PLC0415  (slow to load)
-
-        pixels = self.view.spread(values.ravel())
-        share = (pixels - scale["vmin"]) / (scale["vmax"] - scale["vmin"])
-        colors = colormaps[scale["cmap"]](np.nan_to_num(share))[:, :3]
-        colors[~np.isfinite(pixels)] = _UNKNOWN
-        lines = self.borders
-        if survive is not None:
-            inside = self.view.region(survive.ravel().astype(np.int64), 1)
-            lines = lines | self.view.border(inside, _FOUND_LINE * _POINT)
-        return self.view.picture(colors, lines)
+    pixels = view.spread(values.ravel())
+    share = (pixels - scale["vmin"]) / (scale["vmax"] - scale["vmin"])
+    colors = colormaps[scale["cmap"]](np.nan_to_num(share))[:, :3]
+    colors[~np.isfinite(pixels)] = _UNKNOWN
+    if survive is not None:
+        inside = view.region(survive.ravel().astype(np.int64), 1)
+        borders = borders | view.border(inside, _FOUND_LINE * _POINT)
+    return view.picture(colors, borders)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -315,55 +296,51 @@ class _Column:
     """Where the maps of one side are drawn: unfolded, or on a surface from one direction."""
 
     hemi: str
-    one: FittedMaps
+    fitted: FittedMaps
     box: tuple[int, int]
     """Where it begins from the left, and its width, in pixels."""
     title: str
     ends: tuple[str, ...]
     """What lies to the left and to the right."""
-    seen: "Seen | None" = None
-    """Of a surface."""
+    seen: tuple[View, Bool] | None = None
+    """Of a surface, with the borders of subfields."""
 
 
-@dataclass(frozen=True)
-class _Paper:
-    """A figure on which places are pixels from its upper left corner."""
-
-    figure: "Figure"
-    width: int
-    height: int
-
-    def text(self, x: float, y: float, text: str, **options: Any) -> None:  # noqa: ANN401  (of matplotlib)
-        options = {"ha": "center", "va": "center", "fontsize": SMALL, **options}
-        self.figure.text(x / self.width, 1 - y / self.height, text, **options)
-
-    def axes(self, left: float, top: float, width: float, height: float) -> "Axes":
-        box = (left / self.width, 1 - (top + height) / self.height)
-        axes = self.figure.add_axes((*box, width / self.width, height / self.height))
-        axes.set_xticks([])
-        axes.set_yticks([])
-        return axes
+# Places on figures are pixels from the upper left corner.
 
 
-def draw_maps(
-    cohort: Cohort, points: Mapping[str, FittedMaps], rows: Sequence[Row]
-) -> "list[Figure]":
-    """Draw rows of maps of which no test was made."""
-    return [draw_rows(cohort, points, {}, rows, {})]
+def _size(figure: "Figure") -> tuple[int, int]:
+    return round(figure.bbox.width), round(figure.bbox.height)
 
 
-def draw_rows(
+def _text(figure: "Figure", x: float, y: float, text: str, **options: Any) -> None:  # noqa: ANN401  (of matplotlib)
+    options = {"ha": "center", "va": "center", "fontsize": SMALL, **options}
+    width, height = _size(figure)
+    figure.text(x / width, 1 - y / height, text, **options)
+
+
+def _axes(figure: "Figure", left: float, top: float, width: float, height: float) -> "Axes":
+    whole = _size(figure)
+    box = (left / whole[0], 1 - (top + height) / whole[1])
+    axes = figure.add_axes((*box, width / whole[0], height / whole[1]))
+    axes.set_xticks([])
+    axes.set_yticks([])
+    return axes
+
+
+def _draw_rows(
     cohort: Cohort,
     sides: Mapping[str, FittedMaps],
-    shapes: Mapping[str, AverageShape],
     rows: Sequence[Row],
+    shapes: Mapping[str, AverageShape],
     views: Views,
 ) -> "Figure":
     """Draw rows of panels; all boxes are whole pixels, so that pictures are not resampled."""
-    found = {
-        hemi: _Surface.build(fitted, shapes.get(hemi[0]), hemi[0]) for hemi, fitted in sides.items()
+    surfaces = {
+        hemi: surface
+        for hemi, fitted in sides.items()
+        if (surface := _surface_of(fitted, shapes.get(hemi[0]), hemi[0])) is not None
     }
-    surfaces = {hemi: surface for hemi, surface in found.items() if surface is not None}
     page_width = TWO_COLUMNS if len(sides) > 1 and surfaces else ONE_COLUMN
     space = (page_width - _LEFT - _RIGHT - _BETWEEN * (len(sides) - 1)) / len(sides)
     n_flat, n_views = int(any(map(_unfolded, sides.values()))), 2 * bool(surfaces)
@@ -373,7 +350,7 @@ def draw_rows(
     upright = _UPRIGHT if parts_of(cohort.y) is None else _LONG
     height = round(min(unit * upright, tallest) * MM)
     size = height, round(_VIEW_WIDTH * unit * MM)
-    scale = min((surface.fitting(size) for surface in surfaces.values()), default=1.0)
+    scale = min((_fitting(*surface, size) for surface in surfaces.values()), default=1.0)
     columns: list[_Column] = []
     for number, (hemi, fitted) in enumerate(sides.items()):
         left = (_LEFT + number * (space + _BETWEEN)) * MM
@@ -381,20 +358,20 @@ def draw_rows(
             mesh = fitted.maps.mesh
             ends = X_ENDS if mesh is None else (laid_out(mesh)[2][0], "")
             box = round(left), round(unit * MM)
-            columns.append(_Column(hemi=hemi, one=fitted, box=box, title="unfolded", ends=ends))
+            columns.append(_Column(hemi=hemi, fitted=fitted, box=box, title="unfolded", ends=ends))
             left += (unit + _GAP) * MM
-        for title, axes in surfaces[hemi].axes.items() if hemi in surfaces else ():
+        for title, axes in surfaces[hemi][1].items() if hemi in surfaces else ():
             key = hemi, title, size, id(fitted)
             if key not in views:
-                view = look(surfaces[hemi].mesh, axes, scale, size)
-                views[key] = Seen.build(view, fitted)
+                view = look(surfaces[hemi][0], axes, scale, size)
+                views[key] = view, _borders(view, fitted)
             # The right side's lateral is to the right in the scanner, and the left one's is not.
             turned = (axes[0, 0] > 0) != (hemi == "R")
             medial, lateral = (f"{word[:3]}." for word in X_ENDS)
             ends = (lateral, medial) if turned else (medial, lateral)
             box = round(left), size[1]
             columns.append(
-                _Column(hemi=hemi, one=fitted, box=box, title=title, ends=ends, seen=views[key])
+                _Column(hemi=hemi, fitted=fitted, box=box, title=title, ends=ends, seen=views[key])
             )
             left += size[1] + _GAP * MM
     pixels = (
@@ -403,45 +380,45 @@ def draw_rows(
     )
     figure = new_figure((pixels[0] / DOTS_PER_INCH, pixels[1] / DOTS_PER_INCH), layout=None)
     figure.set_dpi(DOTS_PER_INCH)
-    paper = _Paper(figure, *pixels)
-    _write_heads(paper, columns)
+    _write_heads(figure, columns)
     for number, row in enumerate(rows):
         top = round(_TOP * MM) + _HEAD_PIXELS + number * (height + _HEAD_PIXELS)
-        _draw_row(paper, cohort, columns, row, (top, height, "abcdef"[number]))
-    _write_feet(paper, columns, top + height, scale)
+        _draw_row(figure, cohort, columns, row, (top, height, "abcdef"[number]))
+    _write_feet(figure, columns, top + height, scale)
     return figure
 
 
-def _write_heads(paper: _Paper, columns: Sequence[_Column]) -> None:
+def _write_heads(figure: "Figure", columns: Sequence[_Column]) -> None:
     """Name sides and columns."""
     for hemi in dict.fromkeys(column.hemi for column in columns):
         boxes = [column.box for column in columns if column.hemi == hemi]
         middle = (boxes[0][0] + sum(boxes[-1])) / 2
-        paper.text(middle, 3.4 * MM, SIDES[hemi].capitalize(), fontsize=TITLE, weight="bold")
+        _text(figure, middle, 3.4 * MM, SIDES[hemi].capitalize(), fontsize=TITLE, weight="bold")
     for column in columns:
         left, width = column.box
-        paper.text(left + width / 2, 7.6 * MM, column.title)
+        _text(figure, left + width / 2, 7.6 * MM, column.title)
 
 
-def _write_feet(paper: _Paper, columns: Sequence[_Column], bottom: int, scale: float) -> None:
+def _write_feet(figure: "Figure", columns: Sequence[_Column], bottom: int, scale: float) -> None:
     """Write what lies to the left and to the right, and draw a ruler for the surfaces."""
     for column in columns:
         left, width = column.box
-        paper.text(left, bottom + 2.4 * MM, column.ends[0], ha="left")
-        paper.text(left + width, bottom + 2.4 * MM, column.ends[1], ha="right")
+        _text(figure, left, bottom + 2.4 * MM, column.ends[0], ha="left")
+        _text(figure, left + width, bottom + 2.4 * MM, column.ends[1], ha="right")
     if any(column.seen is not None for column in columns):
         from matplotlib.lines import Line2D  # noqa: PLC0415  (slow to load)
 
         length = max(n for n in _RULERS if n * scale <= _RULER_SPACE * MM or n == _RULERS[-1])
-        middle = paper.width - _RIGHT * MM / 2
-        x = [(middle + sign * length * scale / 2) / paper.width for sign in (-1, 1)]
-        y = 1 - (bottom + 1.4 * MM) / paper.height
-        paper.figure.add_artist(Line2D(x, [y, y], color="black", linewidth=1.2))
-        paper.text(middle, bottom + 3.4 * MM, f"{length:g} mm")
+        width, height = _size(figure)
+        middle = width - _RIGHT * MM / 2
+        x = [(middle + sign * length * scale / 2) / width for sign in (-1, 1)]
+        y = 1 - (bottom + 1.4 * MM) / height
+        figure.add_artist(Line2D(x, [y, y], color="black", linewidth=1.2))
+        _text(figure, middle, bottom + 3.4 * MM, f"{length:g} mm")
 
 
 def _draw_row(
-    paper: _Paper,
+    figure: "Figure",
     cohort: Cohort,
     columns: Sequence[_Column],
     row: Row,
@@ -449,12 +426,12 @@ def _draw_row(
 ) -> None:
     """Draw a row at a place from the top, of a height, with its letter."""
     top, height, letter = position
-    paper.text(1.0 * MM, top - 3.2 * MM, letter, fontsize=LETTER, weight="bold", ha="left")
-    room = int((paper.width / MM - _LEFT) / (_LETTER_WIDTH * TITLE * 25.4 / 72))
+    _text(figure, 1.0 * MM, top - 3.2 * MM, letter, fontsize=LETTER, weight="bold", ha="left")
+    room = int((_size(figure)[0] / MM - _LEFT) / (_LETTER_WIDTH * TITLE * 25.4 / 72))
     long = len(row.title) > room
     title = row.title[: room - 1] + "\N{HORIZONTAL ELLIPSIS}" if long else row.title
-    paper.text(_LEFT * MM, top - 3.2 * MM, title, fontsize=TITLE, ha="left")
-    if columns[0].seen is not None or columns[0].one.maps.mesh is None:
+    _text(figure, _LEFT * MM, top - 3.2 * MM, title, fontsize=TITLE, ha="left")
+    if columns[0].seen is not None or columns[0].fitted.maps.mesh is None:
         words: list[tuple[str, float, str]]
         words = [(Y_ENDS[0], top + height, "bottom"), (Y_ENDS[1], top, "top")]
         if (parts := parts_of(cohort.y)) is not None:
@@ -464,24 +441,24 @@ def _draw_row(
                 for name, at in middle.items()
             ]
         for word, y, va in words:
-            paper.text((_LEFT - 2) * MM, y, word, rotation=90, va=va)
+            _text(figure, (_LEFT - 2) * MM, y, word, rotation=90, va=va)
     for column in columns:
         values, survive = row.values[column.hemi], row.survive.get(column.hemi)
         if column.seen is not None:
-            picture = column.seen.picture(values, row.scale, survive)
-            paper.figure.figimage(picture, column.box[0], paper.height - top - height)
+            picture = draw_view(*column.seen, values, row.scale, survive)
+            figure.figimage(picture, column.box[0], _size(figure)[1] - top - height)
             continue
-        axes = paper.axes(column.box[0], top, column.box[1], height)
+        axes = _axes(figure, column.box[0], top, column.box[1], height)
         axes.set_gid(map_id(row.kind, row.index, column.hemi))
         axes.set_facecolor(str(_UNKNOWN))
-        if column.one.maps.mesh is None:
-            _draw_sheet(axes, cohort, column.one, values, row.scale)
+        if column.fitted.maps.mesh is None:
+            _draw_sheet(axes, cohort, column.fitted, values, row.scale)
         else:
-            draw_mesh(axes, column.one.maps.mesh, values, row.scale)
+            draw_mesh(axes, column.fitted.maps.mesh, values, row.scale)
         if survive is not None:
-            _enclose(axes, cohort, column.one, survive)
+            _enclose(axes, cohort, column.fitted, survive)
     edge = sum(columns[-1].box) + _BAR * MM
-    _draw_bar(paper.axes(edge, top, _BAR_WIDTH * MM, height), row)
+    _draw_bar(_axes(figure, edge, top, _BAR_WIDTH * MM, height), row)
 
 
 def _draw_sheet(

@@ -24,23 +24,10 @@ from hipsta_bids.group.stats.glm import FittedMaps, PointTest, PointwiseFit, Row
 from hipsta_bids.group.stats.inference import Discoveries, MapKey
 from hipsta_bids.group.stats.norms import NormativeScores
 from hipsta_bids.io.files import as_nested
-from hipsta_bids.types import PARTICIPANT, SESSION
+from hipsta_bids.types import PARTICIPANT
 
 #: Group of all, where there are no groups.
 ALL = "all"
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Kept:
-    """Columns whose effects are kept."""
-
-    matrix: Float
-    """(visits, columns) without an intercept; NaN where a variable is missing."""
-    names: tuple[str, ...]
-    formula: str
-    levels: Mapping[str, Sequence[str]]
-    portable: bool = True
-    """Whether the columns of other people can be made from the formula."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -55,8 +42,13 @@ class SitePlan:
     counts: Mapping[str, int]
     """Participants by site whose visits are harmonized."""
     visits: Visits
-    """Rows of the cohort's table."""
-    kept: Kept
+    """Rows of the cohort's table; columns whose effects are kept, without an intercept."""
+    names: tuple[str, ...]
+    """Columns whose effects are kept, by this formula and these levels of factors."""
+    formula: str
+    levels: Mapping[str, Sequence[str]]
+    portable: bool
+    """Whether the columns of other people can be made from the formula."""
     icv: str | None
     """Column that volumes keep besides."""
     icv_values: Float
@@ -86,7 +78,7 @@ class Harmonization:
         A classifier has to tell the groups of people whose groups are not known, so that it
         cannot have them among what is kept, nor sites that were estimated with them.
         """
-        return bool(self.plan.estimated) or groups in closed_formula(self.plan.kept.formula).names
+        return bool(self.plan.estimated) or groups in closed_formula(self.plan.formula).names
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -104,52 +96,10 @@ class ScoredMaps:
     names: tuple[str, ...]
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Scores:
-    """All scores against one reference group."""
-
-    factor: str
-    level: str
-    formula: str
-    """Covariates that are adjusted for."""
-    n_reference: int
-    sides: Mapping[str, ScoredMaps]
-    """By hemisphere; empty without maps."""
-    table: pd.DataFrame
-    """One row per participant, hemisphere and summary measure or region of a map."""
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class MeasureFit:
-    """One model of summary measures; the points of the fit are measures."""
-
-    hemi: str
-    """``L``, ``R``, or ``LR`` for the mean of both."""
-    measures: tuple[str, ...]
-    formula: str
-    fit: PointwiseFit
-    participants: Int
-    """(measures,) with a value; the fit counts visits."""
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class SideResult:
-    """Sheets of one hemisphere, registered."""
-
-    registration: alignment.Registration
-    registered: arrays.SideMaps
-    """Maps of all visits that were chosen."""
-    shifts: Mapping[str, Mapping[str, Any]]
-    """Columns of shifts by group; empty without groups."""
-    difference: Mapping[str, float]
-    """Columns of the largest difference between the groups; empty without groups."""
-
-
-def templates_of(sides: Mapping[str, SideResult]) -> dict[str, Any] | None:
+def templates_of(registrations: Mapping[str, alignment.Registration]) -> dict[str, Any] | None:
     """Write the templates of registration for ``template.json``; ``None`` without registration."""
-    templates = {hemi: side.registration.template for hemi, side in sides.items()}
-    registered = {hemi: template for hemi, template in templates.items() if template is not None}
-    return templates_to_json(registered) if registered else None
+    templates = {hemi: one.template for hemi, one in registrations.items() if one.template}
+    return templates_to_json(templates) if templates else None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -160,8 +110,10 @@ class Analysis:
     comparison: Comparison
     design: Design
     groups: Groups | None
-    sides: Mapping[str, SideResult]
-    """Registered sheets by hemisphere."""
+    registrations: Mapping[str, alignment.Registration]
+    """By hemisphere; empty without sheets."""
+    registered: Mapping[str, arrays.SideMaps]
+    """Maps of all visits that were chosen, by hemisphere."""
     harmonization: Harmonization | None
     """Effects of sites that were taken out after registration, if this was asked for."""
     measured: data.Measures
@@ -176,9 +128,16 @@ class Analysis:
     unregistered: Mapping[MapKey, Discoveries]
     """The same of maps that were not registered; empty without registration, with permutations,
     which are too slow to do twice, and with harmonization from a file."""
-    scores: Scores | None
-    """Scores of participants against a reference group, if there is one."""
-    measures: Sequence[MeasureFit]
+    reference: tuple[str, int] | None
+    """Covariates that scores are adjusted for, and participants of the reference group; ``None``
+    without scores."""
+    scored: Mapping[str, ScoredMaps]
+    """Scores of maps by hemisphere."""
+    scores: pd.DataFrame
+    """One row per participant, hemisphere and summary measure or region of a map."""
+    measures: Mapping[tuple[str, str], tuple[Sequence[str], PointwiseFit, Int]]
+    """Of summary measures, by side (``LR`` for the mean of both) and formula: names, their fits as
+    points, and participants with a value; a fit counts visits."""
     pairs: Sequence[tuple[str, str, tuple[str, str], ModelComparison]]
     """Hemisphere, added measure, control and case, and result."""
     skipped: Sequence[str]
@@ -237,8 +196,8 @@ def harmonization_record(harmonization: Harmonization, groups: Groups | None) ->
         "column": plan.column,
         "participants": dict(plan.counts),
         "estimated": list(plan.estimated),
-        "formula": plan.kept.formula,
-        "kept": list(plan.kept.names),
+        "formula": plan.formula,
+        "kept": list(plan.names),
         "explained": dict(plan.explained),
         "icv": plan.icv,
         "repeated": plan.visits.participant is not None,
@@ -249,14 +208,14 @@ def harmonization_record(harmonization: Harmonization, groups: Groups | None) ->
 def effects_of(parts: Sequence[Harmonization], templates: Mapping[str, str]) -> SavedEffects | None:
     """Collect parameters for other people; ``None`` if they have no meaning there."""
     plan = parts[0].plan
-    if not plan.kept.portable:
+    if not plan.portable:
         return None
     known_sites = plan.saved.sites if plan.saved else {}
     return SavedEffects(
         column=plan.column,
-        formula=plan.kept.formula,
-        levels={name: list(levels) for name, levels in plan.kept.levels.items()},
-        columns=list(plan.kept.names),
+        formula=plan.formula,
+        levels={name: list(levels) for name, levels in plan.levels.items()},
+        columns=list(plan.names),
         sites={one: known_sites.get(one, plan.counts.get(one, 0)) for one in plan.sites},
         repeated=plan.visits.participant is not None,
         icv=plan.icv,
@@ -269,24 +228,3 @@ def effects_of(parts: Sequence[Harmonization], templates: Mapping[str, str]) -> 
 def _of_kind(kind: str, parts: Sequence[Harmonization]) -> dict[tuple[str, str], SiteEffects]:
     pairs = (pair for part in parts for pair in part.effects.items())
     return {key[1:]: effects for key, (effects, _) in pairs if key[0] == kind}
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class RetestCohort:
-    """Participants who have all sessions."""
-
-    cohort: data.Cohort
-    """Their visits."""
-    participants: tuple[str, ...]
-    sessions: tuple[str, ...]
-    left_out: Mapping[str, str]
-    """By visit, what is missing."""
-
-    def arrange(self, values: Float, rows: Int) -> Float:
-        """Arrange values of visits as (participants, sessions, points); NaN where missing."""
-        visits = self.cohort.table.iloc[rows]
-        filled = np.full((len(self.participants), len(self.sessions), values.shape[1]), np.nan)
-        participant = np.searchsorted(self.participants, visits[PARTICIPANT].astype(str))
-        session = np.searchsorted(self.sessions, visits[SESSION].astype(str))
-        filled[participant, session] = values
-        return filled

@@ -3,7 +3,6 @@
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import asdict
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -22,8 +21,8 @@ from hipsta_bids.group.stats.warps import DEGREE, Template
 from hipsta_bids.io import files
 from hipsta_bids.protocols.toml import Fraction, TomlTable
 
-#: Fields of a template that are arrays, and the one that JSON has no infinity for.
-_TEMPLATE_ARRAYS, _INFINITE = ("knots", "mean", "components", "center"), "warp_variance"
+#: Fields of a template that are arrays.
+_TEMPLATE_ARRAYS = ("knots", "mean", "components", "center")
 _FLAT = frozenset({"mean", "sd", "ratio"})
 
 
@@ -245,16 +244,24 @@ _Rising = Annotated[list[Fraction], Field(max_length=1000), AfterValidator(_risi
 
 
 def templates_to_json(templates: Mapping[str, Template]) -> dict[str, Any]:
-    """Write templates by hemisphere as a JSON object."""
-    entries = {}
-    for hemi, template in templates.items():
-        entry = {
-            name: value.tolist() if name in _TEMPLATE_ARRAYS else value
-            for name, value in asdict(template).items()
+    """Write templates by hemisphere as a JSON object.
+
+    ``align`` and ``warp_variance`` are left of a method that is gone: earlier files have them.
+    """
+    entries = {
+        hemi: {
+            "knots": template.knots.tolist(),
+            "mean": template.mean.tolist(),
+            "components": template.components.tolist(),
+            "noise": template.noise,
+            "scale": template.scale,
+            "align": "registr",
+            "warp_variance": None,
+            "turns": template.turns,
+            "center": template.center.tolist(),
         }
-        if not np.isfinite(template.warp_variance):
-            entry[_INFINITE] = None
-        entries[hemi] = entry
+        for hemi, template in templates.items()
+    }
     return {"Description": "template of curvature profiles along x", "Hemispheres": entries}
 
 
@@ -266,8 +273,8 @@ class _SavedTemplate(TomlTable):
     components: list[list[files.Number]]
     noise: Annotated[files.Number, Field(gt=0)]
     scale: Annotated[files.Number, Field(gt=0)] | None
-    align: Literal["registr", "penalized"]
-    warp_variance: Annotated[files.Number, Field(gt=0)] | None
+    align: Literal["registr"]
+    warp_variance: None
     turns: Annotated[int, Field(ge=0, le=1000)]
     center: Annotated[_Rising, Field(min_length=2)]
 
@@ -290,8 +297,7 @@ def templates_from_json(content: Mapping[str, Any], source: str) -> dict[str, Te
         for hemi, entry in content["Hemispheres"].items():
             values = dict(files.checked_foreign(entry, _SavedTemplate))
             values |= {name: np.array(values[name], dtype=np.float64) for name in _TEMPLATE_ARRAYS}
-            if values[_INFINITE] is None:
-                values[_INFINITE] = np.inf
+            del values["align"], values["warp_variance"]
             templates[str(hemi)] = Template(**values)
     except (KeyError, AttributeError, TypeError, ValueError) as error:
         problem = error if isinstance(error, ValueError) else "it has no Hemispheres"

@@ -136,23 +136,23 @@ def average_shapes(
     names = [(record.result.name, record.result) for record in records]
     result_of = {(visit_name(one.subject, one.session), one.hemi): result for one, result in names}
     shapes = {}
-    for hemi, side in analysis.sides.items() if records else ():
-        visits = cohort.table.iloc[side.registered.rows]
+    for hemi, side in analysis.registered.items() if records else ():
+        visits = cohort.table.iloc[side.rows]
         first = np.flatnonzero(~visits[PARTICIPANT].duplicated().to_numpy())
         count = min(len(first), settings.most)
         rows = first[np.linspace(0, len(first) - 1, count).round().astype(np.int64)]
         keys = [(str(name), hemi) for name in visits.index[rows]]
         rows = rows[[key in result_of for key in keys]]
         places = [result_of[key] for key in keys if key in result_of]
-        read, layers = _read_layers(places, side.registered.shape)
+        read, layers = _read_layers(places, side.shape)
         if not read:
             continue
         rows_read = rows[read]
         members = members_of(analysis, visits.iloc[rows_read])
-        warps = side.registration.warps[rows_read]
+        warps = analysis.registrations[hemi].warps[rows_read]
         visible = None
         if parts_of(cohort.y) is not None:  # nodes without values have positions for display alone
-            visible = np.isfinite(next(iter(side.registered.maps.values()))[rows_read])
+            visible = np.isfinite(next(iter(side.maps.values()))[rows_read])
         shapes[hemi] = average_shape(layers, warps, members, visible=visible)
     return shapes
 

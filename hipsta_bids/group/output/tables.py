@@ -14,13 +14,14 @@ from hipsta_bids.group.design.formula import file_label
 from hipsta_bids.group.design.settings import GroupSettings
 from hipsta_bids.group.output import columns, results
 from hipsta_bids.group.output.columns import find_clusters, frame_of
-from hipsta_bids.group.output.panels import Row, Views, draw_pages
+from hipsta_bids.group.output.panels import Row, draw_pages
 from hipsta_bids.group.output.shapes import AverageShape
 from hipsta_bids.group.stats.arrays import Float, describe_known, mean_of_known
 from hipsta_bids.group.stats.classify import ClassifierResult
 from hipsta_bids.group.stats.clusters import edges_of
 from hipsta_bids.group.stats.glm import FittedMaps, PointTest
 from hipsta_bids.group.stats.inference import Discoveries, MapKey, PermutationTest, control_fdr
+from hipsta_bids.group.stats.registration import Registration
 from hipsta_bids.reports import cells, display
 from hipsta_bids.reports.group_maps import EFFECT_NAMES, signed_logarithm
 from hipsta_bids.types import PARTICIPANT, SESSION
@@ -50,15 +51,15 @@ def result_tables(
     if analysis.fitted:
         yield f"{prefix}peaks", _stacked(_peaks(cohort, analysis, settings))
         yield f"{prefix}means", _stacked(_means(cohort, analysis))
-    if analysis.sides:
+    if analysis.registrations:
         yield from _registration_tables(cohort, analysis)
     yield from _sites(f"{prefix}sites", cohort, analysis)
     if analysis.measures:
         yield "measures", with_fdr(_stacked(_measures(cohort, analysis)), settings)
         if analysis.groups is not None:
             yield "descriptives", _stacked(_descriptives(analysis))
-    if analysis.scores is not None and len(analysis.scores.table):
-        yield f"{prefix}wscores", analysis.scores.table
+    if len(analysis.scores):
+        yield f"{prefix}wscores", analysis.scores
     if analysis.pairs:
         yield "classification", _classification(analysis, settings)
         yield "roc", _stacked(_curves(analysis, _roc))
@@ -137,8 +138,8 @@ def _means(cohort: Cohort, analysis: results.Analysis) -> Iterator[Columns]:
 
 
 def _profiles(cohort: Cohort, analysis: results.Analysis) -> Iterator[Columns]:
-    for hemi, side in analysis.sides.items():
-        for registered, source in ((False, cohort.sides[hemi]), (True, side.registered)):
+    for hemi, side in analysis.registered.items():
+        for registered, source in ((False, cohort.sides[hemi]), (True, side)):
             members = results.members_of(analysis, cohort.table.iloc[source.rows])
             for measure in source.maps:
                 for group, member in members.items():
@@ -169,17 +170,17 @@ def overview_table(discoveries: Mapping[MapKey, Discoveries]) -> pd.DataFrame:
 
 
 def _measures(cohort: Cohort, analysis: results.Analysis) -> Iterator[Columns]:
-    for fit in analysis.measures:
-        for test in fit.fit.tests:
+    for (hemi, formula), (names, fit, participants) in analysis.measures.items():
+        for test in fit.tests:
             yield {
-                "hemi": fit.hemi,
-                "measure": fit.measures,
-                "unit": [cohort.units.get(name, "1") for name in fit.measures],
-                "model": fit.formula,
+                "hemi": hemi,
+                "measure": names,
+                "unit": [cohort.units.get(name, "1") for name in names],
+                "model": formula,
                 "contrast": test.contrast.name,
                 "test": test.kind,
-                "n": fit.participants,
-                "visits": fit.fit.n,
+                "n": participants,
+                "visits": fit.n,
                 **columns.test_columns(test),
                 "p_fdr": np.nan,
                 **columns.effect_columns(test),
@@ -219,30 +220,37 @@ def _descriptives(analysis: results.Analysis) -> Iterator[Columns]:
 
 
 def _registration_tables(cohort: Cohort, analysis: results.Analysis) -> Iterator[Named]:
-    yield from registration_tables(cohort, analysis.sides)
+    yield from registration_tables(cohort, analysis.registrations)
     if analysis.unregistered:
         yield "alignment", _alignment(analysis)
     yield "profiles", _stacked(_profiles(cohort, analysis))
     if analysis.groups is not None:
-        yield "shifts", _stacked(_shifts(analysis))
+        shifts = (
+            {"hemi": hemi, "group": group, **shift}
+            for hemi, one in analysis.registrations.items()
+            for group, shift in one.by_group.items()
+        )
+        yield "shifts", _stacked(shifts)
 
 
-def registration_tables(cohort: Cohort, sides: Mapping[str, results.SideResult]) -> Iterator[Named]:
+def registration_tables(
+    cohort: Cohort, registrations: Mapping[str, Registration]
+) -> Iterator[Named]:
     """Make the tables of registration and of its warps."""
     rows = [
         {
             "hemi": hemi,
-            "n": len(side.registration.warps),
-            "explained_before": side.registration.explained_before,
-            "explained_after": side.registration.explained_after,
-            "iterations": side.registration.iterations,
-            "converged": side.registration.converged,
-            **side.difference,
+            "n": len(one.warps),
+            "explained_before": one.explained_before,
+            "explained_after": one.explained_after,
+            "iterations": one.iterations,
+            "converged": one.converged,
+            **one.difference,
         }
-        for hemi, side in sides.items()
+        for hemi, one in registrations.items()
     ]
     yield "registration", pd.DataFrame(rows)
-    yield "warps", _stacked(_warps(cohort, sides))
+    yield "warps", _stacked(_warps(cohort, registrations))
 
 
 def _alignment(analysis: results.Analysis) -> pd.DataFrame:
@@ -265,24 +273,17 @@ def _alignment(analysis: results.Analysis) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def _warps(cohort: Cohort, sides: Mapping[str, results.SideResult]) -> Iterator[Columns]:
-    for hemi, side in sides.items():
-        visits = cohort.table.iloc[side.registered.rows]
-        warps = side.registration.warps
+def _warps(cohort: Cohort, registrations: Mapping[str, Registration]) -> Iterator[Columns]:
+    for hemi, result in registrations.items():
+        visits = cohort.table.iloc[cohort.sides[hemi].rows]
         yield {
             PARTICIPANT: visits[PARTICIPANT].to_numpy(),
             SESSION: visits[SESSION].to_numpy(),
             "hemi": hemi,
-            "displacement": side.registration.displacement,
-            "extreme": side.registration.extreme,
-            **{f"node_{i + 1}": warps[:, i] for i in range(warps.shape[1])},
+            "displacement": result.displacement,
+            "extreme": result.extreme,
+            **{f"node_{i}": column for i, column in enumerate(result.warps.T, start=1)},
         }
-
-
-def _shifts(analysis: results.Analysis) -> Iterator[Columns]:
-    for hemi, side in analysis.sides.items():
-        for group, shift in side.shifts.items():
-            yield {"hemi": hemi, "group": group, **shift}
 
 
 def _sites(name: str, cohort: Cohort, analysis: results.Analysis) -> Iterator[Named]:
@@ -414,8 +415,7 @@ def joint_peaks(joint: Sequence[JointMap], neighbors: int) -> pd.DataFrame:
             joint_map.test.statistic,
         )
         edges = edges_of(joint_map.fitted.maps, neighbors)
-        for cluster in find_clusters(joint_map.found.rejected, z, frame.subfield, edges):
-            at = cluster.peak
+        for at, cluster in find_clusters(joint_map.found.rejected, z, frame.subfield, edges):
             words = [
                 f"{title} {cells.effect_name(_EFFECTS[test.kind])}"
                 f" {cells.number_text(test.effect[at])},"
@@ -432,23 +432,21 @@ def joint_peaks(joint: Sequence[JointMap], neighbors: int) -> pd.DataFrame:
                     "statistic": z[at],
                     "p": joint_map.test.p_uncorrected[at],
                     "p_corrected": joint_map.found.adjusted[at],
-                    **cluster.columns,
+                    **cluster,
                     "measures": "; ".join(words),
                 }
             )
     return pd.DataFrame(rows)
 
 
-def draw_joint(
-    joint: Sequence[JointMap], shapes: Mapping[str, AverageShape], views: Views
-) -> "list[Figure]":
+def draw_joint(joint: Sequence[JointMap], shapes: Mapping[str, AverageShape]) -> "list[Figure]":
     """Draw combined evidence and corrected p of each contrast."""
     by_contrast: dict[str, dict[str, JointMap]] = {}
     for joint_map in joint:
         by_contrast.setdefault(joint_map.key.contrast, {})[joint_map.key.hemi] = joint_map
     places = {joint_map.key.hemi: joint_map.fitted for joint_map in joint}
     blocks = [list(_rows(i, name, own)) for i, (name, own) in enumerate(by_contrast.items())]
-    return draw_pages(joint[0].cohort, places, shapes, views, blocks)
+    return draw_pages(joint[0].cohort, places, blocks, shapes)
 
 
 def _rows(number: int, contrast: str, maps: Mapping[str, JointMap]) -> Iterator[Row]:

@@ -39,11 +39,6 @@ GROUP_FOLDER = DATASET_FILES["group"]
 _ROWS = 10_000  # of tables that are spelled at once
 
 
-def model_folder(root: Path, name: str) -> contextlib.AbstractContextManager[Path]:
-    """Make the folder of a model, whole or not at all."""
-    return whole_folder(root / GROUP_FOLDER / name)
-
-
 @contextlib.contextmanager
 def whole_folder(path: Path) -> Iterator[Path]:
     """Make a folder to write into, which is renamed to its final name if all went well."""
@@ -98,7 +93,7 @@ def write_results(
     rows_of_model = analysis.compared.table.iloc[analysis.design.rows]
     write_table(folder, "covariates", rows_of_model, described=False)
     write_table(folder, "design", tables.design_table(analysis), described=False)
-    registered = {hemi: side.registered for hemi, side in analysis.sides.items()}
+    registered = analysis.registered
     if (registered or len(cohorts) > 1) and _parquet_possible():
         from hipsta_bids.group.output import parquet  # noqa: PLC0415  (an optional extra)
 
@@ -106,21 +101,17 @@ def write_results(
         if analysis.harmonization is not None:
             states.append(analysis.harmonization.cohort.sides)
         parquet.write_maps(folder / "maps.parquet", cohorts, states if registered else [])
-    if templates := results.templates_of(analysis.sides):
+    if templates := results.templates_of(analysis.registrations):
         files.write_json(folder / "template.json", templates)
     if analysis.harmonization is not None:
         parts = [one.harmonization for one in analyses.values() if one.harmonization is not None]
-        templates_used = results.digests(
-            {h: side.registration for h, side in analysis.sides.items()}
-        )
-        if effects := results.effects_of(parts, templates_used):
+        if effects := results.effects_of(parts, results.digests(analysis.registrations)):
             files.write_json(folder / "harmonization.json", effects.model_dump(by_alias=True))
     for surface, one in analyses.items():
         _write_surfaces(folder, cohorts[surface], one)
         write_stats(folder, stats_of(results.tested_maps(one)))
-        scored, table = {} if one.scores is None else one.scores.sides, one.compared.table
-        sheets = bool(one.sides)
-        write_scores(folder, cohorts[surface], table, scored, letter="w", sheets=sheets)
+        table, sheets = one.compared.table, bool(one.registered)
+        write_scores(folder, cohorts[surface], table, one.scored, letter="w", sheets=sheets)
     _write_joint(folder, joint, settings)
     text = methods_text(
         cohort,
@@ -156,7 +147,7 @@ def draw(
         for drawing in draw_figures(cohort, analyses[surface], shapes if surface == SHEET else {})
     ]
     if joint:
-        drawings.append((f"{JOINT}_maps", partial(draw_joint, joint, shapes, {})))
+        drawings.append((f"{JOINT}_maps", partial(draw_joint, joint, shapes)))
     return write_figures(folder, drawings)
 
 

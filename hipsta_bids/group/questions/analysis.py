@@ -4,7 +4,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import product
-from typing import Any
 
 import numpy as np
 from scipy import special
@@ -111,13 +110,13 @@ def analyze_cohort(
     rows = make_rows(design)
     joint = bool(settings.joint.measures)
     inference.check_permutations(settings.multiplicity, settings.glm, joint=joint)
-    _check_weights(comparison, settings)
     sides = {
         hemi: register_side(cohort, hemi, groups=groups, settings=settings, templates=templates)
         for hemi in each("registration", list(cohort.sides) if measures.maps else [])
     }
-    registered = {hemi: side.registered for hemi, side in sides.items()} or cohort.sides
-    measured = replace(cohort, sides=registered)
+    registrations = {hemi: result for hemi, (result, _) in sides.items()}
+    registered = {hemi: maps for hemi, (_, maps) in sides.items()}
+    measured = replace(cohort, sides=registered or cohort.sides)
     fit = partial(
         _fit_cohort,
         plan=plan,
@@ -126,14 +125,13 @@ def analyze_cohort(
         comparison=comparison,
         settings=settings,
     )
-    registrations = {hemi: side.registration for hemi, side in sides.items()}
     harmonization, compared, fitted, discoveries = fit(measured, registrations=registrations)
     unregistered: Mapping[inference.MapKey, inference.Discoveries] = {}
     # Effects of sites from a file are those of registered nodes.
     is_repeated = settings.registration.align != "none" and (plan is None or plan.saved is None)
     if is_repeated and settings.multiplicity.method not in inference.PERMUTATIONS:
         unregistered = fit(cohort)[3]
-    scores = score_cohort(
+    reference, scored, scores = score_cohort(
         compared,
         model,
         comparison.normative,
@@ -163,7 +161,8 @@ def analyze_cohort(
         comparison=comparison,
         design=design,
         groups=groups,
-        sides=sides,
+        registrations=registrations,
+        registered=registered,
         harmonization=harmonization,
         measured=measures,
         compared=compared,
@@ -171,6 +170,8 @@ def analyze_cohort(
         fitted=fitted,
         found=discoveries,
         unregistered=unregistered,
+        reference=reference,
+        scored=scored,
         scores=scores,
         measures=summaries,
         pairs=pairs,
@@ -192,7 +193,7 @@ def analyze_points(
         comparison=analysis.comparison,
         settings=settings,
     )
-    scores = score_cohort(
+    reference, scored, scores = score_cohort(
         compared,
         analysis.model,
         analysis.comparison.normative,
@@ -202,35 +203,21 @@ def analyze_points(
     )
     return replace(
         analysis,
-        sides={},
+        registrations={},
+        registered={},
         harmonization=harmonization,
         measured=measured,
         compared=compared,
         fitted=fitted,
         found=discoveries,
         unregistered={},
-        measures=(),
+        measures={},
         pairs=(),
+        reference=reference,
+        scored=scored,
         scores=scores,
         skipped=(),
     )
-
-
-def _check_weights(comparison: designs.Comparison, settings: GroupSettings) -> None:
-    """Refuse weights where there is no rule for them."""
-    excluded_by = {
-        "--longitudinal": comparison.longitudinal,
-        "--paired": comparison.pair,
-        "--asymmetry": comparison.asymmetry,
-        "--normative": comparison.normative,
-        "permutations": settings.multiplicity.method in inference.PERMUTATIONS,
-        "--joint": settings.joint.measures,
-    }
-    wrong = [name for name, given in excluded_by.items() if given]
-    if settings.glm.weights != "none" and wrong:
-        raise ModelError(
-            f"--weights {settings.glm.weights}: not together with {', '.join(wrong)}; leave one out"
-        )
 
 
 def _fit_cohort(
@@ -282,22 +269,20 @@ def register_side(
     groups: designs.Groups | None,
     settings: GroupSettings,
     templates: Mapping[str, Template] | None,
-) -> results.SideResult:
-    """Register the sheets of one hemisphere, to a template or to each other."""
+) -> tuple[registration.Registration, arrays.SideMaps]:
+    """Register the sheets of one hemisphere, to a template or to each other; also the maps."""
     side = cohort.sides[hemi]
     profiles = registration.mean_profiles(side.maps["curvature"], settings.registration)
     if templates is None:
         result = registration.register(profiles, settings.registration)
     else:
         result = registration.register_to(profiles, templates[hemi], settings.registration)
-    shifts: Mapping[str, Mapping[str, Any]] = {}
-    difference: Mapping[str, float] = {}
     if groups is not None:
         names = cohort.table[groups.column].iloc[side.rows]
         has_group = names.notna().to_numpy()
         grouped = replace(result, warps=result.warps[has_group])
         members = names[has_group].astype(str).to_numpy(dtype=np.str_)
-        shifts = registration.shift_by_group(grouped, members)
+        difference: Mapping[str, float] = {}
         if result.template is not None:
             difference = registration.shift_difference(
                 grouped,
@@ -306,19 +291,16 @@ def register_side(
                 permutations=settings.registration.group_permutations,
                 seed=settings.multiplicity.seed,
             )
+        by_group = registration.shift_by_group(grouped, members)
+        result = replace(result, by_group=by_group, difference=difference)
     arrays.return_memory()
-    return results.SideResult(
-        registration=result,
-        registered=_register_maps(side, result.warps, parts_of(cohort.y) is not None),
-        shifts=shifts,
-        difference=difference,
-    )
+    return result, _register_maps(side, result.warps, parts_of(cohort.y) is not None)
 
 
 def _register_maps(side: arrays.SideMaps, warps: arrays.Float, rims: bool) -> arrays.SideMaps:
     """Carry all maps of sheets; a point beside ``rims`` that came to be known of few is none."""
     is_small = len(warps) <= arrays.MOST_KEPT
-    maps, errors = (arrays.WarpedMaps(one, warps, warp_values) for one in (side.maps, side.errors))
+    maps = arrays.WarpedMaps(side.maps, warps, warp_values)
     labels = arrays.WarpedLabels(side.subfield[:], warps, warp_labels)
     registered = dict(maps) if is_small or rims else maps
     for values in registered.values() if rims else ():
@@ -326,7 +308,6 @@ def _register_maps(side: arrays.SideMaps, warps: arrays.Float, rims: bool) -> ar
     return replace(
         side,
         maps=registered,
-        errors=dict(errors) if is_small else errors,
         subfield=labels[:] if is_small else labels,
     )
 
@@ -338,8 +319,7 @@ def unequal_spread(analysis: results.Analysis, settings: GlmSettings) -> Iterato
     """
     groups, worst = analysis.groups, dict[str, tuple[float, str]]()
     named = groups is not None and groups.column in closed_formula(analysis.model.formula).names
-    ordinary = (settings.covariance, settings.weights) == ("ordinary", "none")
-    if not (named and ordinary) or analysis.comparison.longitudinal:
+    if not named or settings.covariance != "ordinary" or analysis.comparison.longitudinal:
         return
     for hemi, fitted in analysis.fitted.items():
         members = results.members_of(analysis, results.rows_of(analysis, fitted))

@@ -15,13 +15,13 @@ from hipsta_bids.group.output.saved import load_effects
 from hipsta_bids.group.output.shapes import average_shapes, write_shapes
 from hipsta_bids.group.output.write import draw, write_results
 from hipsta_bids.group.questions import analysis as fitting
-from hipsta_bids.group.questions import study
+from hipsta_bids.group.questions import study as studies
 from hipsta_bids.group.questions.exchange import SUMMARY, summarize, write_summary
 from hipsta_bids.io import files
 from hipsta_bids.progress import tell
 
 
-def run_group(options: study.GroupOptions, settings: GroupSettings) -> study.GroupResult:
+def run_group(options: studies.GroupOptions, settings: GroupSettings) -> studies.GroupResult:
     """Collect sheets and covariates, analyze them, and write all results or none.
 
     Parameters
@@ -41,102 +41,94 @@ def run_group(options: study.GroupOptions, settings: GroupSettings) -> study.Gro
         If inputs, model or output folder do not allow it.
     """
     dataset.check_own_dataset(options.out_dir)
-    return study.with_page(options, _analyze(options, settings))
+    return studies.with_page(options, _analyze(options, settings))
 
 
-def _analyze(options: study.GroupOptions, settings: GroupSettings) -> study.GroupResult:
+def _analyze(options: studies.GroupOptions, settings: GroupSettings) -> studies.GroupResult:
     """Analyze and write all but the page, for which the memory that it takes is free again."""
-    tell("reading")
-    inputs = study.read_inputs(options, settings)
-    fitting.check_joint(inputs.maps, options.comparison, settings)
-    cohort = inputs.cohort
+    study = studies.read_study(options, settings)
+    fitting.check_joint(study.maps, options.comparison, settings)
+    cohort = study.cohort
     document, model, groups, references = designs.choose_model(
         options.model,
         cohort.table,
         settings,
         comparison=options.comparison,
-        visits=inputs.time,
+        visits=study.time,
     )
-    templates = study.read_templates(options.template, cohort)
+    templates = studies.read_templates(options.template, cohort)
     analysis = fitting.analyze_cohort(
         cohort,
         model,
         groups,
         settings,
-        measures=inputs.measures,
+        measures=study.measures,
         references=references,
         comparison=options.comparison,
-        time=inputs.time.column if inputs.time else None,
-        icv=inputs.icv,
+        time=study.time.column if study.time else None,
+        icv=study.icv,
         templates=templates,
         site_effects=load_effects(options.harmonize_model) if options.harmonize_model else None,
     )
     analyses = {
         surface: analysis
         if surface == SHEET
-        else fitting.analyze_points(inputs.cohorts[surface], analysis, settings)
-        for surface in inputs.cohorts
+        else fitting.analyze_points(study.cohorts[surface], analysis, settings)
+        for surface in study.cohorts
     }
     joint = fitting.combine_maps(list(analyses.values()), settings)
     discoveries = {key: test for one in analyses.values() for key, test in one.found.items()}
     discoveries |= {key: one.found for key, one in joint.items()}
     tested = tuple(joint.values())
     analysis = analyses[SHEET] = replace(analysis, found=discoveries)
-    exclusions = [*inputs.exclusions, *_incomplete(analysis)]
+    exclusions = [*study.exclusions, *_incomplete(analysis)]
     measures = designs.wanted_measures(options.model, options.measures)
-    notes = [*inputs.notes, *_notes(options, inputs, analysis, settings)]
-    summary = _summary(options, inputs, analysis, settings, notes)
+    notes = [*study.notes, *_notes(study, analysis)]
+    summary = _summary(study, analysis, notes)
     tell("average surfaces")
-    shapes = average_shapes(inputs.found.records, cohort, analysis, settings.shapes)
+    shapes = average_shapes(study.collection.records, cohort, analysis, settings.shapes)
     # One is enough from here on, and all may take much memory.
-    inputs = replace(inputs, found=replace(inputs.found, records=inputs.found.records[:1]))
+    study = replace(
+        study, collection=replace(study.collection, records=study.collection.records[:1])
+    )
 
     def fill(folder: Path) -> dict[str, Any]:
         write_results(
             folder,
-            inputs.cohorts,
+            study.cohorts,
             analyses,
             settings,
             exclusions,
             joint=tested,
             region=options.sheets.region,
-            ratings=inputs.found.ratings,
+            ratings=study.collection.ratings,
         )
         files.write_json(folder / "model.json", document)
         if summary is not None:
             write_summary(folder / SUMMARY, summary)
         write_shapes(folder, shapes)
-        if analysis.sides and inputs.found.records and not shapes:
+        if analysis.registered and study.collection.records and not shapes:
             notes.append("no average surfaces: those of the participant level are missing")
-        notes.extend(draw(folder, inputs.cohorts, analyses, shapes, joint=tested))
-        return _record(analysis, inputs.found.ratings)
+        notes.extend(draw(folder, study.cohorts, analyses, shapes, joint=tested))
+        return _record(analysis, study.collection.ratings)
 
     return study.write_folder(
-        options,
         designs.folder_name(model.formula, measures) + options.comparison.suffix,
-        inputs,
-        settings,
         notes=notes,
         counts=(analysis.n_participants, len(exclusions)),
         fill=fill,
     )
 
 
-def _summary(
-    options: study.GroupOptions,
-    inputs: study.GroupInputs,
-    analysis: Analysis,
-    settings: GroupSettings,
-    notes: list[str],
-) -> dict[str, Any] | None:
+def _summary(study: studies.Study, analysis: Analysis, notes: list[str]) -> dict[str, Any] | None:
     """Make the summary for other sites, if it is asked for."""
+    options, collection = study.options, study.collection
     if options.export_summary is None:
         return None
-    collection = inputs.found
     summary, notes_of_summary = summarize(
-        inputs.cohort,
+        study.cohort,
         analysis,
-        settings,
+        study.settings,
         site=options.export_summary or options.bids_dir.resolve().name,
         inputs={
             "versions": list(collection.versions),
@@ -149,27 +141,22 @@ def _summary(
     return summary
 
 
-def _notes(
-    options: study.GroupOptions,
-    inputs: study.GroupInputs,
-    analysis: Analysis,
-    settings: GroupSettings,
-) -> list[str]:
+def _notes(study: studies.Study, analysis: Analysis) -> list[str]:
     """List what a reader of the results should know, one line each."""
-    collection, notes = inputs.found, list(analysis.skipped)
-    time = inputs.time.column if inputs.time else None
+    options, settings, notes = study.options, study.settings, list(analysis.skipped)
+    time = study.time.column if study.time else None
     notes += [note for name, note in analysis.design.notes.items() if name != time]
     if options.model.formula is None and options.model.file is None:
         notes += [
             f"{name} is n/a for all, and not in the model; fill it in, or do not read much into"
             f" differences that {name} might explain"
-            for name in designs.empty_covariates(inputs.cohort.table, settings)
+            for name in designs.empty_covariates(study.cohort.table, settings)
         ]
-    if n_later := sum(one.reason == "later-session" for one in inputs.exclusions):
+    if n_later := sum(one.reason == "later-session" for one in study.exclusions):
         notes.append(
             f"{n_later} later sessions are not in it; --longitudinal takes all, --paired two"
         )
-    if flagged := sum(record.flagged for record in collection.records):
+    if flagged := sum(record.flagged for record in study.collection.records):
         notes.append(
             f"{flagged} flagged hemispheres are in it; look at them, or use --exclude-flagged"
         )
@@ -185,14 +172,11 @@ def _notes(
                 " survives, above the level; effects are widespread"
             )
     notes += fitting.unequal_spread(analysis, settings.glm)
-    for hemi, side in analysis.sides.items():
-        if not side.registration.converged:
+    for hemi, registration in analysis.registrations.items():
+        if not registration.converged:
             notes.append(f"hemisphere {hemi}: registration had not settled when it ended")
-        if side.registration.extreme.any():
-            notes.append(
-                f"hemisphere {hemi}: extreme warps: {int(side.registration.extreme.sum())}, see"
-                " warps.tsv"
-            )
+        if n_extreme := int(registration.extreme.sum()):
+            notes.append(f"hemisphere {hemi}: extreme warps: {n_extreme}, see warps.tsv")
     return notes
 
 

@@ -136,7 +136,7 @@ def _figures(meta: Meta) -> Iterator[tuple[str, Drawing]]:
                 },
             )
             blocks[2 * number + 1].append(row)
-        yield f"{measure}_maps", partial(draw_pages, cohort, sides, {}, {}, blocks)
+        yield f"{measure}_maps", partial(draw_pages, cohort, sides, blocks)
 
 
 def _place(meta: Meta, hemi: str, cohort: Cohort) -> FittedMaps:

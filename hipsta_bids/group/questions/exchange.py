@@ -225,7 +225,7 @@ def summarize(
         notes.append(f"{SUMMARY}: without {lacking} participants who lack a hemisphere")
     table = compared.table.iloc[rows]
     designs = {}
-    for formula in dict.fromkeys((analysis.model.formula, *(m.formula for m in analysis.measures))):
+    for formula in dict.fromkeys((analysis.model.formula, *(f for _, f in analysis.measures))):
         # Anew, since contrasts may hold means over all participants.
         spec = replace(analysis.model, formula=formula)
         rebuilt = build_design(table, spec, settings.design, analysis.design.references)
@@ -275,7 +275,7 @@ def summarize(
         "asymmetry": [] if analysis.comparison.pair else list(settings.asymmetry.relative),
         "change": analysis.comparison.pair is not None,
         "align": settings.registration.align,
-        "template": files.plain(templates_of(analysis.sides)),
+        "template": files.plain(templates_of(analysis.registrations)),
         "participants": len(rows),
         "groups": groups,
         "factors": factors,
@@ -302,8 +302,8 @@ def _check_model(analysis: Analysis, settings: GroupSettings) -> None:
         problem = "of --longitudinal cannot be combined; use --paired"
     elif analysis.harmonization is not None:
         problem = "of harmonized values cannot be combined; leave --harmonize out"
-    elif settings.glm.covariance != "ordinary" or settings.glm.weights != "none":
-        problem = "with HC3 standard errors or weights cannot be combined; leave these out"
+    elif settings.glm.covariance != "ordinary":
+        problem = "with HC3 standard errors cannot be combined; leave these out"
     elif match := _OF_THE_SAMPLE.search(analysis.model.formula):
         problem = (
             f"with {match[1]}() has other columns at each site; write numbers that are the same"
@@ -364,20 +364,20 @@ def _models(
                 "subfield": _subfields(one),
                 **_model(values, designs[formula], fit.tests, settings),
             }
-    for fitted in analysis.measures:
-        if fitted.formula not in designs:
+    for (hemi, model_formula), (_, fit, _) in analysis.measures.items():
+        if model_formula not in designs:
             continue
-        table = summary_values(compared, fitted.hemi, analysis.measured.summaries).iloc[rows]
+        table = summary_values(compared, hemi, analysis.measured.summaries).iloc[rows]
         # Also those that do not vary here, so that all sites have the same measures.
-        adjusted = fitted.formula != formula
+        adjusted = model_formula != formula
         names = [str(c) for c in table if not adjusted or str(c).startswith("volume")]
         values = table[names].to_numpy(dtype=np.float64)
         yield {
             "kind": "summary",
-            "hemi": fitted.hemi,
+            "hemi": hemi,
             "measures": names,
-            "formula": fitted.formula,
-            **_model(values, designs[fitted.formula], fitted.fit.tests, settings),
+            "formula": model_formula,
+            **_model(values, designs[model_formula], fit.tests, settings),
         }
 
 

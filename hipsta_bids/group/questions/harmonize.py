@@ -14,7 +14,7 @@ from hipsta_bids.group.design import formula as formulas
 from hipsta_bids.group.design.grammar import closed_formula
 from hipsta_bids.group.design.model import DEPENDENCE, Comparison, Design, build_design
 from hipsta_bids.group.design.settings import GroupSettings
-from hipsta_bids.group.output.results import Harmonization, Kept, SitePlan, digests
+from hipsta_bids.group.output.results import Harmonization, SitePlan, digests
 from hipsta_bids.group.output.saved import SavedEffects, damaged
 from hipsta_bids.group.questions.scores import without_variable
 from hipsta_bids.group.stats import combat
@@ -49,12 +49,18 @@ def plan_sites(
     _check_terms(model, column)
     if comparison.pair:
         _check_constant(cohort.table, column)
+    levels: Mapping[str, Sequence[str]]
     if saved:
-        preserved = _saved_columns(cohort.table, saved)
+        formula, levels, portable = saved.formula, saved.levels, True
+        matrix, names = _saved_columns(cohort.table, saved)
     else:
-        preserved = _own_columns(cohort, column, model, settings, (references, comparison))
+        formula = without_variable(model.formula, column).removeprefix("1 + ")
+        spec = replace(model, formula=formula, contrasts=(), dummy=None)
+        matrix, names, levels, portable = _own_columns(
+            cohort, spec, settings, references, comparison
+        )
     labels = formulas.level_labels(cohort.table[column])
-    usable = labels.notna().to_numpy() & np.isfinite(preserved.matrix).all(axis=1)
+    usable = labels.notna().to_numpy() & np.isfinite(matrix).all(axis=1)
     old = tuple(saved.sites) if saved else ()
     present = set(labels[usable])
     new = tuple(sorted(present - set(old)))
@@ -65,10 +71,11 @@ def plan_sites(
     _check_sizes(column, new, counts, settings, is_single=saved is None)
     site = np.where(usable, pd.Categorical(labels, categories=sites).codes, -1).astype(np.int64)
     member = np.eye(len(sites))[site[usable]]
-    explained = _explained(column, member, preserved, usable, refuse=saved is None)
+    columns = dict(zip(names, matrix[usable].T, strict=True))
+    explained = _explained(column, member, columns, refuse=saved is None)
     repeated = pd.Series(people[usable]).duplicated().any() if saved is None else saved.repeated
     volume = saved.icv if saved else icv
-    volume, values = _icv(cohort.table, usable, volume, preserved.formula)
+    volume, values = _icv(cohort.table, usable, volume, formula)
     if saved and saved.icv and volume is None:
         raise ModelError(
             f"{saved.file}: volumes kept {saved.icv} there, which not all have here; complete it"
@@ -80,10 +87,13 @@ def plan_sites(
         counts=counts,
         visits=combat.Visits(
             site=site,
-            columns=preserved.matrix,
+            columns=matrix,
             participant=np.unique(people, return_inverse=True)[1] if repeated else None,
         ),
-        kept=preserved,
+        names=names,
+        formula=formula,
+        levels=levels,
+        portable=portable,
         icv=volume,
         icv_values=values,
         explained=explained,
@@ -92,7 +102,7 @@ def plan_sites(
     )
 
 
-def _saved_columns(table: pd.DataFrame, saved: SavedEffects) -> Kept:
+def _saved_columns(table: pd.DataFrame, saved: SavedEffects) -> tuple[Float, tuple[str, ...]]:
     """Make the columns of an earlier analysis for these visits."""
     matrix, names, complete = formulas.columns_of(
         table, saved.formula, saved.levels, f"{saved.file}: "
@@ -103,38 +113,36 @@ def _saved_columns(table: pd.DataFrame, saved: SavedEffects) -> Kept:
         )
     values = np.full((len(table), len(names)), np.nan)
     values[complete] = matrix
-    return Kept(matrix=values, names=names, formula=saved.formula, levels=saved.levels)
+    return values, names
 
 
 def _own_columns(
     cohort: Cohort,
-    column: str,
-    model: formulas.ModelSpec,
+    spec: formulas.ModelSpec,
     settings: GroupSettings,
-    context: tuple[Mapping[str, str], Comparison],
-) -> Kept:
-    """Make the columns of the model without the site; of two sessions, with their interactions."""
-    references, comparison = context
+    references: Mapping[str, str],
+    comparison: Comparison,
+) -> tuple[Float, tuple[str, ...], Mapping[str, Sequence[str]], bool]:
+    """Make the columns of a model without the site; of two sessions, with their interactions.
+
+    Returns columns, names, levels of factors, and whether other people's can be made from these.
+    """
     table = modeled_table(cohort.table, comparison)
-    formula = without_variable(model.formula, column).removeprefix("1 + ")
-    variables = closed_formula(formula).names
-    spec = replace(model, formula=formula, contrasts=(), dummy=None)
+    variables = closed_formula(spec.formula).names
     levels = {name: text for name, text in references.items() if name in variables}
     design = build_design(table, spec, settings.design, levels)
     positions = [i for i, name in enumerate(design.columns) if name != formulas.INTERCEPT]
     names = tuple(design.columns[i] for i in positions)
     values = np.full((len(table), len(names)), np.nan)
     values[design.rows] = design.matrix[:, positions]
-    portable = not comparison.pair and _is_portable(table, formula, design)
+    portable = not comparison.pair and _is_portable(table, spec.formula, design)
     if comparison.pair:
         session = comparison.pair[1]
         values = values[table.index.get_indexer(pd.Index(cohort.table[PARTICIPANT]))]
         is_later = (cohort.table[SESSION] == session).to_numpy(np.float64)[:, None]
         values = np.hstack([values, is_later, is_later * values])
         names = (*names, session, *(f"{name} x {session}" for name in names))
-    return Kept(
-        matrix=values, names=names, formula=formula, levels=design.levels, portable=portable
-    )
+    return values, names, design.levels, portable
 
 
 def _check_terms(model: formulas.ModelSpec, column: str) -> None:
@@ -185,8 +193,7 @@ def _check_sizes(
 def _explained(
     column: str,
     member: Float,
-    preserved: Kept,
-    usable: Bool,
+    columns: Mapping[str, Float],
     *,
     refuse: bool,
 ) -> dict[str, float]:
@@ -194,7 +201,7 @@ def _explained(
     dummies = member[:, member.any(axis=0)]
     basis = np.linalg.qr(dummies)[0]
     shares: dict[str, float] = {}
-    for name, values in zip(preserved.names, preserved.matrix[usable].T, strict=True):
+    for name, values in columns.items():
         around = values - values.mean()
         total = float(around @ around)
         inside = around - dummies @ np.linalg.lstsq(dummies, around, rcond=None)[0]
@@ -288,43 +295,33 @@ def harmonize_cohort(
     """Estimate or take effects of sites, and take them out of maps and summary measures."""
     if plan.saved and registrations:
         _check_templates(plan.saved, registrations)
-    maps: dict[tuple[str, str], tuple[combat.SiteEffects, combat.SiteMoments]] = {}
-    summaries: dict[tuple[str, str], tuple[combat.SiteEffects, combat.SiteMoments]] = {}
+    effects: dict[tuple[str, str, str], tuple[combat.SiteEffects, combat.SiteMoments]] = {}
     sides, unknown = {}, set()
     for hemi, side in cohort.sides.items():
         visits = plan.visits.take(side.rows)
-        changed, errors = dict(side.maps), dict(side.errors)
+        changed, summary = dict(side.maps), side.summary.astype(np.float64)
         for measure in measures.maps:
+            key = "map", hemi, measure
             values = side.maps[measure].reshape(len(side.rows), -1)
-            effects = _effects(values, visits, plan, settings, (hemi, measure))
-            maps[hemi, measure] = effects
-            changed[measure] = combat.harmonize(values, visits, effects[0]).reshape(
-                side.maps[measure].shape
-            )
-            if measure in errors:
-                scale = effects[0].scale[visits.site].reshape(errors[measure].shape)
-                errors[measure] = errors[measure] / scale
-        summary = side.summary.astype(np.float64)
+            effects[key] = _effects(values, visits, plan, settings, key)
+            harmonized = combat.harmonize(values, visits, effects[key][0])
+            changed[measure] = harmonized.reshape(side.maps[measure].shape)
         for name in summary.columns:
+            key = "summary", hemi, name
             values = summary[[name]].to_numpy()
-            visits_of_map = (
-                _with_icv(visits, plan, side.rows) if name.startswith("volume") else visits
-            )
+            adjusted = _with_icv(visits, plan, side.rows) if name.startswith("volume") else visits
             if plan.saved and (hemi, name) not in plan.saved.effects_on_summaries:
                 unknown.add(name)
                 summary[name] = np.nan
             elif len(np.unique(values[np.isfinite(values)])) > 1:
-                effects = _effects(
-                    values, visits_of_map, plan, settings, (hemi, name), summary=True
-                )
-                summaries[hemi, name] = effects
-                summary[name] = combat.harmonize(values, visits_of_map, effects[0])[:, 0]
-        sides[hemi] = replace(side, maps=changed, errors=errors, summary=summary)
+                effects[key] = _effects(values, adjusted, plan, settings, key)
+                summary[name] = combat.harmonize(values, adjusted, effects[key][0])[:, 0]
+        sides[hemi] = replace(side, maps=changed, summary=summary)
+    maps = [("map", hemi, name) for name in measures.maps for hemi in sides]
     return Harmonization(
         plan=plan,
         cohort=replace(cohort, sides=sides),
-        effects={("map", hemi, name): maps[hemi, name] for name in measures.maps for hemi in sides}
-        | {("summary", *key): pair for key, pair in summaries.items()},
+        effects={key: effects.pop(key) for key in maps} | effects,
         notes=tuple(_notes(plan, settings, unknown)),
     )
 
@@ -342,26 +339,26 @@ def _effects(
     visits: combat.Visits,
     plan: SitePlan,
     settings: GroupSettings,
-    key: tuple[str, str],
-    *,
-    summary: bool = False,
+    key: tuple[str, str, str],
 ) -> tuple[combat.SiteEffects, combat.SiteMoments]:
-    pooled = settings.harmonization.pooling and not summary
+    kind, hemi, measure = key
+    pooled = settings.harmonization.pooling and kind == "map"
     if plan.saved is None:
         n, longitudinal = len(plan.sites), settings.longitudinal
         return combat.fit_effects(values, visits, n, longitudinal, pooled=pooled)
-    saved_effects = plan.saved.effects_on_summaries if summary else plan.saved.effects_on_maps
-    if key not in saved_effects:
+    known_effects = plan.saved.effects_on_maps if kind == "map" else plan.saved.effects_on_summaries
+    effects = known_effects.get((hemi, measure))
+    if effects is None:
         raise ModelError(
-            f"{plan.saved.file}: has no map of {key[1]} of hemisphere {key[0]}; choose other maps"
+            f"{plan.saved.file}: has no map of {measure} of hemisphere {hemi}; choose other maps"
             " by --measures, or harmonize anew"
         )
-    if len(saved_effects[key].mean) != values.shape[1]:
+    if len(effects.mean) != values.shape[1]:
         raise ModelError(
-            f"{plan.saved.file}: its map of {key[1]} has {len(saved_effects[key].mean)} points,"
-            f" those of these participants {values.shape[1]}; use the same grid"
+            f"{plan.saved.file}: its map of {measure} has {len(effects.mean)} points, those of"
+            f" these participants {values.shape[1]}; use the same grid"
         )
-    return combat.extend_effects(saved_effects[key], values, visits, pooled=pooled)
+    return combat.extend_effects(effects, values, visits, pooled=pooled)
 
 
 def _notes(plan: SitePlan, settings: GroupSettings, unknown: set[str]) -> Iterator[str]:
@@ -373,7 +370,7 @@ def _notes(plan: SitePlan, settings: GroupSettings, unknown: set[str]) -> Iterat
     if unknown and plan.saved:
         names = formulas.listed(unknown)
         yield f"{plan.saved.file} has not these measures, which are left out: {names}"
-    if plan.saved is None and not plan.kept.portable:
+    if plan.saved is None and not plan.portable:
         yield "harmonization.json is not written: this model's columns depend on all participants"
 
 

@@ -20,12 +20,12 @@ from hipsta_bids.group.design.settings import GroupSettings, NormSettings
 from hipsta_bids.group.output import write
 from hipsta_bids.group.output.figures import Drawing, deviation_rows, draw_norms, norm_rows
 from hipsta_bids.group.output.methods import norms_text
-from hipsta_bids.group.output.panels import draw_maps
+from hipsta_bids.group.output.panels import draw_pages
 from hipsta_bids.group.output.results import ScoredMaps
 from hipsta_bids.group.output.saved import NormsFile, load_norms, save_norms, templates_from_json
 from hipsta_bids.group.questions import study as studies
-from hipsta_bids.group.questions.reference import points_of
 from hipsta_bids.group.questions.scores import map_rows, score_rows
+from hipsta_bids.group.questions.trials import points_of
 from hipsta_bids.group.stats import norms as normative
 from hipsta_bids.group.stats.arrays import Bool, Float, Int, Key
 from hipsta_bids.group.stats.glm import most_frequent
@@ -74,25 +74,15 @@ def run_norms(
     among: tuple[str, str] | None = None,
     controls: tuple[str, str] | None = None,
 ) -> studies.GroupResult:
-    """Fit norms, or score people by them, and write all results or none.
+    """Fit norms, or score people by those of a file, and write all results or none.
 
-    Parameters
-    ----------
-    options : GroupOptions
-        Files.
-    settings : GroupSettings
-        What changes results.
-    path : Path, optional
-        Norms that score; without, norms are fitted.
-    among : (str, str), optional
-        Column and level of the participants; all without.
-    controls : (str, str), optional
-        Column and level of the controls, who estimate shift and scale of new sites.
+    ``among`` are column and level of the participants, ``controls`` those of the controls who
+    estimate shift and scale of new sites.
     """
     dataset.check_own_dataset(options.out_dir)
     if path is not None:
         return _score_people(options, path, settings, among, controls)
-    study = studies.Study.read(options, among, settings)
+    study = studies.read_study(options, settings, among)
     file, people = _planned(study)
     template, tables, cohorts, values = _registered(
         study, studies.read_templates(options.template, study.cohort)
@@ -119,8 +109,8 @@ def _score_people(
     comparison = Comparison(longitudinal=True)  # each visit has a score
     options = replace(options, measures=measures, comparison=comparison)
     settings = settings.changed(registration=file.registration)
-    study = studies.Study.read(options, among, settings)
-    notes, table = _check(file, path, study.inputs), study.cohort.table
+    study = studies.read_study(options, settings, among)
+    notes, table = _check(file, path, study), study.cohort.table
     repeated = table.duplicated([PARTICIPANT, *({file.site} & set(table.columns))])
     if repeated.any() and FIRST_AGE not in table:
         notes.append(
@@ -162,9 +152,8 @@ def _registered(
     study: studies.Study, templates: Mapping[str, Template] | None
 ) -> tuple[dict[str, Any] | None, dict[str, pd.DataFrame], dict[str, Cohort], Values]:
     """Register maps, and collect them and summary measures of each side and of the mean of both."""
-    inputs = study.inputs
     template, cohorts, tables = study.register(templates)
-    names = set(inputs.maps)
+    names = set(study.maps)
     for name, cohort in cohorts.items():
         sides = {
             hemi: side.only([name for name in side.maps if name in names])
@@ -173,7 +162,7 @@ def _registered(
         cohorts[name] = replace(cohort, sides=sides)
     values = {
         (layer.hemi, layer.measure): (layer.rows, layer.data)
-        for layer in layers(cohorts, inputs.measures.maps, inputs.measures.summaries)
+        for layer in layers(cohorts, study.measures.maps, study.measures.summaries)
     }
     return template, tables, cohorts, values
 
@@ -234,16 +223,16 @@ def _write(study: studies.Study, scoring: _Made, notes: Iterable[str]) -> studie
     }
     name = studies.folder_of(["norms" if scoring.path is None else "scores"], study.among)
     notes = [*notes]
-    if n_later := sum(one.reason == "later-session" for one in study.inputs.exclusions):
+    if n_later := sum(one.reason == "later-session" for one in study.exclusions):
         notes.append(f"{n_later} later sessions are not in the norms, which take first ones")
     if file.site not in cohort.table:
         notes.append(f"no column {file.site!r}: all are taken to be at one, {_NO_SITE!r}")
     return study.write(name, notes, visits=visits, tables=scoring.tables, record=record, fill=fill)
 
 
-def _protocol(inputs: studies.GroupInputs) -> tuple[str, str]:
+def _protocol(study: studies.Study) -> tuple[str, str]:
     """Segmentation protocol and region of the sheets, if there are sheets."""
-    records = inputs.found.records
+    records = study.collection.records
     return (records[0].result.name.seg, records[0].result.name.region) if records else ("none",) * 2
 
 
@@ -252,8 +241,8 @@ def _planned(study: studies.Study) -> tuple[NormsFile, normative.People]:
 
     Refuses a cohort that is too small, or whose sexes are those of sites.
     """
-    cohort, inputs, settings = study.cohort, study.inputs, study.settings
-    rules, collection, table = settings.norms, inputs.found, cohort.table
+    cohort, collection, settings = study.cohort, study.collection, study.settings
+    rules, table = settings.norms, cohort.table
     check_names([rules.age], table.columns)
     sites, complete = _site_labels(table, rules.site), np.ones(len(table), dtype=bool)
     sexes = level_labels(table[rules.sex]) if rules.sex in table else None
@@ -266,8 +255,8 @@ def _planned(study: studies.Study) -> tuple[NormsFile, normative.People]:
         hash="",
         version=__version__,
         versions=list(collection.versions),
-        seg=_protocol(inputs)[0],
-        region=_protocol(inputs)[1],
+        seg=_protocol(study)[0],
+        region=_protocol(study)[1],
         settings_hash=collection.settings_hash,
         registration=resolve(settings)["registration"],
         template=None,
@@ -315,7 +304,7 @@ def _site_labels(table: pd.DataFrame, column: str) -> pd.Series:
 
 def _people(study: studies.Study, file: NormsFile) -> normative.People:
     """Describe visits as norms have to know them, new sites last; all other visits are left out."""
-    table, _settings = study.cohort.table, study.settings
+    table = study.cohort.table
     check_names([file.age, *([file.sex] if file.sexes else [])], table.columns)
     age, labels = _ages(table, file.age), _site_labels(table, file.site)
     low, high = file.knots[0], file.knots[-1]
@@ -341,15 +330,15 @@ def _people(study: studies.Study, file: NormsFile) -> normative.People:
     return normative.People(age=age, sex=sex, site=site)
 
 
-def _check(file: NormsFile, path: Path, inputs: studies.GroupInputs) -> list[str]:
+def _check(file: NormsFile, path: Path, study: studies.Study) -> list[str]:
     """Refuse people who were measured in another way; note what may differ."""
-    cohort, collection = inputs.cohort, inputs.found
+    cohort, collection = study.cohort, study.collection
     is_same_grid = all(
         len(a) == len(b) and np.allclose(a, b) for a, b in ((file.x, cohort.x), (file.y, cohort.y))
     )
     grid_text = f"{len(cohort.x)} by {len(cohort.y)} nodes"
     file_text = grid_text if is_same_grid else f"another grid, {len(file.x)} by {len(file.y)} nodes"
-    seg, region = _protocol(inputs)
+    seg, region = _protocol(study)
     for subject, value, expected in (
         ("segmentation protocol", seg, file.seg),
         ("region", region, file.region),
@@ -362,7 +351,7 @@ def _check(file: NormsFile, path: Path, inputs: studies.GroupInputs) -> list[str
                 " cohort of the norms was"
             )
     available = {measure for measures in file.norms.values() for measure in measures}
-    requested = [*inputs.maps, *(inputs.measures.summaries or ())]
+    requested = [*study.maps, *(study.measures.summaries or ())]
     if unknown := [name for name in requested if name not in available]:
         raise ModelError(
             f"{path}: has no norms of {listed(unknown)}, only of {listed(sorted(available))};"
@@ -510,7 +499,7 @@ def _figures(scoring: _Made) -> Iterator[tuple[str, Drawing]]:
             rows = norm_rows(means, float(middle.age[0]), measure, unit)
             if scoring.adapted is not None:
                 rows = deviation_rows(scoring.scored[surface], measure)
-            yield f"{measure}_normmaps", partial(draw_maps, cohort, places, list(rows))
+            yield f"{measure}_normmaps", partial(draw_pages, cohort, places, [list(rows)])
 
 
 def _dots(scoring: _Made, lines: pd.DataFrame) -> pd.DataFrame:

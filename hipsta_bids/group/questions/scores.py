@@ -13,10 +13,10 @@ from hipsta_bids.group.design.formula import Contrast, ModelSpec, check_names, l
 from hipsta_bids.group.design.grammar import closed_formula
 from hipsta_bids.group.design.model import Design, Groups, build_design
 from hipsta_bids.group.design.settings import ClassificationSettings, DesignSettings, GroupSettings
-from hipsta_bids.group.output.results import MeasureFit, ScoredMaps, Scores
+from hipsta_bids.group.output.results import ScoredMaps
 from hipsta_bids.group.stats.arrays import Float, Int
 from hipsta_bids.group.stats.classify import ModelComparison, compare_pairs, forget_models
-from hipsta_bids.group.stats.glm import MEAN, RowModel, most_frequent, with_mean
+from hipsta_bids.group.stats.glm import MEAN, PointwiseFit, RowModel, most_frequent, with_mean
 from hipsta_bids.group.stats.norms import w_scores
 from hipsta_bids.progress import tell
 from hipsta_bids.types import PARTICIPANT, SESSION
@@ -33,10 +33,13 @@ def score_cohort(
     *,
     measures: data.Measures,
     references: Mapping[str, str],
-) -> Scores | None:
-    """Score all participants who have the covariates of a model, whatever their group."""
+) -> tuple[tuple[str, int] | None, dict[str, ScoredMaps], pd.DataFrame]:
+    """Score all participants who have the covariates of a model, whatever their group.
+
+    Returns covariates and size of the reference group, scores of maps by hemisphere, and a table.
+    """
     if normative is None:
-        return None
+        return None, {}, pd.DataFrame()
     tell("w-scores")
     factor, level = normative
     formula = without_variable(model.formula, factor)
@@ -82,21 +85,12 @@ def score_cohort(
         scores_of = w_scores(numbers, design.matrix, reference, settings.glm)
         for i, measure in enumerate(map(str, values.columns)):
             labels = {"hemi": hemi, "measure": measure, "region": None, "reference": reference}
-            numbers_of = {
-                "w": scores_of.w[:, i],
-                "p": scores_of.p[:, i],
-                "low": np.nan,
-                "high": np.nan,
-            }
-            parts.append(score_rows(cohort, design.rows, **labels, **numbers_of))
-    return Scores(
-        factor=factor,
-        level=level,
-        formula=formula,
-        n_reference=int(reference.sum()),
-        sides=sides,
-        table=pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(),
-    )
+            w, p = scores_of.w[:, i], scores_of.p[:, i]
+            parts.append(
+                score_rows(cohort, design.rows, **labels, w=w, p=p, low=np.nan, high=np.nan)
+            )
+    table = pd.concat(parts, ignore_index=True) if parts else pd.DataFrame()
+    return (formula, int(reference.sum())), sides, table
 
 
 def without_variable(formula: str, factor: str) -> str:
@@ -157,9 +151,9 @@ def fit_summaries(
     references: Mapping[str, str],
     icv: str | None,
     rows_of: Callable[[Design], RowModel],
-) -> tuple[list[MeasureFit], list[str]]:
+) -> tuple[dict[tuple[str, str], tuple[list[str], PointwiseFit, Int]], list[str]]:
     """Fit the model of the maps to all summary measures; volumes also with intracranial volume."""
-    fits: list[MeasureFit] = []
+    fits: dict[tuple[str, str], tuple[list[str], PointwiseFit, Int]] = {}
 
     def fit(formula: str, model: RowModel, start: str = "") -> None:
         rows = model.design.rows
@@ -172,14 +166,10 @@ def fit_summaries(
             present = np.flatnonzero(values.notna().any(axis=1).to_numpy())
             maps: Float = values.to_numpy(dtype=np.float64)[present]
             participants = cohort.table[PARTICIPANT].iloc[rows[present]].to_numpy()
-            fits.append(
-                MeasureFit(
-                    hemi=hemi,
-                    measures=tuple(values.columns),
-                    formula=formula,
-                    fit=model.fit_measures(maps, present, model.design.contrasts),
-                    participants=data.participants_with(np.isfinite(maps), participants),
-                )
+            fits[hemi, formula] = (
+                list(values.columns),
+                model.fit_measures(maps, present, model.design.contrasts),
+                data.participants_with(np.isfinite(maps), participants),
             )
 
     fit(model.formula, rows_of(design))

@@ -11,7 +11,7 @@ import pandas as pd
 from hipsta_bids import __version__
 from hipsta_bids.derivatives import dataset
 from hipsta_bids.derivatives.names import group_report
-from hipsta_bids.errors import InputError, ModelError
+from hipsta_bids.errors import ModelError
 from hipsta_bids.group.cohort import collect, external, read
 from hipsta_bids.group.cohort.covariates import add_icv, add_time, read_covariates
 from hipsta_bids.group.cohort.data import SHEET, Cohort, Measures, choose_visits
@@ -30,13 +30,6 @@ from hipsta_bids.progress import each, tell
 from hipsta_bids.protocols.toml import resolve
 from hipsta_bids.reports.group import write_group_report
 from hipsta_bids.types import PARTICIPANT
-
-#: Squared SDs are averaged over this many nodes along both axes, odd: from 8 copies, each is
-#: known to a third only.
-#: Squared SDs are averaged over this many nodes along both axes, odd: from 8 copies, each is
-#: known to a third only.
-ERROR_WINDOW = 5
-
 
 #: Hemispheres that notes name.
 _MOST_NOTES = 4
@@ -72,35 +65,6 @@ class GroupOptions:
     """The command line, for the record."""
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class GroupInputs:
-    """What was read."""
-
-    found: collect.Collection
-    """Hemispheres that were measured."""
-    cohorts: Mapping[str, Cohort]
-    """Visits that are compared, with covariates and maps, by surface."""
-    measures: Measures
-    """Measures of the sheets."""
-    icv: str | None
-    """Column of intracranial volume."""
-    time: designs.VisitTime | None
-    exclusions: tuple[collect.Exclusion, ...]
-    """Of hemispheres, and of sessions that are not compared."""
-    notes: tuple[str, ...]
-    """What to know, one line each."""
-
-    @property
-    def cohort(self) -> Cohort:
-        """Return the visits with their sheets."""
-        return self.cohorts[SHEET]
-
-    @property
-    def maps(self) -> list[str]:
-        """Return the maps of all surfaces."""
-        return [*self.measures.maps, *(name for name in self.cohorts if name != SHEET)]
-
-
 @dataclass(frozen=True, kw_only=True)
 class GroupResult:
     """What was done."""
@@ -120,71 +84,177 @@ class GroupResult:
     """Why the page could not be made."""
 
 
-def write_folder(
-    options: GroupOptions,
-    name: str,
-    inputs: GroupInputs,
-    settings: GroupSettings,
-    *,
-    notes: list[str],
-    counts: tuple[int, int],
-    fill: Callable[[Path], Mapping[str, Any]],
-) -> GroupResult:
-    """Write all results or none.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Study:
+    """What was read for a question, and of whom."""
 
-    ``fill`` writes into the folder, adds to the notes, and returns what is recorded; ``counts`` are
-    of participants and of what is left out.
-    """
-    collection, region = inputs.found, options.sheets.region
-    name = options.model.name or (name if region == "body" else f"{name}_{region}")
-    _describe_dataset(options)
-    with write.model_folder(options.out_dir, name) as folder:
-        tell("tables and maps")
-        record = {
-            "command": list(options.command),
-            "version": __version__,
-            "inputs": {
-                "datasets": [str(root.resolve()) for root in options.sheets.roots],
-                "settings_hash": collection.settings_hash,
-                "versions": collection.versions,
-                "seg": collection.records[0].result.name.seg if collection.records else None,
-                "region": region,
-                "maps": dict(options.maps),
-                "volumes": dict(options.volumes),
-                "covariates": [str(path) for path in options.covariates],
-                "template": options.template and str(options.template),
-                "harmonization": options.harmonize_model and str(options.harmonize_model),
-            },
-            **fill(folder),
-            "notes": [*collection.warnings, *notes],
-            "settings": resolve(settings),
+    options: GroupOptions
+    settings: GroupSettings
+    collection: collect.Collection
+    """Hemispheres that were measured."""
+    visits: pd.DataFrame
+    """All visits with covariates."""
+    cohorts: Mapping[str, Cohort]
+    """Visits that the question is about, with maps, by surface."""
+    measures: Measures
+    """Measures of the sheets."""
+    icv: str | None
+    """Column of intracranial volume."""
+    time: designs.VisitTime | None
+    exclusions: tuple[collect.Exclusion, ...]
+    """Of hemispheres, and of sessions that are not compared."""
+    notes: tuple[str, ...]
+    """What to know, one line each."""
+    among: tuple[str, str] | None = None
+    """Column and level of the participants; all without."""
+    left_out: dict[str, tuple[str, str]] = field(default_factory=dict)
+    """Reason and message by further visits that are left out."""
+
+    @property
+    def cohort(self) -> Cohort:
+        """Return the visits with their sheets."""
+        return self.cohorts[SHEET]
+
+    @property
+    def maps(self) -> list[str]:
+        """Return the maps of all surfaces."""
+        return [*self.measures.maps, *(name for name in self.cohorts if name != SHEET)]
+
+    def take(self, keep: Bool, reason: tuple[str, str]) -> "Study":
+        """Keep some visits; the others are left out, with a reason and a message."""
+        left_out = dict.fromkeys(map(str, self.cohort.table.index[~keep]), reason)
+        cohorts = {surface: one.take(keep) for surface, one in self.cohorts.items()}
+        return replace(self, cohorts=cohorts, left_out=self.left_out | left_out)
+
+    def register(
+        self, templates: Mapping[str, Template] | None
+    ) -> tuple[dict[str, Any] | None, dict[str, Cohort], dict[str, pd.DataFrame]]:
+        """Register sheets: templates for a file, cohorts (other maps by name), and tables."""
+        cohort = self.cohort
+        with_maps = list(cohort.sides) if self.measures.maps else []
+        sides = {
+            hemi: analysis.register_side(
+                cohort, hemi, groups=None, settings=self.settings, templates=templates
+            )
+            for hemi in each("registration", with_maps)
         }
-        files.write_json(folder / "analysis.json", record)
-    return GroupResult(
-        folder=options.out_dir / write.GROUP_FOLDER / name,
-        n_participants=counts[0],
-        n_excluded=counts[1],
-        notes=tuple(notes),
-        warnings=collection.warnings,
-    )
+        registrations = {hemi: result for hemi, (result, _) in sides.items()}
+        registered = {hemi: maps for hemi, (_, maps) in sides.items()} or cohort.sides
+        cohorts = {**self.cohorts, SHEET: replace(cohort, sides=registered)}
+        tables = dict(registration_tables(cohort, registrations)) if sides else {}
+        return templates_of(registrations), cohorts, tables
+
+    def write(
+        self,
+        name: str,
+        notes: Iterable[str],
+        *,
+        visits: pd.DataFrame,
+        tables: Mapping[str, pd.DataFrame],
+        record: Mapping[str, Any],
+        fill: Callable[[Path], list[str]],
+    ) -> GroupResult:
+        """Write results other than those of comparisons, and a page.
+
+        ``fill`` writes what only this question has, and returns notes.
+        """
+        excluded = [*self.exclusions, *collect.exclude_visits(self.visits, self.left_out)]
+        all_notes, people = [*self.notes, *notes], int(visits[PARTICIPANT].nunique())
+
+        def everything(folder: Path) -> dict[str, Any]:
+            for title, table in tables.items():
+                write.write_table(folder, title, table)
+            write.write_exclusions(folder, excluded)
+            write.write_table(folder, "covariates", visits, described=False)
+            all_notes.extend(fill(folder))
+            return {"participants": people, "rows": len(visits), **record}
+
+        counts = people, len(excluded)
+        result = self.write_folder(name, notes=all_notes, counts=counts, fill=everything)
+        return with_page(self.options, result)
+
+    def write_folder(
+        self,
+        name: str,
+        *,
+        notes: list[str],
+        counts: tuple[int, int],
+        fill: Callable[[Path], Mapping[str, Any]],
+    ) -> GroupResult:
+        """Write all results or none.
+
+        ``fill`` writes into the folder, adds to the notes, and returns what is recorded; ``counts``
+        are of participants and of what is left out.
+        """
+        options, collection = self.options, self.collection
+        region = options.sheets.region
+        name = options.model.name or (name if region == "body" else f"{name}_{region}")
+        _describe_dataset(options)
+        final = options.out_dir / write.GROUP_FOLDER / name
+        with write.whole_folder(final) as folder:
+            tell("tables and maps")
+            record = {
+                "command": list(options.command),
+                "version": __version__,
+                "inputs": {
+                    "datasets": [str(root.resolve()) for root in options.sheets.roots],
+                    "settings_hash": collection.settings_hash,
+                    "versions": collection.versions,
+                    "seg": collection.records[0].result.name.seg if collection.records else None,
+                    "region": region,
+                    "maps": dict(options.maps),
+                    "volumes": dict(options.volumes),
+                    "covariates": [str(path) for path in options.covariates],
+                    "template": options.template and str(options.template),
+                    "harmonization": options.harmonize_model and str(options.harmonize_model),
+                },
+                **fill(folder),
+                "notes": [*collection.warnings, *notes],
+                "settings": resolve(self.settings),
+            }
+            files.write_json(folder / "analysis.json", record)
+        return GroupResult(
+            folder=final,
+            n_participants=counts[0],
+            n_excluded=counts[1],
+            notes=tuple(notes),
+            warnings=collection.warnings,
+        )
 
 
-def read_inputs(options: GroupOptions, settings: GroupSettings) -> GroupInputs:
-    """Find and read sheets, other maps, volumes and covariates."""
+def read_study(
+    options: GroupOptions, settings: GroupSettings, among: tuple[str, str] | None = None
+) -> Study:
+    """Find and read sheets, other maps, volumes and covariates, of all or of some participants."""
+    tell("reading")
     external.check_volumes(options.volumes)
     collection = collect.collect_sheets(options.sheets, may_lack=bool(options.maps))
-    reserved = external.taken_names(with_sheets=bool(collection.records))
+    reserved = read.SHEET_MAPS if collection.records else ()
     requests = external.map_patterns(options.maps, options.surfaces, reserved)
     requested = designs.wanted_measures(options.model, options.measures)
     measures = read.choose_measures(requested, collection.records, [one.name for one in requests])
-    sheets, surfaces, map_notes = _read_maps(options, collection, requests, measures, settings)
+    files_of, visits = external.find_all(
+        [one for one in requests if one.name in measures.maps],
+        options.bids_dir,
+        read.visits_of(collection.records),
+        collect.wanted_by(options.sheets),
+    )
+    names = {one.name for one in requests}
+    sheets = read.read_sheets(
+        collection.records,
+        collection.grid,
+        [name for name in measures.maps if name not in names],
+        visits,
+        max_gap=settings.registration.max_gap,
+    )
+    sheets, surfaces, map_notes = external.add_external(sheets, files_of, visits)
     measured, volume_notes = external.add_volumes(
         sheets, collection.records, options.volumes, options.bids_dir
     )
     read.check_summaries(measures, measured.sides)
     all_visits = Cohort(
         table=with_factors(
-            read_covariates(measured.visits, options.bids_dir, options.covariates),
+            read_covariates(measured.table, options.bids_dir, options.covariates),
             settings.design,
             settings.model,
         ),
@@ -200,67 +270,30 @@ def read_inputs(options: GroupOptions, settings: GroupSettings) -> GroupInputs:
     cohort, reasons = choose_visits(all_visits.take(has_maps), options.comparison)
     keep = all_visits.table.index.isin(cohort.table.index)
     table, icv = add_icv(cohort.table, measured.sources, settings)
-    cohort = replace(cohort, table=table)
-    time = None
-    if options.comparison.longitudinal:
-        time = add_time(cohort.table, settings)
-        cohort = replace(cohort, table=time.table)
-    sheet_maps = tuple(name for name in measures.maps if name not in surfaces)
+    time = add_time(table, settings) if options.comparison.longitudinal else None
+    cohort = replace(cohort, table=table if time is None else time.table)
     reason = "other-session" if options.comparison.pair else "later-session"
-    return GroupInputs(
-        found=collection,
+    reasons_of = {visit: (reason, message) for visit, message in reasons.items()}
+    study = Study(
+        options=options,
+        settings=settings,
+        collection=collection,
+        visits=cohort.table,
         cohorts={SHEET: cohort}
-        | {
-            surface: replace(one.take(keep), table=cohort.table)
-            for surface, one in surfaces.items()
-        },
-        measures=replace(measures, maps=sheet_maps),
+        | {name: replace(one.take(keep), table=cohort.table) for name, one in surfaces.items()},
+        measures=replace(measures, maps=tuple(m for m in measures.maps if m not in surfaces)),
         icv=icv,
         time=time,
         exclusions=(
             *collection.exclusions,
             *measured.damaged,
-            *collect.exclude_visits(
-                measured.visits, {visit: (reason, message) for visit, message in reasons.items()}
-            ),
+            *collect.exclude_visits(measured.table, reasons_of),
         ),
         notes=(*collection.notes, *map_notes, *volume_notes, *_damaged(measured)),
+        among=among,
     )
-
-
-def _read_maps(
-    options: GroupOptions,
-    collection: collect.Collection,
-    requests: Sequence[external.MapPattern],
-    measures: Measures,
-    rules: GroupSettings,
-) -> tuple[read.Measured, dict[str, Cohort], list[str]]:
-    """Read the maps that are asked for, of the sheets and of other programs."""
-    error_window = 0 if rules.glm.weights == "none" else ERROR_WINDOW
-    requested = [one for one in requests if one.name in measures.maps]
-    files_of, visits = external.find_all(
-        requested,
-        options.bids_dir,
-        read.visits_of(collection.records),
-        collect.wanted_by(options.sheets),
-    )
-    names = {one.name for one in requests}
-    sheet_maps = [name for name in measures.maps if name not in names]
-    if error_window and requested:
-        names_of = ", ".join(one.name for one in requested)
-        raise InputError(
-            f"--weights uncertainty: there are no SDs of {names_of}; leave --maps or the"
-            " weights out"
-        )
-    measured = read.read_sheets(
-        collection.records,
-        collection.grid,
-        sheet_maps,
-        visits,
-        max_gap=rules.registration.max_gap,
-        error_window=error_window,
-    )
-    return external.add_external(measured, files_of, visits)
+    keep = members(cohort.table, among)
+    return study.take(keep, ("not-asked", "another level than --among"))
 
 
 def _damaged(measured: read.Measured) -> tuple[str, ...]:
@@ -276,20 +309,15 @@ def _damaged(measured: read.Measured) -> tuple[str, ...]:
 
 
 def with_page(options: GroupOptions, result: GroupResult) -> GroupResult:
-    """Add the page to results that were written."""
-    page, problem = make_page(options, result.folder.name)
-    return replace(result, page=page, problem=problem)
-
-
-def make_page(options: GroupOptions, name: str) -> tuple[Path | None, str | None]:
-    """Make the page, and say why if it is not there."""
+    """Add the page to results that were written, or why it could not be made."""
+    name = result.folder.name
     path = options.out_dir / group_report(name)
     if not options.reports:
         files.remove([path])  # it would be that of an earlier analysis of this name
-        return None, None
+        return result
     tell("page")
     problem = write_group_report(options.out_dir, name)
-    return (path if problem is None else None), problem
+    return replace(result, page=path if problem is None else None, problem=problem)
 
 
 def _describe_dataset(options: GroupOptions) -> None:
@@ -335,93 +363,3 @@ def members(table: pd.DataFrame, among: tuple[str, str] | None, option: str = "-
             f" {listed(sorted(values.dropna().unique()))}"
         )
     return np.asarray(is_member, dtype=bool)
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Study:
-    """What was read, and the visits that a question other than a comparison is about."""
-
-    options: GroupOptions
-    settings: GroupSettings
-    inputs: GroupInputs
-    among: tuple[str, str] | None
-    """Column and level of the participants; all without."""
-    keep: Bool
-    """Of the visits that were read."""
-    cohort: Cohort
-    """Of those that are kept."""
-    left_out: dict[str, tuple[str, str]]
-    """Reason and message by visit."""
-
-    @classmethod
-    def read(
-        cls, options: GroupOptions, among: tuple[str, str] | None, settings: GroupSettings
-    ) -> "Study":
-        """Read all visits, and keep those that are asked for."""
-        tell("reading")
-        inputs = read_inputs(options, settings)
-        keep = members(inputs.cohort.table, among)
-        reason = "not-asked", "another level than --among"
-        return cls(
-            options=options,
-            settings=settings,
-            inputs=inputs,
-            among=among,
-            keep=keep,
-            cohort=inputs.cohort.take(keep),
-            left_out=dict.fromkeys(map(str, inputs.cohort.table.index[~keep]), reason),
-        )
-
-    def register(
-        self, templates: Mapping[str, Template] | None
-    ) -> tuple[dict[str, Any] | None, dict[str, Cohort], dict[str, pd.DataFrame]]:
-        """Register sheets: templates for a file, cohorts (other maps by name), and tables."""
-        cohort = self.cohort
-        with_maps = list(cohort.sides) if self.inputs.measures.maps else []
-        sides = {
-            hemi: analysis.register_side(
-                cohort, hemi, groups=None, settings=self.settings, templates=templates
-            )
-            for hemi in each("registration", with_maps)
-        }
-        registered = {hemi: side.registered for hemi, side in sides.items()} or cohort.sides
-        cohorts = {
-            surface: replace(cohort, sides=registered) if surface == SHEET else one.take(self.keep)
-            for surface, one in self.inputs.cohorts.items()
-        }
-        tables = dict(registration_tables(cohort, sides)) if sides else {}
-        return templates_of(sides), cohorts, tables
-
-    def write(
-        self,
-        name: str,
-        notes: Iterable[str],
-        *,
-        visits: pd.DataFrame,
-        tables: Mapping[str, pd.DataFrame],
-        record: Mapping[str, Any],
-        fill: Callable[[Path], list[str]],
-    ) -> GroupResult:
-        """Write what these questions share, and a page; ``fill`` writes all else, and notes."""
-        excluded = collect.exclude_visits(self.inputs.cohort.table, self.left_out)
-        excluded = [*self.inputs.exclusions, *excluded]
-        all_notes, people = [*self.inputs.notes, *notes], int(visits[PARTICIPANT].nunique())
-
-        def everything(folder: Path) -> dict[str, Any]:
-            for title, table in tables.items():
-                write.write_table(folder, title, table)
-            write.write_exclusions(folder, excluded)
-            write.write_table(folder, "covariates", visits, described=False)
-            all_notes.extend(fill(folder))
-            return {"participants": people, "rows": len(visits), **record}
-
-        result = write_folder(
-            self.options,
-            name,
-            self.inputs,
-            self.settings,
-            notes=all_notes,
-            counts=(people, len(excluded)),
-            fill=everything,
-        )
-        return with_page(self.options, result)

@@ -1,37 +1,270 @@
 """Agreement of repeated sessions and sample sizes of trials, from files to files."""
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
+from scipy import stats
 
 from hipsta_bids import __version__
 from hipsta_bids.derivatives import dataset
 from hipsta_bids.derivatives.names import TRIAL_MAPS, TRIAL_TABLES
-from hipsta_bids.group.cohort.data import SHEET, SUMMARY, Cohort, layers
-from hipsta_bids.group.design.model import Comparison
+from hipsta_bids.errors import ModelError
+from hipsta_bids.group.cohort.data import SHEET, SUMMARY, Cohort, Layer, layers, participants_with
+from hipsta_bids.group.design import model as designs
+from hipsta_bids.group.design.formula import listed, model_from_shortcut, parse_model
 from hipsta_bids.group.design.settings import GroupSettings
 from hipsta_bids.group.output import write
 from hipsta_bids.group.output.columns import frame_of
 from hipsta_bids.group.output.figures import Drawing
 from hipsta_bids.group.output.methods import Citations, power_text, retest_text
-from hipsta_bids.group.output.panels import Row, draw_maps, spanned
+from hipsta_bids.group.output.panels import Row, draw_pages, spanned
 from hipsta_bids.group.output.tables import entity_label
-from hipsta_bids.group.questions import reference
 from hipsta_bids.group.questions import study as studies
 from hipsta_bids.group.stats import trials
-from hipsta_bids.group.stats.arrays import Float
+from hipsta_bids.group.stats.arrays import Bool, Float, Int, SideMaps, mean_of_known
+from hipsta_bids.group.stats.glm import FittedMaps, PointwiseFit, RowModel, fit_maps, most_frequent
+from hipsta_bids.group.stats.mixed import longitudinal_model
 from hipsta_bids.io import files, gifti
 from hipsta_bids.progress import tell
 from hipsta_bids.reports.cells import display_name, with_brackets
-from hipsta_bids.types import PARTICIPANT
+from hipsta_bids.types import PARTICIPANT, SESSION
 
 #: Ticks of numbers of participants.
 _COUNTS = tuple(n * 10**power for power in range(5) for n in (1, 2, 3, 5))
+#: Months per unit of columns of time with these names.
+_MONTHS = {"years": 12.0, "months": 1.0, "days": 12 / 365.25}
+#: Sessions that tell a participant's change from noise.
+_SLOPE_SESSIONS = 3
+
+
+Tables = dict[str, Mapping[str, Any]]
+"""Columns of the tables of each question, ``retest`` and ``power``."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Described:
+    """What is known of a layer."""
+
+    layer: Layer
+    tables: Tables
+    reference: trials.Reference
+    data: Float
+    """(rows, points) that it rests on."""
+    points: FittedMaps | None
+    """Where the points are; ``None`` for a summary measure."""
+
+
+def points_of(side: SideMaps) -> FittedMaps:
+    """Locate the points of maps of one hemisphere, to which nothing was fitted."""
+    rows = np.arange(len(side.rows))
+    subfield = most_frequent(side.subfield[:], len(side.names))
+    return FittedMaps(maps=side, used=rows, rows=rows, subfield=subfield, fits={})
+
+
+class Retested:
+    """Means and variances of repeated sessions, of the participants who have all of them."""
+
+    time: str | None = None
+
+    rows: Int | None = None
+    """Rows of the table of which summary measures are taken; all."""
+
+    def __init__(
+        self, cohort: Cohort, settings: GroupSettings, *, has_visits: bool = False
+    ) -> None:
+        """Take variances of one visit of a trial, or of several."""
+        self._has_visits, self._settings = has_visits, settings.retest
+        table = cohort.table
+        counts = table[SESSION].fillna("").value_counts().sort_index()
+        self.sessions = tuple(str(name) for name in counts.index if name)
+        session_counts = table[PARTICIPANT].map(table.groupby(PARTICIPANT)[SESSION].nunique())
+        self.complete: Bool = (session_counts == len(self.sessions)).to_numpy()
+        self._table = table[self.complete]
+        self.participants = sorted(self._table[PARTICIPANT].unique())
+        sessions_text = listed(
+            [f"{name or 'without a name'} ({count})" for name, count in counts.items()]
+        )
+        if len(self.sessions) < 2:  # noqa: PLR2004 -- two sessions
+            raise ModelError(
+                f"--retest: there is no second session, only {sessions_text}; measure repeated"
+                " sessions first"
+            )
+        if len(self.participants) < self._settings.min_participants:
+            raise ModelError(
+                f"--retest: {len(self.participants)} participants have all of the sessions"
+                f" {sessions_text}, at least {self._settings.min_participants} are needed; name"
+                " sessions that more have by --session-label"
+            )
+
+    def arrange(self, values: Float, rows: Int) -> Float:
+        """Arrange values of visits as (participants, sessions, points); NaN where missing.
+
+        ``rows`` are those of the table of all complete visits.
+        """
+        visits = self._table.iloc[rows]
+        filled = np.full((len(self.participants), len(self.sessions), values.shape[1]), np.nan)
+        participant = np.searchsorted(self.participants, visits[PARTICIPANT].astype(str))
+        session = np.searchsorted(self.sessions, visits[SESSION].astype(str))
+        filled[participant, session] = values
+        return filled
+
+    def describe(self, layer: Layer) -> Described:
+        """Describe the agreement of sessions at each point, and mean and variance."""
+        data = layer.data
+        agreed = trials.repeatability(
+            self.arrange(data, layer.rows),
+            confidence=self._settings.confidence,
+            least=self._settings.min_participants,
+        )
+        # Of one visit, the variance between and within; of several, that within.
+        n = agreed["n"]
+        freedom = n * (len(self.sessions) - 1) if self._has_visits else n - 1
+        between = 0.0 if self._has_visits else agreed["sd_between"] ** 2
+        reference = trials.Reference(
+            n=n,
+            mean=agreed["mean"],
+            variance=agreed["sd_within"] ** 2 + between,
+            freedom=np.maximum(freedom, 1.0),
+        )
+        return Described(
+            layer=layer,
+            tables={"retest": agreed},
+            reference=reference,
+            data=data,
+            points=points_of(layer.source) if isinstance(layer.source, SideMaps) else None,
+        )
+
+    def words(self, cite: Callable[[str], str]) -> str:
+        """Name what means and variances rest on."""
+        text = f"these repeated sessions {cite('bland')}"
+        if self._has_visits:
+            text += (
+                "; true changes were taken to be the same in all participants, so that the numbers"
+                " are lower limits"
+            )
+        return text
+
+
+class Modeled:
+    """Means, changes and variances of a cohort, by a model of its visits."""
+
+    def __init__(
+        self,
+        cohort: Cohort,
+        request: designs.ModelRequest,
+        settings: GroupSettings,
+        visits: designs.VisitTime | None = None,
+    ) -> None:
+        table, covariates = cohort.table, None
+        self.time: str | None = None
+        if visits is not None:
+            self.time, covariates = visits.column, visits.covariates
+            _check_times(table, self.time, settings)
+        formula = request.formula or designs.default_formula(
+            table, None, settings, covariates=covariates, time=self.time
+        )
+        contrasts = [self.time] if self.time else []
+        self.spec = parse_model(model_from_shortcut(formula, contrasts, "reference"))
+        design = designs.build_design(table, self.spec, settings.design, dict(request.references))
+        self._table, self._settings = table, settings
+        self.model = RowModel(replace(design, contrasts=()), settings.glm)
+        if self.time is not None:
+            slopes = settings.longitudinal.changed(random="slope")
+            self.model = longitudinal_model(design, table, self.time, settings.glm, slopes)
+
+    @property
+    def months(self) -> float:
+        """Months per unit of time."""
+        return _MONTHS.get(str(self.time).casefold(), self._settings.power.months_per_time)
+
+    @property
+    def follow_up(self) -> float:
+        """Months from the earliest to the latest visit."""
+        if self.time is None:
+            return 0.0
+        times = self._table[self.time].to_numpy(dtype=np.float64)
+        return float(np.ptp(times[np.isfinite(times)])) * self.months
+
+    @property
+    def rows(self) -> Int:
+        """Rows of the table of which summary measures are taken: those of the model."""
+        return self.model.design.rows
+
+    def describe(self, layer: Layer) -> Described:
+        """Fit the model, and describe mean, change and variances at each point."""
+        points = None
+        if isinstance(layer.source, SideMaps):
+            points = fit_maps(layer.hemi, layer.source, self.model)
+            data, fit = points.values(layer.measure), points.fits[layer.measure]
+            rows = layer.rows[points.used]
+        else:
+            rows, data = layer.rows, layer.data
+            rows_known = np.flatnonzero(np.isfinite(data[:, 0]))
+            contrasts = self.model.design.contrasts
+            fit = self.model.fit_measures(data[rows_known], rows_known, contrasts)
+        return Described(
+            layer=layer,
+            tables={},
+            reference=self._reference(rows, data, fit),
+            data=data,
+            points=points,
+        )
+
+    def _reference(self, rows: Int, values: Float, fit: PointwiseFit) -> trials.Reference:
+        """At one visit with the residual variance; over time with changes and both variances."""
+        participants = self._table[PARTICIPANT].iloc[rows].to_numpy()
+        n = participants_with(np.isfinite(values), participants)
+        plain = trials.Reference(
+            n=n,
+            mean=mean_of_known(values, 0),
+            variance=fit.sigma**2,
+            freedom=np.maximum(n - float(len(self.model.design.columns)), 1.0),
+        )
+        if self.time is None:
+            return plain
+        (test,) = (one for one in fit.tests if one.contrast.name == self.time)
+        slope, se = test.estimate[0] / self.months, test.se[0] / self.months
+        reach = stats.t.ppf((1 + self._settings.glm.confidence) / 2, test.df) * se
+        return replace(
+            plain,
+            variance=fit.variances["residual"],
+            slope=slope,
+            slope_limits=np.stack([slope - reach, slope + reach]),
+            slope_variance=fit.variances["slope"] / self.months**2,
+        )
+
+    def words(self, cite: Callable[[str], str]) -> str:
+        """Name what means, changes and variances rest on."""
+        model = f"`{self.spec.formula}`"
+        if self.time is None:
+            return f"these participants, after a linear model {model}"
+        unit = "a month" if self.months == 1 else f"{self.months:.3g} months"
+        return (
+            f"these participants, by a linear mixed model {model} with intercepts and"
+            f" slopes of participants {cite('mixed')}; a unit of {self.time} is {unit}"
+        )
+
+
+Source = Retested | Modeled
+
+
+def _check_times(table: pd.DataFrame, time: str | None, settings: GroupSettings) -> None:
+    """Refuse a reference in which change cannot be told from noise."""
+    if time is None:
+        raise ModelError(
+            "--power with --visits needs the time of each session of the reference: a column"
+            f" {', '.join(settings.longitudinal.time_columns)}, acq_time or age in sessions.tsv"
+        )
+    if table[PARTICIPANT].value_counts().max() < _SLOPE_SESSIONS:
+        raise ModelError(
+            "--power with --visits: no participant of the reference has three sessions, so that"
+            " changes cannot be told from noise; leave --visits out, or give --retest"
+        )
 
 
 def run_trial(
@@ -44,43 +277,29 @@ def run_trial(
 ) -> studies.GroupResult:
     """Measure the agreement of sessions, or sample sizes, and write all results or none.
 
-    Parameters
-    ----------
-    options : GroupOptions
-        Files, model of the reference cohort.
-    settings : GroupSettings
-        What changes results.
-    retest : bool
-        Whether the agreement of sessions is measured; means and variances are theirs then.
-    effect : TrialEffect, optional
-        Of a trial whose size is asked for.
-    among : (str, str), optional
-        Column and level of the participants; all without.
+    ``effect`` is that of a trial whose size is asked for, by the ``retest`` if there is one, and
+    ``among`` are column and level of the participants.
     """
     dataset.check_own_dataset(options.out_dir)
     if effect is not None:
         trials.point_level(settings.multiplicity, settings.power)  # refuses before anything is read
     visits = bool(effect and effect.visits)
-    options = replace(options, comparison=Comparison(longitudinal=retest or visits))
-    study, repeated = studies.Study.read(options, among, settings), None
+    options = replace(options, comparison=designs.Comparison(longitudinal=retest or visits))
+    study = studies.read_study(options, settings, among)
+    source: Source
     if retest:
-        repeated = reference.retest_cohort(study.cohort, settings.retest.min_participants)
-        reasons = {v: ("incomplete-sessions", text) for v, text in repeated.left_out.items()}
-        keep = study.inputs.cohort.table.index.isin(repeated.cohort.table.index)
-        left_out = study.left_out | reasons
-        study = replace(study, keep=keep, cohort=repeated.cohort, left_out=left_out)
-    cohort, inputs = study.cohort, study.inputs
+        source = Retested(study.cohort, settings, has_visits=visits)
+        message = "the participant lacks one of the sessions " + " ".join(source.sessions)
+        study = study.take(source.complete, ("incomplete-sessions", message))
+    cohort = study.cohort
     templates, cohorts, tables = study.register(studies.read_templates(options.template, cohort))
     tell("points and measures")
-    source: reference.Source
-    if repeated is not None:
-        source = reference.Retested(repeated, settings, has_visits=visits)
-    else:
-        source = reference.Modeled(cohort, options.model, settings, inputs.time)
+    if not retest:
+        source = Modeled(cohort, options.model, settings, study.time)
         for variable, lacking in source.model.design.dropped.items():
             reason = "incomplete", f"{variable} is missing"
             study.left_out.update(dict.fromkeys(lacking, reason))
-    maps, summaries = inputs.measures.maps, inputs.measures.summaries
+    maps, summaries = study.measures.maps, study.measures.summaries
     results = [
         source.describe(layer)
         for layer in layers(cohorts, maps, summaries, source.rows)
@@ -101,9 +320,11 @@ def run_trial(
         return write.write_figures(folder, _figures(cohorts, results))
 
     record = {
-        "formula": source.spec.formula if isinstance(source, reference.Modeled) else None,
+        "formula": source.spec.formula if isinstance(source, Modeled) else None,
         "hemispheres": {hemi: len(side.rows) for hemi, side in cohort.sides.items()},
-        "retest": repeated and {"participants": people, "sessions": repeated.sessions},
+        "retest": {"participants": people, "sessions": source.sessions}
+        if isinstance(source, Retested)
+        else None,
         "power": effect
         and asdict(effect)
         | {
@@ -117,7 +338,7 @@ def run_trial(
         name.append(f"power-{effect.kind}-{100 * effect.share:g}".replace(".", "p"))
     return study.write(
         studies.folder_of(name, among),
-        _notes(source, results, inputs, effect),
+        _notes(source, results, study, effect),
         visits=modeled,
         tables=tables,
         record=record,
@@ -125,9 +346,7 @@ def run_trial(
     )
 
 
-def _sample_sizes(
-    effect: trials.TrialEffect, result: reference.Described, settings: GroupSettings
-) -> reference.Tables:
+def _sample_sizes(effect: trials.TrialEffect, result: Described, settings: GroupSettings) -> Tables:
     """Return columns of sample sizes; the mean of values of both signs has no share.
 
     Such a map has none, a summary measure keeps its row.
@@ -146,12 +365,12 @@ def _sample_sizes(
 
 
 def _notes(
-    source: reference.Source,
-    results: Sequence[reference.Described],
-    inputs: studies.GroupInputs,
+    source: Source,
+    results: Sequence[Described],
+    study: studies.Study,
     effect: trials.TrialEffect | None,
 ) -> Iterator[str]:
-    if isinstance(source, reference.Retested) and (n := len(source.retest.left_out)):
+    if isinstance(source, Retested) and (n := int((~source.complete).sum())):
         yield f"{n} visits of participants who lack a session are left out, see excluded.tsv"
     if effect is None:
         return
@@ -160,25 +379,25 @@ def _notes(
             f"{', '.join(signed)}: no sample sizes, since it has values of both signs, whose share"
             " means nothing"
         )
-    if isinstance(source, reference.Modeled) and effect.duration > source.follow_up:
+    if isinstance(source, Modeled) and effect.duration > source.follow_up:
         yield (
             f"the trial lasts {effect.duration:g} months, the reference {source.follow_up:.3g};"
             " that change goes on alike is an assumption"
         )
-    if isinstance(source, reference.Retested) and effect.visits:
+    if isinstance(source, Retested) and effect.visits:
         yield (
             "sample sizes rest on the variance of measurement alone; trials need more, as people"
             " differ in how they change"
         )
-    if n_later := sum(exclusion.reason == "later-session" for exclusion in inputs.exclusions):
+    if n_later := sum(exclusion.reason == "later-session" for exclusion in study.exclusions):
         yield f"{n_later} later sessions are not in it; --visits takes all"
 
 
 def _methods(
     study: studies.Study,
-    source: reference.Source,
+    source: Source,
     visits: pd.DataFrame,
-    results: Sequence[reference.Described],
+    results: Sequence[Described],
     effect: trials.TrialEffect | None,
 ) -> str:
     """Describe what was done, with the works it rests on."""
@@ -203,15 +422,17 @@ def _methods(
             " registration."
         )
     paragraphs = [first]
-    if isinstance(source, reference.Retested):
-        paragraphs.append(retest_text(source.retest, settings.retest, cite))
+    if isinstance(source, Retested):
+        paragraphs.append(
+            retest_text(len(source.sessions), len(source.participants), settings.retest, cite)
+        )
     if effect is not None:
         paragraphs.append(power_text(effect, settings, source.words, cite))
     return cite.page(paragraphs, study.options.sheets.region)
 
 
 def _write_tables(
-    folder: Path, cohorts: Mapping[str, Cohort], results: Sequence[reference.Described]
+    folder: Path, cohorts: Mapping[str, Cohort], results: Sequence[Described]
 ) -> None:
     """Write a table per question and surface; of summary measures the smallest trial first."""
     for question, (summary_title, points_title) in TRIAL_TABLES.items():
@@ -240,9 +461,7 @@ def _write_tables(
             write.write_table(folder, title, table)
 
 
-def _write_maps(
-    folder: Path, cohorts: Mapping[str, Cohort], results: Sequence[reference.Described]
-) -> None:
+def _write_maps(folder: Path, cohorts: Mapping[str, Cohort], results: Sequence[Described]) -> None:
     """Write surfaces and maps as GIFTI."""
     for result in results:
         layer = result.layer
@@ -259,7 +478,7 @@ def _write_maps(
 
 
 def _figures(
-    cohorts: Mapping[str, Cohort], results: Sequence[reference.Described]
+    cohorts: Mapping[str, Cohort], results: Sequence[Described]
 ) -> Iterator[tuple[str, Drawing]]:
     """List the figures of each map by name."""
     maps = [result for result in results if result.points is not None]
@@ -273,10 +492,10 @@ def _figures(
             unit = cohorts[surface].units.get(measure, "1")
             if rows := list(make(sides, display_name(measure), unit)):
                 points = {hemi: r.points for hemi, r in sides.items() if r.points is not None}
-                yield f"{measure}_{question}", partial(draw_maps, cohorts[surface], points, rows)
+                yield f"{measure}_{question}", partial(draw_pages, cohorts[surface], points, [rows])
 
 
-def _agreement(sides: Mapping[str, reference.Described], measure: str, unit: str) -> Iterator[Row]:
+def _agreement(sides: Mapping[str, Described], measure: str, unit: str) -> Iterator[Row]:
     """Show agreement between sessions."""
     if sides:
         within, icc = (_values(sides, "retest", name) for name in ("sd_within", "icc"))
@@ -289,7 +508,7 @@ def _agreement(sides: Mapping[str, reference.Described], measure: str, unit: str
         yield Row(kind="agreement", index=0, title=title, label=title, scale=scale, values=icc)
 
 
-def _sizes(sides: Mapping[str, reference.Described], measure: str, _: str) -> Iterator[Row]:
+def _sizes(sides: Mapping[str, Described], measure: str, _: str) -> Iterator[Row]:
     """Show participants per arm, by their logarithm."""
     values = {hemi: np.log10(n) for hemi, n in _values(sides, "power", "per_arm").items()}
     if any(np.isfinite(n).any() for n in values.values()):
@@ -306,9 +525,7 @@ def _sizes(sides: Mapping[str, reference.Described], measure: str, _: str) -> It
         )
 
 
-def _values(
-    sides: Mapping[str, reference.Described], question: str, column: str
-) -> dict[str, Float]:
+def _values(sides: Mapping[str, Described], question: str, column: str) -> dict[str, Float]:
     return {
         hemi: np.asarray(result.tables[question][column], dtype=np.float64)
         for hemi, result in sides.items()

@@ -3,7 +3,7 @@
 import contextlib
 import ctypes
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
@@ -97,8 +97,6 @@ class SideMaps:
     """Abbreviations of subfields."""
     summary: pd.DataFrame
     """One row per sheet: the columns of the participant level's summaries, as numbers."""
-    errors: Mapping[str, Float] = field(default_factory=dict)
-    """(sheets, x, y) SD of the measurement per measure, where it was asked for."""
     mesh: Mesh | None = None
     """Surface of the points if they are not on the grid: x are its vertices then, and y is 1."""
 
@@ -131,7 +129,6 @@ class SideMaps:
             self,
             rows=self.rows[keep],
             maps=some_sheets(self.maps, keep),
-            errors=some_sheets(self.errors, keep),
             subfield=self.subfield[keep],
             summary=self.summary[keep].reset_index(drop=True),
         )

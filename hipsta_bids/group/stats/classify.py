@@ -70,19 +70,6 @@ def roc_curve(score: Float, case: Bool) -> tuple[Float, Float]:
 
 
 @dataclass(frozen=True)
-class CrossValidation:
-    """Performance on subjects that were not fitted."""
-
-    auc: float
-    """Mean over folds and repeats."""
-    auc_sd: float
-    """Standard deviation of the repeats' means."""
-    score: Float
-    """(subjects,) log odds, mean over repeats."""
-    folds: int
-
-
-@dataclass(frozen=True)
 class Calibration:
     """Whether predicted chances are right, on subjects that were not fitted."""
 
@@ -113,7 +100,8 @@ class ClassifierResult:
     """(points,) shares of controls and of cases at or above each of the fitted scores."""
     auc: Area
     """Of the subjects fitted: optimistic."""
-    cross_validation: CrossValidation
+    validated: tuple[float, float]
+    """Area of subjects that were not fitted, and its SD over repeats of the cross-validation."""
     calibration: Calibration
 
 
@@ -174,8 +162,7 @@ def compare_models(
 
 
 def _areas(name: str, result: ClassifierResult) -> dict[str, float]:
-    area, validation = result.auc, result.cross_validation
-    values = area.area, area.low, area.high, validation.auc, validation.auc_sd
+    values = result.auc.area, result.auc.low, result.auc.high, *result.validated
     return dict(zip((f"auc_{name}{end}" for end in _AREAS), values, strict=True))
 
 
@@ -187,13 +174,13 @@ def _classified(
     matrix, case = np.frombuffer(values).reshape(-1, columns), np.frombuffer(cases, dtype=bool)
     fit = logistic.fit_logistic(matrix, case, firth=firth)
     score = matrix @ fit.coefficients
-    validation = cross_validate(matrix, case, settings)
+    area, spread, validated_score = cross_validate(matrix, case, settings)
     return ClassifierResult(
         fit=fit,
         curve=roc_curve(score, case),
         auc=delong(score, case, settings.confidence),
-        cross_validation=validation,
-        calibration=calibrate(validation.score, case, settings),
+        validated=(area, spread),
+        calibration=calibrate(validated_score, case, settings),
     )
 
 
@@ -217,10 +204,13 @@ def _check(matrix: Float, case: Bool) -> None:
         )
 
 
-def cross_validate(matrix: Float, case: Bool, settings: ClassificationSettings) -> CrossValidation:
+def cross_validate(
+    matrix: Float, case: Bool, settings: ClassificationSettings
+) -> tuple[float, float, Float]:
     """Area under the curve by repeated stratified cross-validation.
 
-    In each training set separation is looked for, and answered by Firth's method.
+    In each training set separation is looked for, and answered by Firth's method. Returns the mean
+    over folds and repeats, the SD of the repeats' means, and log odds (subjects,), mean over these.
     """
     folds = min(settings.folds, int(case.sum()), int((~case).sum()))
     basis = logistic.orthonormal(matrix)
@@ -244,7 +234,7 @@ def cross_validate(matrix: Float, case: Bool, settings: ClassificationSettings) 
             areas = [_area(score[~one & case], score[~one & ~case]) for one in by_fold]
             means.append(np.mean(areas))
     spread = float(np.std(means, ddof=1)) if settings.repeats > 1 else float("nan")
-    return CrossValidation(float(np.mean(means)), spread, total / settings.repeats, folds)
+    return float(np.mean(means)), spread, total / settings.repeats
 
 
 def _coefficients(basis: Float, case: Bool, train: Bool, start: Float | None) -> Float:

@@ -24,7 +24,6 @@ POSTERIOR_TOLERANCE = 1e-6
 
 #: Values of a site at a point, below which its variance says nothing about that of other points.
 _LEAST_VISITS = 3
-_LARGEST = 1_000_000_000  # bytes of a file
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -105,7 +104,9 @@ def fit_effects(
     design = np.hstack([member, (visits.columns - center) / spread])
     coefficients = np.full((design.shape[1], values.shape[1]), np.nan)
     ratio = np.zeros(values.shape[1])
-    varies = np.flatnonzero(_varies(values))
+    finite = np.isfinite(values)
+    low = values.min(axis=0, where=finite, initial=np.inf)
+    varies = np.flatnonzero(low < values.max(axis=0, where=finite, initial=-np.inf))
     if visits.participant is None:
         for part in chunks((len(values), len(varies)), design.shape[1]):
             points = varies[part]
@@ -125,7 +126,7 @@ def fit_effects(
         coefficients[np.ix_(columns_used, varies)] = fit.coefficients
         ratio[varies] = fit.variances["participant"] / fit.variances["residual"]
     sites, slopes = coefficients[:n_sites], coefficients[n_sites:] / spread[:, None]
-    counts = member.T @ np.isfinite(values)
+    counts = member.T @ finite
     middle = np.einsum("sp,sp->p", counts, sites) / np.maximum(counts.sum(axis=0), 1)
     effects = SiteEffects(
         mean=middle - center @ slopes,
@@ -187,13 +188,6 @@ def harmonize(values: Float, visits: Visits, effects: SiteEffects) -> Float:
         adjusted = (residuals / sd - shift) / scale[visits_used.site, part]
         result[rows, part] = values[rows, part] - residuals + sd * adjusted
     return result
-
-
-def _varies(values: Float) -> Bool:
-    """Tell points that have different values."""
-    finite = np.isfinite(values)
-    low = values.min(axis=0, where=finite, initial=np.inf)
-    return np.asarray(low < values.max(axis=0, where=finite, initial=-np.inf))
 
 
 def solve_weighted(values: Float, weight: Float, design: Float, least: float = 0.0) -> Float:

@@ -16,9 +16,6 @@ from hipsta_bids.group.design.settings import GlmSettings
 from hipsta_bids.group.stats.arrays import Bool, Float, Int, SideMaps, parts_of_sheets, sheets_of
 from hipsta_bids.group.stats.exchangeability import Visits
 
-#: Least variance between participants for these weights, share of the residual variance, so that
-#: a few maps do not decide alone where SDs are too large.
-LEAST_BETWEEN = 0.5
 #: Points are left out where the missing values take away all but this fraction of what the data
 #: say about a direction of the coefficients.
 MIN_INFORMATION = 1e-8
@@ -151,27 +148,14 @@ class PointBlock:
 
 
 def fit_points(
-    maps: Float,
-    matrix: Float,
-    contrasts: Sequence[Contrast],
-    settings: GlmSettings,
-    errors: Float | None = None,
+    maps: Float, matrix: Float, contrasts: Sequence[Contrast], settings: GlmSettings
 ) -> PointwiseFit:
-    """Fit the same linear model to each column of a table, with values missing anywhere.
-
-    ``errors`` are the SDs of the measurements, (subjects, points); values weigh by
-    :func:`uncertainty_weights` then, those without an SD are left out, and standard errors are HC3.
-    """
+    """Fit the same linear model to each column of a table, with values missing anywhere."""
     check_design(maps, matrix, contrasts)
     basis, triangle = np.linalg.qr(matrix)
     inverse = np.linalg.inv(triangle)
     blocks = [
-        fit_block(
-            np.asarray(maps[:, part], dtype=np.float64),
-            basis,
-            settings,
-            errors if errors is None else errors[:, part],
-        )
+        fit_block(np.asarray(maps[:, part], dtype=np.float64), basis, settings)
         for part in chunks(maps.shape, matrix.shape[1])
     ]
     names = ("scores", "covariance", "sigma", "n")
@@ -224,68 +208,35 @@ def chunks(shape: tuple[int, ...], columns: int) -> Iterator[slice]:
     return (slice(start, start + step) for start in range(0, max(shape[1], 1), step))
 
 
-def uncertainty_weights(maps: Float, errors: Float, basis: Float, settings: GlmSettings) -> Float:
-    """Weights 1 / (t2 + s2), mean 1, of values (subjects, points) with error variances s2.
-
-    t2 is the variance between subjects at a point: the residual variance of the unweighted fit,
-    less what the errors explain of it, (sum of squared residuals - sum s2 (1 - leverage)) /
-    (n - columns), by the method of moments (Hedges and Olkin 1985, Statistical Methods for
-    Meta-Analysis, chapter 9; with covariates Raudenbush 2009). Rough SDs are no matter, since tests
-    have HC3 standard errors. 0 where a value or SD is missing.
-    """
-    present = np.isfinite(maps) & np.isfinite(errors)
-    ordinary = settings.changed(covariance="ordinary")
-    plain = fit_block(np.where(present, maps, np.nan), basis, ordinary)
-    squared = np.where(present, errors, 0.0) ** 2
-    spread = (squared.T @ products_of(basis)).reshape(plain.covariance.shape)
-    variance = plain.sigma**2
-    inverse = plain.covariance / variance[:, None, None]
-    explained = squared.sum(axis=0) - np.einsum("pij,pij->p", inverse, spread)
-    freedom = np.maximum(plain.n - basis.shape[1], 1)
-    between = np.maximum(variance - explained / freedom, LEAST_BETWEEN * variance)
-    weights = np.where(present & np.isfinite(between), 1 / (between + squared), 0.0)
-    total = weights.sum(axis=0)
-    return np.asarray(weights * np.where(total > 0, plain.n / np.where(total > 0, total, 1), 0))
-
-
-def fit_block(
-    maps: Float, basis: Float, settings: GlmSettings, errors: Float | None = None
-) -> PointBlock:
+def fit_block(maps: Float, basis: Float, settings: GlmSettings) -> PointBlock:
     """Solve least squares at some points, by normal equations in orthonormal coordinates.
 
     There the equations of a complete point are the identity, and those of other points stay well
     conditioned unless the missing subjects really carried a column.
     """
     present = np.isfinite(maps)
-    weights = None
-    if errors is not None:
-        weights = uncertainty_weights(maps, errors, basis, settings)
-        present = weights > 0
     values = np.where(present, maps, 0.0)
     n = present.sum(axis=0)
     columns = basis.shape[1]
-    if weights is None and present.all():
+    if present.all():
         inverse = np.repeat(np.eye(columns)[None], maps.shape[1], axis=0)
         usable = n - columns >= settings.min_residual_df
     else:
-        shares = present.astype(np.float64) if weights is None else weights
-        information = (shares.T @ products_of(basis)).reshape(-1, columns, columns)
+        information = present.astype(np.float64).T @ products_of(basis)
+        information = information.reshape(-1, columns, columns)
         usable = np.linalg.eigvalsh(information)[:, 0] > MIN_INFORMATION
         usable &= n - columns >= settings.min_residual_df
         information[~usable] = np.eye(columns)
         inverse = np.asarray(np.linalg.inv(information), dtype=np.float64)
-    weighted = values if weights is None else weights * values
-    scores = np.einsum("pij,jp->pi", inverse, basis.T @ weighted)
+    scores = np.einsum("pij,jp->pi", inverse, basis.T @ values)
     residuals = np.where(present, values - basis @ scores.T, 0.0)
-    squares = np.einsum(
-        "sp,sp->p", residuals, residuals if weights is None else weights * residuals
-    )
-    total = np.einsum("sp,sp->p", values, weighted)
+    squares = np.einsum("sp,sp->p", residuals, residuals)
+    total = np.einsum("sp,sp->p", values, values)
     usable &= squares > total * np.finfo(np.float64).eps  # else the model leaves rounding only
     sigma = np.sqrt(squares / np.where(usable, n - columns, 1))
     sigma[~usable] = np.nan
-    if settings.covariance == "hc3" or weights is not None:
-        covariance = _hc3(residuals, basis, inverse, present, weights)
+    if settings.covariance == "hc3":
+        covariance = _hc3(residuals, basis, inverse, present)
     else:
         covariance = inverse * (sigma**2)[:, None, None]
     return PointBlock(
@@ -296,16 +247,12 @@ def fit_block(
     )
 
 
-def _hc3(
-    residuals: Float, basis: Float, inverse: Float, present: Bool, weights: Float | None
-) -> Float:
+def _hc3(residuals: Float, basis: Float, inverse: Float, present: Bool) -> Float:
     """Sandwich covariance with residuals over (1 - leverage) (MacKinnon and White 1985).
 
     NaN where one subject alone determines a coefficient.
     """
     leverage = np.einsum("psi,si->sp", basis @ inverse, basis)
-    if weights is not None:
-        leverage, residuals = weights * leverage, weights * residuals
     is_saturated = (1 - leverage < np.sqrt(np.finfo(np.float64).eps)) & present
     weights = (
         np.where(is_saturated, np.nan, residuals / np.where(is_saturated, 1.0, 1 - leverage)) ** 2
@@ -494,14 +441,7 @@ def fit_maps(
     try:
         for name in side.maps:
             # Maps of a large cohort are made here: without a name, one is gone before the next.
-            if model.settings.weights == "none":
-                fits[name] = model.fit(_values(side.maps[name], positions), rows, tested)
-            else:
-                errors = _values(side.errors[name], positions)
-                matrix = model.design.matrix[rows]
-                fits[name] = fit_points(
-                    _values(side.maps[name], positions), matrix, tested, model.settings, errors
-                )
+            fits[name] = model.fit(_values(side.maps[name], positions), rows, tested)
     except ModelError as error:
         raise ModelError(f"hemisphere {hemi}: {error}") from error
     for name, fit in fits.items():
@@ -514,7 +454,7 @@ def fit_maps(
             raise ModelError(
                 f"hemisphere {hemi}: a participant who alone determines a coefficient of the model"
                 f" leaves no HC3 standard error at any point of the {name} maps; use a smaller"
-                " model, or leave glm.covariance or the weights out"
+                " model, or leave glm.covariance out"
             )
     return FittedMaps(
         maps=side,

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 from scipy import special
 from statsmodels.stats.multitest import multipletests
 
@@ -66,22 +65,14 @@ class PermutationPart:
     """Whose each row is, where they are visits of which participants have several."""
 
 
-@dataclass(frozen=True, eq=False)
-class JointPart:
-    """Maps of several measures, or sides, at the same points, whose evidence is combined."""
-
-    parts: Sequence[PermutationPart]
-    combine: str
-    """As the setting ``joint.combine``."""
-
-
 def permute(
-    parts: Sequence[PermutationPart | JointPart],
+    parts: Sequence[PermutationPart | Sequence[PermutationPart]],
     contrast: Contrast,
     *,
     settings: MultiplicitySettings,
     blocks: Int | None = None,
     family: tuple[int, int] | None = None,
+    combine: str | None = None,
 ) -> list[PermutationTest]:
     """Permutation test of one contrast at all points (Freedman and Lane 1983).
 
@@ -96,11 +87,13 @@ def permute(
     freedom are those of the subjects present. ``family`` is the number of this one, from 0, and of
     how many, to tell how far all are; without it nothing is told.
 
-    Measures of a joint part are shuffled alike, which keeps their dependence, and combined at each
-    point by :func:`combine_evidence` (non-parametric combination; Winkler et al. 2016).
+    Parts of several measures, or sides, at the same points are shuffled alike, which keeps their
+    dependence, and combined at each point by :func:`combine_evidence` (non-parametric combination;
+    Winkler et al. 2016), whose method is ``combine``.
     """
-    runs = [_Run.build(part, contrast, settings, blocks) for part in parts]
-    parts_alone = [one.part for run in runs for one in run.members]
+    groups = [[part] if isinstance(part, PermutationPart) else part for part in parts]
+    runs = [_Run(group, contrast, settings, blocks, combine) for group in groups]
+    parts_alone = [part for group in groups for part in group]
     subjects = [one.subjects for one in parts_alone]
     subjects += [one.visits.people for one in parts_alone if one.visits]
     n_subjects = 1 + max(int(numbers.max()) for numbers in subjects)
@@ -144,34 +137,16 @@ def combine_evidence(p: Float, method: str) -> Float:
     return np.asarray(np.abs(special.ndtri(np.clip(joined, limits.tiny, 1) / 2)), dtype=np.float64)
 
 
-@dataclass(frozen=True, eq=False)
 class _Member:
     """One map of a run, with the design split into what is tested and what is not."""
 
-    part: PermutationPart
-    """With the blocks in its visits."""
-    blocks: Int | None
-    exchange: exchangeability.Exchange | None
-    """Of visits."""
-    basis: Float
-    """(subjects, columns) orthonormal, tested ones first."""
-    rows: int
-    residuals: Float
-    """(subjects, points) what the columns not tested leave; zero where missing."""
-    squares: Float
-    df: Float
-    """(points,) NaN where there is nothing to test."""
-    flips: bool
-    """Whether the columns not tested cannot make a constant: then it is tested, by signs."""
-
-    @classmethod
-    def build(
-        cls,
+    def __init__(
+        self,
         part: PermutationPart,
         contrast: Contrast,
         settings: MultiplicitySettings,
         blocks: Int | None,
-    ) -> "_Member":
+    ) -> None:
         maps, matrix = part.maps, part.matrix
         tested, nuisance = exchangeability.split(matrix, contrast)
         present = np.isfinite(maps)
@@ -179,146 +154,122 @@ class _Member:
         if nuisance.shape[1]:
             fitted = nuisance @ fit_points(maps, nuisance, (), GlmSettings()).coefficients
             residuals = np.nan_to_num(np.where(present, maps - fitted, 0.0))
-        squares = np.einsum("sp,sp->p", residuals, residuals)
+        self._subjects, self._rows = part.subjects, contrast.n_rows
+        # Columns are orthonormal, tested ones first; residuals are what the others leave.
+        self.basis, self._residuals = np.column_stack([tested, nuisance]), residuals
+        self._squares = np.einsum("sp,sp->p", residuals, residuals)
         df = present.sum(axis=0) - matrix.shape[1]
-        blocks_of_part = None if blocks is None else blocks[part.subjects]
-        exchange = None
-        if part.visits is not None:
-            visits = replace(part.visits, blocks=blocks_of_part)
-            part = replace(part, visits=visits)
-            exchange = exchangeability.choose_exchange(matrix, contrast, visits, settings.visits)
-        flips = not exchangeability.spans(nuisance, np.ones(len(nuisance)))
-        if blocks_of_part is not None and not (flips if exchange is None else exchange == "flip"):
+        self._df = np.where((df > 0) & (self._squares > 0), df, np.nan)
+        self._blocks = None if blocks is None else blocks[part.subjects]
+        self._visits = part.visits and replace(part.visits, blocks=self._blocks)
+        if self._visits is not None:
+            exchange = exchangeability.choose_exchange(
+                matrix, contrast, self._visits, settings.visits
+            )
+        elif exchangeability.spans(nuisance, np.ones(len(nuisance))):
+            exchange = "whole"
+        else:  # the columns not tested cannot make a constant: then it is tested
+            exchange = "flip"
+        self._exchange = exchange
+        if self._blocks is not None and exchange != "flip":
             weights = matrix @ np.linalg.pinv(contrast.weights)
-            varies = exchangeability.varies_inside(weights, blocks_of_part)
-            if part.visits is not None and exchange == "whole":
-                varies = exchangeability.varies_between(weights, part.visits)
+            varies = exchangeability.varies_inside(weights, self._blocks)
+            if self._visits is not None and exchange == "whole":
+                varies = exchangeability.varies_between(weights, self._visits)
             if not varies:  # shuffling cannot break it up
                 raise ModelError(
                     f"permutation: {contrast.name} does not vary inside the blocks, so that"
                     " shuffling there says nothing about it; leave --blocks out, or choose larger"
                     " blocks"
                 )
-        usable = (df > 0) & (squares > 0)
-        return cls(
-            part=part,
-            blocks=blocks_of_part,
-            exchange=exchange,
-            basis=np.column_stack([tested, nuisance]),
-            rows=contrast.n_rows,
-            residuals=residuals,
-            squares=squares,
-            df=np.where(usable, df, np.nan),
-            flips=flips,
-        )
 
     def shuffled(self, keys: Float) -> Float:
         """Permuted designs (batch, columns, subjects) that are given by keys of subjects."""
-        basis, part_keys, visits = self.basis, keys[:, self.part.subjects], self.part.visits
-        bases: Iterable[Float] = (
-            exchangeability.shuffle(basis, self.blocks, key) for key in part_keys
-        )
-        if visits is not None and self.exchange is not None:
-            pairs = zip(keys, part_keys, strict=True)
-            bases = (visits.shuffle(basis, self.exchange, *pair) for pair in pairs)
-        elif self.flips:
-            bases = (exchangeability.flip(basis, key) for key in part_keys)
+        basis, part_keys = self.basis, keys[:, self._subjects]
         designs = np.empty((len(keys), *basis.T.shape))
-        for design, basis_of_design in zip(designs, bases, strict=True):
-            design[:] = basis_of_design.T
+        for design, key, part_key in zip(designs, keys, part_keys, strict=True):
+            if self._visits is not None:
+                shuffled = self._visits.shuffle(basis, self._exchange, key, part_key)
+            elif self._exchange == "flip":
+                shuffled = exchangeability.flip(basis, part_key)
+            else:
+                shuffled = exchangeability.shuffle(basis, self._blocks, part_key)
+            design[:] = shuffled.T
         return designs
 
     def statistics(self, bases: Float) -> Float:
         """Signed t, or square root of F, (batch, points) of bases (batch, columns, subjects)."""
         # One product of large matrices is many times as fast as one for each basis.
-        scores = (bases.reshape(-1, bases.shape[2]) @ self.residuals).reshape(*bases.shape[:2], -1)
-        noise = self.squares - np.einsum("bcp,bcp->bp", scores, scores)
-        tested = scores[:, : self.rows]
-        gained = np.einsum("bcp,bcp->bp", tested, tested) / self.rows
+        scores = (bases.reshape(-1, bases.shape[2]) @ self._residuals).reshape(*bases.shape[:2], -1)
+        noise = self._squares - np.einsum("bcp,bcp->bp", scores, scores)
+        tested = scores[:, : self._rows]
+        gained = np.einsum("bcp,bcp->bp", tested, tested) / self._rows
         # Rounding only may take the noise below zero, where the model fits perfectly.
-        t = np.sqrt(gained * self.df / np.maximum(noise, np.finfo(np.float64).eps * self.squares))
-        return np.asarray(np.copysign(t, tested[:, 0]) if self.rows == 1 else t, dtype=np.float64)
+        t = np.sqrt(gained * self._df / np.maximum(noise, np.finfo(np.float64).eps * self._squares))
+        return np.asarray(np.copysign(t, tested[:, 0]) if self._rows == 1 else t, dtype=np.float64)
 
     def p_values(self, t: Float) -> Float:
         """Two-sided p-values of these statistics."""
-        if self.rows == 1:
-            return np.asarray(2 * special.stdtr(self.df, -np.abs(t)), dtype=np.float64)
-        return np.asarray(special.fdtrc(self.rows, self.df, t**2), dtype=np.float64)
+        if self._rows == 1:
+            return np.asarray(2 * special.stdtr(self._df, -np.abs(t)), dtype=np.float64)
+        return np.asarray(special.fdtrc(self._rows, self._df, t**2), dtype=np.float64)
 
 
-@dataclass(frozen=True, eq=False)
 class _Run:
-    """One part, with its counts of what reached the observed statistics."""
+    """One map, or several that are combined, with counts of what reached the observed statistics.
 
-    members: Sequence[_Member]
-    """One map, or several that are combined."""
-    combine: str | None
-    contrast: Contrast
-    settings: MultiplicitySettings
-    observed: Float
-    enhanced: Float
-    counts: Float
-    """(3, points) of each point alone, of the maximum, and of the enhanced maximum."""
+    ``counts`` (3, points) are of each point alone, of the maximum, and of the enhanced maximum.
+    """
 
-    @classmethod
-    def build(
-        cls,
-        part: PermutationPart | JointPart,
+    def __init__(
+        self,
+        parts: Sequence[PermutationPart],
         contrast: Contrast,
         settings: MultiplicitySettings,
         blocks: Int | None,
-    ) -> "_Run":
-        parts = part.parts if isinstance(part, JointPart) else [part]
-        combine = part.combine if isinstance(part, JointPart) else None
-        members = [_Member.build(one, contrast, settings, blocks) for one in parts]
-        observed = _together(members, [one.basis.T[None] for one in members], combine)
-        enhanced = _enhanced(observed, parts[0].edges, settings)
-        counts = np.ones((3, observed.shape[1]))
-        return cls(members, combine, contrast, settings, observed, enhanced, counts)
+        combine: str | None,
+    ) -> None:
+        self._members = [_Member(part, contrast, settings, blocks) for part in parts]
+        self._combine, self._settings, self._edges = combine, settings, parts[0].edges
+        self._is_squared = contrast.n_rows > 1 and combine is None
+        self._observed, self._enhanced = self._statistics([m.basis.T[None] for m in self._members])
+        self.counts = np.ones((3, self._observed.shape[1]))
+
+    def _statistics(self, bases: Sequence[Float]) -> tuple[Float, Float]:
+        """Statistics, and enhanced ones where the method has these, by designs of the members."""
+        pairs = zip(self._members, bases, strict=True)
+        if self._combine is None:
+            ((member, basis),) = pairs
+            t = member.statistics(basis)
+        else:
+            p = [member.p_values(member.statistics(basis)) for member, basis in pairs]
+            t = combine_evidence(np.stack(p), self._combine)
+        is_maximum = self._settings.method == _MAXIMUM
+        return t, np.zeros_like(t) if is_maximum else enhance(t, self._edges)
 
     def shuffled(self, keys: Float) -> tuple[Float, Float]:
         """Statistics, and enhanced ones, of the permutations that are given by keys of subjects."""
-        bases = [member.shuffled(keys) for member in self.members]
-        t = _together(self.members, bases, self.combine)
-        return t, _enhanced(t, self.members[0].part.edges, self.settings)
+        return self._statistics([member.shuffled(keys) for member in self._members])
 
     def reached(self, t: Float, highest: Float, highest_enhanced: Float) -> Float:
         """Count (3, points) permutations that reach what was observed."""
-        pairs = ((t, self.observed), (highest, self.observed), (highest_enhanced, self.enhanced))
-        return np.stack([_at_least(*pair).sum(axis=0, dtype=np.float64) for pair in pairs])
+        pairs = ((t, self._observed), (highest, self._observed), (highest_enhanced, self._enhanced))
+        # Values may be off by rounding.
+        reach = [np.abs(values) >= np.abs(seen) * (1 - _ROUNDING) for values, seen in pairs]
+        return np.stack([values.sum(axis=0, dtype=np.float64) for values in reach])
 
     def result(self) -> PermutationTest:
         """Turn counts into p-values."""
-        t = self.observed[0]
-        p = np.where(np.isnan(t), np.nan, self.counts / self.settings.permutations)
-        if self.settings.method == _MAXIMUM:
+        t = self._observed[0]
+        p = np.where(np.isnan(t), np.nan, self.counts / self._settings.permutations)
+        if self._settings.method == _MAXIMUM:
             p[2] = np.nan
-        as_it_is = self.contrast.n_rows == 1 or self.combine is not None
-        return PermutationTest(p[0], p[1], p[2], t if as_it_is else t**2)
-
-
-def _together(members: Sequence[_Member], bases: Sequence[Float], method: str | None) -> Float:
-    """Return the statistics of one map, or of several combined, by designs."""
-    member_statistics = [one.statistics(basis) for one, basis in zip(members, bases, strict=True)]
-    if method is None:
-        return member_statistics[0]
-    pairs = zip(members, member_statistics, strict=True)
-    return combine_evidence(np.stack([one.p_values(t) for one, t in pairs]), method)
-
-
-def _enhanced(t: Float, edges: Int, settings: MultiplicitySettings) -> Float:
-    """Cluster enhancement, zero where the method does without."""
-    return np.zeros_like(t) if settings.method == _MAXIMUM else enhance(t, edges)
+        return PermutationTest(p[0], p[1], p[2], t**2 if self._is_squared else t)
 
 
 def _maximum(values: Float) -> Float:
     """Largest size on each map."""
     return np.asarray(np.nanmax(np.abs(values), axis=1, keepdims=True, initial=0.0))
-
-
-def _at_least(values: Float, observed: Float) -> NDArray[np.bool_]:
-    """Whether values reach those observed, but for rounding."""
-    return np.abs(values) >= np.abs(observed) * (1 - _ROUNDING)
 
 
 @dataclass(frozen=True)
@@ -408,20 +359,21 @@ def correct_joint(
     if rules.method not in PERMUTATIONS:
         rules = rules.changed(method=_MAXIMUM)
 
-    def part(key: MapKey) -> JointPart:
-        parts = [_part(*one, model, rules) for one in groups[key].values()]
-        return JointPart(parts, combine)
+    def parts(key: MapKey) -> list[PermutationPart]:
+        return [_part(*one, model, rules) for one in groups[key].values()]
 
     tested = {key: contrasts[key.contrast] for key in groups}
-    return _permuted(tested, part, row_blocks(model, table, rules), rules)
+    return _permuted(tested, parts, row_blocks(model, table, rules), rules, combine=combine)
 
 
 def _permuted(
     tested: Mapping[MapKey, Contrast],
-    part: Callable[[MapKey], PermutationPart | JointPart],
+    part: Callable[[MapKey], PermutationPart | list[PermutationPart]],
     blocks: Int | None,
     rules: MultiplicitySettings,
+    *,
     raw: Mapping[MapKey, Float] | None = None,
+    combine: str | None = None,
 ) -> dict[MapKey, tuple[PermutationTest, Discoveries]]:
     """Permute families of maps; ``raw`` replaces the p-values of points for cut-offs."""
     results_of: dict[MapKey, tuple[PermutationTest, Discoveries]] = {}
@@ -434,6 +386,7 @@ def _permuted(
             settings=rules,
             blocks=blocks,
             family=(number, len(groups)),
+            combine=combine,
         )
         corrected = [result.p_enhanced if enhanced else result.p_max for result in results]
         rejected = [p <= rules.alpha for p in corrected]
@@ -484,7 +437,7 @@ def correct(
         lambda key: _part(fitted[key.hemi], key.measure, model, rules),
         row_blocks(model, table, rules),
         rules,
-        {key: test.p for key, test in tests.items()},
+        raw={key: test.p for key, test in tests.items()},
     )
     return {key: permuted[key][1] for key in tests}
 

@@ -1,7 +1,7 @@
 """Logistic models: by maximum likelihood, or by Firth's method where they separate the groups."""
 
 import warnings
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy import optimize, special
@@ -89,7 +89,7 @@ def fit_logistic(
     if firth:
         weights = np.ones((1, len(case)))
         beta, value = firth_maxima(scaled, case, weights, free)
-        covariance = np.linalg.inv(_Sets.of(scaled, case, weights).information(beta)[0])
+        covariance = np.linalg.inv(_Penalized(scaled, case).information(weights, beta)[0])
         return LogisticFit(
             coefficients=beta[0] / scale,
             se=np.sqrt(np.diagonal(covariance)) / scale,
@@ -197,15 +197,15 @@ def firth_maxima(
     likelihood of each set.
     """
     free = np.ones(matrix.shape[1], dtype=bool) if free is None else free
-    sets = _Sets.of(matrix, case, weights)
+    likelihood = _Penalized(matrix, case)
     beta = np.zeros((len(weights), matrix.shape[1]))
-    value = sets.penalized(beta)
+    value = likelihood.value(weights, beta)
     active = np.arange(len(weights))
     for number in range(FIRTH_STEPS):
-        active_sets = replace(sets, kept=weights[active])
-        step, promised = active_sets.step(beta[active], free, bent=number >= _FISHER_STEPS)
+        members, bent = weights[active], number >= _FISHER_STEPS
+        step, promised = likelihood.step(members, beta[active], free, bent=bent)
         for halving in range(_HALVINGS):
-            new = active_sets.penalized(beta[active] + step)
+            new = likelihood.value(members, beta[active] + step)
             least = _SHARE * promised / 2**halving - _ROUNDING * (1 + np.abs(value[active]))
             short = new < value[active] + least
             if not short.any():
@@ -219,56 +219,47 @@ def firth_maxima(
     raise _no_convergence(FIRTH_STEPS)
 
 
-@dataclass(frozen=True)
-class _Sets:
-    """The penalized likelihood of several sets of subjects, at coefficients (sets, columns)."""
+class _Penalized:
+    """The penalized log likelihood of sets of subjects (sets, subjects), 1 for members.
 
-    matrix: Float
-    products: Float
-    """(subjects, columns * columns) of each subject's values."""
-    case: Bool
-    kept: Float
+    Coefficients are (sets, columns).
+    """
 
-    @classmethod
-    def of(cls, matrix: Float, case: Bool, weights: Float) -> "_Sets":
-        return cls(matrix, products_of(matrix), case, weights)
+    def __init__(self, matrix: Float, case: Bool) -> None:
+        self._matrix, self._case, self._products = matrix, case, products_of(matrix)
 
-    def information(self, beta: Float) -> Float:
-        chance = special.expit(beta @ self.matrix.T)
-        information = (self.kept * chance * (1 - chance)) @ self.products
-        return np.asarray(
-            information.reshape(len(beta), *[self.matrix.shape[1]] * 2), dtype=np.float64
-        )
+    def information(self, weights: Float, beta: Float) -> Float:
+        chance = special.expit(beta @ self._matrix.T)
+        information = (weights * chance * (1 - chance)) @ self._products
+        return np.asarray(information.reshape(*beta.shape, -1), dtype=np.float64)
 
-    def penalized(self, beta: Float) -> Float:
-        """Penalized log likelihood."""
-        margins = np.where(self.case, 1.0, -1.0) * (beta @ self.matrix.T)
-        penalty = 0.5 * np.linalg.slogdet(self.information(beta))[1]
-        return np.asarray((self.kept * special.log_expit(margins)).sum(axis=1) + penalty)
+    def value(self, weights: Float, beta: Float) -> Float:
+        margins = np.where(self._case, 1.0, -1.0) * (beta @ self._matrix.T)
+        penalty = 0.5 * np.linalg.slogdet(self.information(weights, beta))[1]
+        return np.asarray((weights * special.log_expit(margins)).sum(axis=1) + penalty)
 
-    def slope(self, beta: Float) -> Float:
-        """Slope of the penalized log likelihood."""
-        chance = special.expit(beta @ self.matrix.T)
-        inverse = np.linalg.pinv(self.information(beta), hermitian=True)
-        leverage = inverse.reshape(len(beta), -1) @ self.products.T
-        residual = self.case - chance + chance * (1 - chance) * leverage * (0.5 - chance)
-        return np.asarray((self.kept * residual) @ self.matrix, dtype=np.float64)
+    def slope(self, weights: Float, beta: Float) -> Float:
+        chance = special.expit(beta @ self._matrix.T)
+        inverse = np.linalg.pinv(self.information(weights, beta), hermitian=True)
+        leverage = inverse.reshape(len(beta), -1) @ self._products.T
+        residual = self._case - chance + chance * (1 - chance) * leverage * (0.5 - chance)
+        return np.asarray((weights * residual) @ self._matrix, dtype=np.float64)
 
-    def step(self, beta: Float, free: Bool, *, bent: bool) -> tuple[Float, Float]:
+    def step(self, weights: Float, beta: Float, free: Bool, *, bent: bool) -> tuple[Float, Float]:
         """Next step by the information, or by Newton's method, and the gain the slope promises.
 
         The penalty bends as much as the likelihood where groups are far apart, so that steps by the
         information alone may take thousands. For Newton's, the slope is differentiated along
         directions in which the information is one.
         """
-        size, axes = np.linalg.eigh(self.information(beta)[:, free][:, :, free])
+        size, axes = np.linalg.eigh(self.information(weights, beta)[:, free][:, :, free])
         directions = np.zeros((*beta.shape, size.shape[1]))
         directions[:, free] = axes / np.sqrt(np.maximum(size, _FLATTEST * size[:, -1:]))[:, None]
-        gradient = np.einsum("sck,sc->sk", directions, self.slope(beta))
+        gradient = np.einsum("sck,sc->sk", directions, self.slope(weights, beta))
         along = gradient
         if bent:
             moved = [_DIFFERENCE * one for one in np.moveaxis(directions, 2, 0)]
-            changes = [self.slope(beta + one) - self.slope(beta - one) for one in moved]
+            changes = [self.slope(weights, beta + d) - self.slope(weights, beta - d) for d in moved]
             bend = np.einsum("sck,lsc->slk", directions, changes) / (-2 * _DIFFERENCE)
             curvature, turned = np.linalg.eigh((bend + np.swapaxes(bend, 1, 2)) / 2)
             along = np.einsum("slk,sl->sk", turned, gradient)

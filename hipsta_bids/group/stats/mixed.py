@@ -33,22 +33,6 @@ _SAME_DF = 1e-8
 
 
 @dataclass(frozen=True)
-class State:
-    """Generalized least squares at one ratio of variances per point."""
-
-    scores: Float
-    """(points, columns) coefficients."""
-    inverse: Float
-    """(points, columns, columns) of X' V^-1 X."""
-    information_first: Float
-    """(points, columns, columns) derivative of X' V^-1 X for the ratio."""
-    residual: tuple[Float, Float, Float]
-    """(points,) generalized sum of squared residuals, its first and second derivative."""
-    penalty: tuple[Float, Float, Float]
-    """(points,) log |V| + log |X' V^-1 X|, its first and second derivative."""
-
-
-@dataclass(frozen=True)
 class Sums:
     """What the likelihood depends on: sums of products of columns, the values being the last."""
 
@@ -76,8 +60,13 @@ class Sums:
             own_squares=np.where(mask, self.own_squares, 0.0),
         )
 
-    def at(self, ratio: Float) -> State:
-        """Fit with one ratio per point."""
+    def at(self, ratio: Float) -> tuple[Float, Float, Float, Float, Float]:
+        """Fit by generalized least squares with one ratio of variances per point.
+
+        Returns coefficients (points, columns); the inverse of X' V^-1 X, and the derivative of that
+        matrix for the ratio, (points, columns, columns); the sum of squared residuals with its
+        first and second derivative, and log |V| + log |X' V^-1 X| with these, (3, points).
+        """
         sizes = self.sizes[:, None]
         spread = 1 + sizes * ratio
         take = (ratio / spread, 1 / spread**2, -2 * sizes / spread**3)
@@ -96,21 +85,17 @@ class Sums:
         bend = inverse @ second[:, :-1, :-1] - relative @ relative
         share = sizes / spread
         log_spread = np.sum(self.people * np.log(spread), axis=0)
-        return State(
-            scores=scores,
-            inverse=inverse,
-            information_first=first[:, :-1, :-1],
-            residual=(
-                np.einsum("pi,pi->p", left, gradient),
-                np.einsum("pi,pi->p", left, moved),
-                residual_second,
-            ),
-            penalty=(
-                log_spread - np.linalg.slogdet(inverse)[1],
-                np.sum(self.people * share, axis=0) + np.trace(relative, axis1=1, axis2=2),
-                np.trace(bend, axis1=1, axis2=2) - np.sum(self.people * share**2, axis=0),
-            ),
+        residual = (
+            np.einsum("pi,pi->p", left, gradient),
+            np.einsum("pi,pi->p", left, moved),
+            residual_second,
         )
+        penalty = (
+            log_spread - np.linalg.slogdet(inverse)[1],
+            np.sum(self.people * share, axis=0) + np.trace(relative, axis1=1, axis2=2),
+            np.trace(bend, axis1=1, axis2=2) - np.sum(self.people * share**2, axis=0),
+        )
+        return scores, inverse, first[:, :-1, :-1], np.stack(residual), np.stack(penalty)
 
 
 def collect_sums(maps: Float, basis: Float, participants: Int) -> Sums:
@@ -148,13 +133,13 @@ def best_ratio(sums: Sums) -> Float:
     grid = np.linspace(0.0, MAX_CORRELATION, CORRELATIONS)
     losses = []
     for ratio in grid / (1 - grid):
-        state = sums.at(np.full(len(sums.n), ratio))
-        losses.append(freedom * np.log(state.residual[0]) + state.penalty[0])
+        *_, residual, penalty = sums.at(np.full(len(sums.n), ratio))
+        losses.append(freedom * np.log(residual[0]) + penalty[0])
     best = np.argmin(losses, axis=0)
 
     def rising(correlation: Float) -> Float:
-        state = sums.at(correlation / (1 - correlation))
-        return np.asarray(freedom * state.residual[1] / state.residual[0] + state.penalty[1])
+        *_, residual, penalty = sums.at(correlation / (1 - correlation))
+        return np.asarray(freedom * residual[1] / residual[0] + penalty[1])
 
     low, high = grid[np.maximum(best - 1, 0)], grid[np.minimum(best + 1, len(grid) - 1)]
     for _ in range(HALVINGS):
@@ -304,18 +289,18 @@ def _fit(
     usable &= (sums.n > columns + 1) & sums.repeated
     sums = sums.where(usable)
     ratio = best_ratio(sums)
-    state = sums.at(ratio)
+    scores, inverse, information_first, residual, penalty = sums.at(ratio)
     freedom = sums.n - columns
-    variance = state.residual[0] / freedom
-    turned, values_of = _tested(rotated, state.scores, state.inverse, variance)
-    form = random_slope.forms(state.inverse, turned)
-    slope = -random_slope.forms(state.inverse @ state.information_first @ state.inverse, turned)
-    df = _satterthwaite(form, slope, freedom, ratio, state)
+    variance = residual[0] / freedom
+    turned, values_of = _tested(rotated, scores, inverse, variance)
+    slope = -random_slope.forms(inverse @ information_first @ inverse, turned)
+    relative = slope / random_slope.forms(inverse, turned)
+    df = _satterthwaite(relative, freedom, ratio, residual, penalty)
     blank = np.where(usable, 1.0, np.nan)
     values_of |= {
         "participant": variance * ratio,
         "df": df,
-        "loss": freedom * np.log(state.residual[0]) + state.penalty[0],
+        "loss": freedom * np.log(residual[0]) + penalty[0],
     }
     values_of = {name: values * blank for name, values in values_of.items()}
     return values_of | {"slope": np.full(len(blank), np.nan), "n": sums.n.astype(np.float64)}
@@ -338,14 +323,14 @@ def _fit_slopes(
     usable &= sums.n > basis.shape[1] + _SLOPE_SESSIONS
     subset = sums.take(np.flatnonzero(usable))
     triangles = random_slope.best_triangles(subset)
-    state = random_slope.solve_slopes(subset, triangles)
-    variance = state.residual / (subset.n - basis.shape[1])
-    turned, values_of = _tested(rotated, state.scores, state.inverse, variance)
+    scores, inverse, residual, penalty = random_slope.solve_slopes(subset, triangles)
+    variance = residual / (subset.n - basis.shape[1])
+    turned, values_of = _tested(rotated, scores, inverse, variance)
     values_of |= {
         "participant": variance * triangles[:, 0] ** 2,
         "slope": variance * np.sum(triangles[:, 1:] ** 2, axis=1) / unit**2,
         "df": random_slope.slope_freedom(subset, triangles, turned),
-        "loss": (subset.n - basis.shape[1]) * np.log(state.residual) + state.penalty,
+        "loss": (subset.n - basis.shape[1]) * np.log(residual) + penalty,
     }
 
     def spread(values: Float) -> Float:
@@ -357,18 +342,20 @@ def _fit_slopes(
     return spaced | {"n": sums.n.astype(np.float64)}
 
 
-def _satterthwaite(form: Float, slope: Float, freedom: Int, ratio: Float, state: State) -> Float:
+def _satterthwaite(
+    relative: Float, freedom: Int, ratio: Float, residual: Float, penalty: Float
+) -> Float:
     """Degrees of freedom of contrasts: 2 f^2 / Var(f), f the estimated variance of one.
 
     With s the logarithm of the residual variance and r the ratio, f = exp(s) form(r), so its
-    gradient is f (1, slope / form); the covariance of (s, r) is twice the inverse of the Hessian
-    of minus twice the restricted likelihood, whose entry for s is the residual ``freedom``.
+    gradient is f (1, ``relative``), the slope of form over form. The covariance of (s, r) is twice
+    the inverse of the Hessian of minus twice the restricted likelihood, whose entry for s is the
+    residual ``freedom``.
     """
-    variance = state.residual[0] / freedom
-    mixed, second = -state.residual[1] / variance, state.penalty[2] + state.residual[2] / variance
+    variance = residual[0] / freedom
+    mixed, second = -residual[1] / variance, penalty[2] + residual[2] / variance
     determinant = freedom * second - mixed**2
     safe = (ratio > 0) & (determinant > 0)
-    relative = slope / form
     spread = second - 2 * mixed * relative + freedom * relative**2
     df_of = np.where(safe, determinant, 1.0) / np.where(safe, spread, 1.0)
     return np.where(safe, df_of, freedom.astype(np.float64))

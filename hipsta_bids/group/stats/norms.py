@@ -81,12 +81,9 @@ class Norms:
         design = np.column_stack(
             [np.ones(len(people.age)), age_columns(people.age, self.knots), people.sex]
         )
-        return design @ self.mean, np.exp(self._position(people.age) @ self.spread)
-
-    def _position(self, age: Float) -> Float:
-        return np.column_stack(
-            [np.ones(len(age)), (age - self.knots[0]) / (self.knots[-1] - self.knots[0])]
-        )
+        share = (people.age - self.knots[0]) / (self.knots[-1] - self.knots[0])
+        log_sd = np.column_stack([np.ones(len(share)), share]) @ self.spread
+        return design @ self.mean, np.exp(log_sd)
 
     def score(self, values: Float, people: People) -> Float:
         """(visits, points) deviations z; their normal probability is the centile.
@@ -223,7 +220,9 @@ def _fit(
     one_minus_leverage = np.maximum(1 - leverage, 1 / len(values))[:, None]
     inverse = np.linalg.pinv(spread) / 2
     log_sd = np.zeros((n_sites + 1, values.shape[1]))
-    sd = _spread_of(filled, finite)
+    count = np.maximum(finite.sum(axis=0), 1)
+    deviation = finite * (filled - filled.sum(axis=0) / count)
+    sd = np.sqrt((deviation**2).sum(axis=0) / count)
     log_sd[:n_sites] = np.log(np.where(sd > 0, sd, np.nan))
     coefficients = np.full((design.shape[1], values.shape[1]), np.nan)
     for _ in range(_STEPS):
@@ -251,12 +250,6 @@ def _fit(
         scale=np.exp(sds - average[1]),
         n=n.astype(np.int64),
     )
-
-
-def _spread_of(filled: Float, finite: Bool) -> Float:
-    count = np.maximum(finite.sum(axis=0), 1)
-    mean = filled.sum(axis=0) / count
-    return np.asarray(np.sqrt((finite * (filled - mean) ** 2).sum(axis=0) / count))
 
 
 def _power(order: Float) -> Float:

@@ -66,20 +66,6 @@ class SlopeSums:
         )
 
 
-@dataclass(frozen=True)
-class SlopeState:
-    """Generalized least squares at given triangles."""
-
-    scores: Float
-    """(points, columns)"""
-    inverse: Float
-    """(points, columns, columns) covariance of the scores over the residual variance."""
-    residual: Float
-    """(points,) generalized sum of squared residuals."""
-    penalty: Float
-    """(points,) log |V| + log |X' V^-1 X|."""
-
-
 def collect_slope_sums(maps: Float, basis: Float, participants: Int, times: Float) -> SlopeSums:
     """Sum over each participant's sessions."""
     present = np.isfinite(maps)
@@ -108,8 +94,12 @@ def collect_slope_sums(maps: Float, basis: Float, participants: Int, times: Floa
     )
 
 
-def solve_slopes(sums: SlopeSums, triangles: Float) -> SlopeState:
-    """Fit with one triangle (intercept, covariance, slope) per point."""
+def solve_slopes(sums: SlopeSums, triangles: Float) -> tuple[Float, Float, Float, Float]:
+    """Fit by generalized least squares with one triangle (intercept, covariance, slope) per point.
+
+    Returns coefficients (points, columns), their covariance over the residual variance, the sum of
+    squared residuals (points,), and log |V| + log |X' V^-1 X| (points,).
+    """
     a, b, c = triangles.T[:, :, None]
     n, s, q = sums.moments
     first = 1 + a**2 * n + 2 * a * b * s + b**2 * q
@@ -128,7 +118,7 @@ def solve_slopes(sums: SlopeSums, triangles: Float) -> SlopeState:
     residual = sums.total - np.sum(weighted[0] * y + weighted[1] * t, axis=1)
     residual -= np.einsum("pi,pi->p", scores, right)
     penalty = np.log(determinant).sum(axis=1) + np.linalg.slogdet(information)[1]
-    return SlopeState(scores, np.asarray(inverse, dtype=np.float64), residual, penalty)
+    return scores, np.asarray(inverse, dtype=np.float64), residual, penalty
 
 
 def _products(x: Float, z: Float, plain: Float, mixed: Float, timed: Float) -> Float:
@@ -191,24 +181,25 @@ def slope_freedom(sums: SlopeSums, triangles: Float, rows: Float) -> Float:
     R's ``lmerTest``.
     """
     freedom = sums.n - sums.squares.shape[1]
-    base = solve_slopes(sums, triangles)
-    variance = base.residual / freedom
+    _, inverse_here, residual_here, _ = solve_slopes(sums, triangles)
+    variance = residual_here / freedom
     shifts = _STEP * np.eye(3)
     hessian = np.empty((len(triangles), 4, 4))
     hessian[:, 0, 0] = freedom
     slopes = []
     for i in range(3):
-        up, down = (solve_slopes(sums, triangles + sign * shifts[i]) for sign in (1, -1))
-        hessian[:, 0, i + 1] = -(up.residual - down.residual) / (2 * _STEP) / variance
+        _, up, residual_up, _ = solve_slopes(sums, triangles + shifts[i])
+        _, down, residual_down, _ = solve_slopes(sums, triangles - shifts[i])
+        hessian[:, 0, i + 1] = -(residual_up - residual_down) / (2 * _STEP) / variance
         hessian[:, i + 1, 0] = hessian[:, 0, i + 1]
-        slopes.append((forms(up.inverse, rows) - forms(down.inverse, rows)) / (2 * _STEP))
+        slopes.append((forms(up, rows) - forms(down, rows)) / (2 * _STEP))
 
     def fixed_variance(at: Float) -> Float:
-        state = solve_slopes(sums, at)
-        return np.asarray(state.penalty + state.residual / variance)
+        *_, residual, penalty = solve_slopes(sums, at)
+        return np.asarray(penalty + residual / variance)
 
     hessian[:, 1:, 1:] = _second(fixed_variance, triangles)
-    form = forms(base.inverse, rows)
+    form = forms(inverse_here, rows)
     gradient = np.stack([np.ones_like(form), *(slope / form for slope in slopes)], axis=-1)
     size, axes = np.linalg.eigh(hessian)
     valid = size > _BENT * size[:, -1:]
@@ -224,9 +215,9 @@ def forms(inverse: Float, rows: Float) -> Float:
 
 def _loss(sums: SlopeSums, triangles: Float) -> Float:
     """Minus twice the restricted likelihood, but for a constant."""
-    state = solve_slopes(sums, triangles)
+    *_, residual, penalty = solve_slopes(sums, triangles)
     freedom = sums.n - sums.squares.shape[1]
-    return np.asarray(freedom * np.log(state.residual) + state.penalty)
+    return np.asarray(freedom * np.log(residual) + penalty)
 
 
 def _derivatives(sums: SlopeSums, at: Float) -> tuple[Float, Float, Float]:

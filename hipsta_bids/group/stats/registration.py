@@ -1,7 +1,7 @@
 """Registration of curvature profiles, so that a grid node means the same position in all."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -17,12 +17,8 @@ from hipsta_bids.group.stats.inference import PermutationPart, permute
 
 #: Displacements that vary less, as a share of the largest variance, are those of fixed ends.
 _ROUNDING = 1e-12
-#: Settings of the method ``penalized``, in place of those of ``registr``.
-PENALIZED = {"template_splines": 12, "warp_splines": 6, "components": 2, "iterations": 20}
-#: Turns end when warps change by less than this, mean square, sheet = 1; by method.
-TOLERANCES = {"registr": 1e-4, "penalized": 1e-7}
-#: Standard deviation of the logarithms of a warp's local stretch, to start with.
-START_SD = 0.3
+#: Turns end when warps change by less than this, mean square, sheet = 1.
+_TOLERANCE = 1e-4
 
 
 @dataclass(frozen=True)
@@ -42,6 +38,10 @@ class Registration:
     """(subjects,) root mean square of warp minus identity, in grid nodes."""
     extreme: Bool
     """(subjects,) whose displacement is an outlier."""
+    by_group: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    """Columns of shifts by group; empty without groups."""
+    difference: Mapping[str, float] = field(default_factory=dict)
+    """Columns of the largest difference between the groups; empty without groups."""
 
     @property
     def shifts(self) -> Float:
@@ -54,11 +54,6 @@ def _shifts(warps: Float) -> Float:
     return np.asarray((warps - np.linspace(0.0, 1.0, nodes)) * (nodes - 1), dtype=np.float64)
 
 
-def _of_method(settings: RegistrationSettings) -> RegistrationSettings:
-    penalized = settings.align == "penalized"
-    return settings.model_copy(update=PENALIZED) if penalized else settings
-
-
 def register(profiles: Float, settings: RegistrationSettings) -> Registration:
     """Register profiles to a template that is made from them.
 
@@ -67,13 +62,10 @@ def register(profiles: Float, settings: RegistrationSettings) -> Registration:
     2018, as in version 2.1.1 of the R package of that name). Unlike R, each profile is first
     standardized (setting ``standardize``; else all are divided by one standard deviation, since
     the algorithm is not free of scale), and the mean warp is kept at identity (``center``).
-    ``penalized`` has finer warps with a normal prior on the logarithms of local stretch, whose
-    variance is estimated along with the rest.
     """
     if settings.align == "none":
         return _finish(profiles, _identity(profiles), None, settings, 0, converged=True)
     scale = _check(profiles, settings)
-    settings = _of_method(settings)
     scaled = _scaled(profiles, scale)
     basis = warping.WarpBasis.make(profiles.shape[1], settings.warp_splines)
     warps = _identity(profiles)
@@ -81,47 +73,35 @@ def register(profiles: Float, settings: RegistrationSettings) -> Registration:
     mean = np.linalg.lstsq(warping.make_basis(knots)(warps[0]), scaled.mean(axis=0), rcond=None)[0]
     curves = np.tile(mean, (len(profiles), 1))
     parameters = np.zeros((len(profiles), len(basis.identity)))
-    variance = START_SD**2 if settings.align == "penalized" else np.inf
-    noise = 1.0
     turn = 0
     while True:
-        fit = warping.fit_warps(
-            scaled, knots, curves, basis, parameters, penalty=noise / variance, settings=settings
-        )
-        parameters = fit.parameters
-        if np.isfinite(variance):
-            variance = float(np.mean(parameters**2) + noise * fit.uncertainty.mean())
-        before, warps = warps, fit.warps
+        before = warps
+        parameters, warps = warping.fit_warps(scaled, knots, curves, basis, parameters)
         if settings.center:
             warps = _after_inverse(warps, warps.mean(axis=0))
         template, curves = warping.fit_template(
             scaled, warps, settings.template_splines, settings.components
         )
-        knots, noise = template.knots, template.noise
+        knots = template.knots
         change = float(np.mean((warps - before) ** 2))
         # The first warps are to the mean of profiles that were not registered.
-        if turn == settings.iterations or (turn and change <= TOLERANCES[settings.align]):
+        if turn == settings.iterations or (turn and change <= _TOLERANCE):
             break
         turn += 1
-    template = replace(
-        template, scale=scale, align=settings.align, warp_variance=variance, turns=turn
-    )
+    template = replace(template, scale=scale, turns=turn)
     if settings.center:
         center = _fit_to(scaled, template, settings).mean(axis=0)
         template = replace(template, center=center)
-    return _finish(
-        profiles, warps, template, settings, turn, converged=change <= TOLERANCES[settings.align]
-    )
+    return _finish(profiles, warps, template, settings, turn, converged=change <= _TOLERANCE)
 
 
 def register_to(
     profiles: Float, template: warping.Template, settings: RegistrationSettings
 ) -> Registration:
     """Register profiles to a template that does not change; each subject is on its own."""
-    if template.align != settings.align:
+    if settings.align == "none":
         raise ModelError(
-            f"registration: the template was made with align {template.align}, not"
-            f" {settings.align}; use the same"
+            "registration: the template was made with align registr, not none; use the same"
         )
     if (template.scale is None) != settings.standardize:
         raise ModelError(
@@ -141,18 +121,14 @@ def register_to(
 
 def _fit_to(scaled: Float, template: warping.Template, settings: RegistrationSettings) -> Float:
     """Warps to a template that does not change, by as many turns as it was made with."""
-    basis = warping.WarpBasis.make(scaled.shape[1], _of_method(settings).warp_splines)
+    basis = warping.WarpBasis.make(scaled.shape[1], settings.warp_splines)
     curves = np.tile(template.mean, (len(scaled), 1))
     parameters = np.zeros((len(scaled), len(basis.identity)))
-    penalty = template.noise / template.warp_variance
     for turn in range(template.turns + 1):
-        fit = warping.fit_warps(
-            scaled, template.knots, curves, basis, parameters, penalty=penalty, settings=settings
-        )
-        parameters = fit.parameters
+        parameters, warps = warping.fit_warps(scaled, template.knots, curves, basis, parameters)
         if turn < template.turns:
-            curves = warping.subject_curves(template, scaled, fit.warps)
-    return fit.warps
+            curves = warping.subject_curves(template, scaled, warps)
+    return warps
 
 
 def _identity(profiles: Float) -> Float:

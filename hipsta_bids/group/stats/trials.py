@@ -196,18 +196,14 @@ def point_level(rules: MultiplicitySettings, plan: PowerSettings) -> float:
         )
     if rules.method == "bh":
         return rules.alpha * plan.affected * plan.power / (1 - rules.alpha * (1 - plan.affected))
-    return _two_stage_level(rules, plan.power, plan.affected)
-
-
-def _two_stage_level(rules: MultiplicitySettings, power: float, affected: float) -> float:
-    rate = rules.alpha / (1 + rules.alpha)
-    second = first = rate * affected * power
+    rate, affected = rules.alpha / (1 + rules.alpha), plan.affected
+    second = first = rate * affected * plan.power
     for _ in range(_TURNS):
-        center = stats.norm.isf(second / 2) + stats.norm.ppf(power)
+        center = stats.norm.isf(second / 2) + stats.norm.ppf(plan.power)
         power_first = stats.norm.sf(stats.norm.isf(first / 2) - center)
-        found = affected * power_first + (1 - affected) * first
-        first = rate * found
-        second = rate * affected * power / (1 - found - rate * (1 - affected))
+        share = affected * power_first + (1 - affected) * first
+        first = rate * share
+        second = rate * affected * plan.power / (1 - share - rate * (1 - affected))
     return float(second)
 
 

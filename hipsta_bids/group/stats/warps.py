@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 
-from hipsta_bids.group.design.settings import RegistrationSettings
 from hipsta_bids.group.stats.arrays import Float, Int, blocks
 
 #: Most steps of expectation and maximization for the components.
@@ -80,10 +79,6 @@ class Template:
     scale: float | None
     """Standard deviation of the profiles that made it, in their unit; None where each profile
     was standardized by its own mean and standard deviation."""
-    align: str
-    """How it was made."""
-    warp_variance: float
-    """Of the logarithms of local stretch; infinite without a penalty."""
     turns: int
     """Iterations of template and warps, which new subjects take as well."""
     center: Float
@@ -91,43 +86,27 @@ class Template:
     are; warps are followed by its inverse."""
 
 
-@dataclass(frozen=True)
 class _Moments:
-    """What the steps need to know of the profiles at their registered coordinates."""
+    """What the steps need to know of the profiles at their registered coordinates.
 
-    squares: Float
-    """(subjects, splines, splines) of the splines there."""
-    products: Float
-    """(subjects, splines) of splines and profiles."""
-    grid: Float
-    """(nodes, splines) mean of the splines."""
-    power: float
-    """Sum of the squared profiles."""
+    ``squares`` (subjects, splines, splines) of the splines there, their ``products`` with profiles
+    (subjects, splines), the mean of the splines at each node, and the sum of squared profiles.
+    """
 
-    @classmethod
-    def collect(cls, profiles: Float, warps: Float, knots: Float) -> "_Moments":
+    def __init__(self, profiles: Float, warps: Float, knots: Float) -> None:
         splines = make_basis(knots)
         size = splines.c.shape[1]
-        squares, products = np.empty((len(warps), size, size)), np.empty((len(warps), size))
-        grid = np.zeros((warps.shape[1], size))
+        self.squares, self.products = (
+            np.empty((len(warps), size, size)),
+            np.empty((len(warps), size)),
+        )
+        self.grid, self.power = np.zeros((warps.shape[1], size)), float(np.sum(profiles**2))
         for part in blocks(len(warps), _BLOCK):
             basis = splines(warps[part])
-            squares[part] = np.swapaxes(basis, 1, 2) @ basis
-            products[part] = np.einsum("sdk,sd->sk", basis, profiles[part])
-            grid += basis.sum(axis=0)
-        return cls(squares, products, grid / len(warps), float(np.sum(profiles**2)))
-
-
-@dataclass(frozen=True)
-class _Scores:
-    mean: Float
-    """(subjects, components)"""
-    covariance: Float
-    """(subjects, components, components)"""
-    squares: Float
-    """(subjects, components, components) of the components at the subject's nodes."""
-    projection: Float
-    """(subjects, components)"""
+            self.squares[part] = np.swapaxes(basis, 1, 2) @ basis
+            self.products[part] = np.einsum("sdk,sd->sk", basis, profiles[part])
+            self.grid += basis.sum(axis=0)
+        self.grid /= len(warps)
 
 
 def fit_template(
@@ -142,31 +121,30 @@ def fit_template(
     et al. 2018), all subjects at once.
     """
     knots = inner_knots(warps, splines)
-    moments = _Moments.collect(profiles, warps, knots)
+    moments = _Moments(profiles, warps, knots)
     mean = np.linalg.solve(moments.squares.sum(axis=0), moments.products.sum(axis=0))
     expected = BSpline(make_basis(knots).t, mean, DEGREE)(warps)
     parts = _start(profiles - expected, moments.grid, components)
     noise = 1.0
-    scores = _expect(moments, mean, parts, noise)  # the answer if there are no steps
+    scores, *_ = _expect(moments, mean, parts, noise)  # the answer if there are no steps
     for _ in range(EM_ITERATIONS - 1):
-        scores = _expect(moments, mean, parts, noise)
-        new_mean, new_parts = _maximize(moments, scores)
-        new_noise = _noise(moments, mean, scores)
+        scores, covariance, new_noise = _expect(moments, mean, parts, noise)
+        new_mean, new_parts = _maximize(moments, scores, covariance)
         change = np.sum((new_parts - parts) ** 2) + np.sum((new_mean - mean) ** 2)
         change += (new_noise - noise) ** 2
         mean, parts, noise = new_mean, new_parts, new_noise
         if change < EM_TOLERANCE:
             break
     grid = np.linspace(0.0, 1.0, warps.shape[1])
-    template = Template(knots, mean, parts, noise, 1.0, "none", np.inf, 0, grid)
-    return template, mean + scores.mean @ parts.T
+    template = Template(knots, mean, parts, noise, scale=1.0, turns=0, center=grid)
+    return template, mean + scores @ parts.T
 
 
 def subject_curves(template: Template, profiles: Float, warps: Float) -> Float:
     """Each subject's own curve, by a template that does not change."""
-    moments = _Moments.collect(profiles, warps, template.knots)
-    scores = _expect(moments, template.mean, template.components, template.noise)
-    return template.mean + scores.mean @ template.components.T
+    moments = _Moments(profiles, warps, template.knots)
+    scores, *_ = _expect(moments, template.mean, template.components, template.noise)
+    return template.mean + scores @ template.components.T
 
 
 def _start(residuals: Float, grid: Float, components: int) -> Float:
@@ -176,31 +154,32 @@ def _start(residuals: Float, grid: Float, components: int) -> Float:
     return np.asarray(parts * size[:components] / np.sqrt(len(residuals)), dtype=np.float64)
 
 
-def _expect(moments: _Moments, mean: Float, parts: Float, noise: float) -> _Scores:
-    """Posterior of the scores."""
+def _expect(
+    moments: _Moments, mean: Float, parts: Float, noise: float
+) -> tuple[Float, Float, float]:
+    """Mean (subjects, components) and covariance of the scores' posterior.
+
+    Also the mean square, as expected, of what the subjects' templates leave.
+    """
     squares = parts.T @ moments.squares @ parts
     covariance = np.linalg.inv(squares / noise + np.eye(parts.shape[1]))
     projection = (moments.products - moments.squares @ mean) @ parts
     scores = np.einsum("spq,sq->sp", covariance, projection) / noise
-    return _Scores(scores, np.asarray(covariance, dtype=np.float64), squares, projection)
-
-
-def _noise(moments: _Moments, mean: Float, scores: _Scores) -> float:
-    """Mean square, as expected, of what the subjects' templates leave."""
     total = moments.power - 2 * float(moments.products.sum(axis=0) @ mean)
     total += float(mean @ moments.squares.sum(axis=0) @ mean)
-    total -= 2 * float(np.sum(scores.mean * scores.projection))
-    second = scores.covariance + scores.mean[:, :, None] * scores.mean[:, None, :]
-    total += float(np.sum(scores.squares * second))
-    return total / (len(moments.products) * len(moments.grid))
+    total -= 2 * float(np.sum(scores * projection))
+    second = covariance + scores[:, :, None] * scores[:, None, :]
+    total += float(np.sum(squares * second))
+    noise = total / (len(moments.products) * len(moments.grid))
+    return scores, np.asarray(covariance, dtype=np.float64), noise
 
 
-def _maximize(moments: _Moments, scores: _Scores) -> tuple[Float, Float]:
+def _maximize(moments: _Moments, scores: Float, covariance: Float) -> tuple[Float, Float]:
     """Mean and components that fit the profiles best, given the scores' posterior."""
-    subjects, components = scores.mean.shape
-    first = np.column_stack([scores.mean, np.ones(subjects)])
+    subjects, components = scores.shape
+    first = np.column_stack([scores, np.ones(subjects)])
     second = first[:, :, None] * first[:, None, :]
-    second[:, :components, :components] += scores.covariance
+    second[:, :components, :components] += covariance
     splines = moments.squares.shape[1]
     size = splines * (components + 1)
     system = np.einsum("sij,spq->ipjq", moments.squares, second, optimize=True)
@@ -255,109 +234,60 @@ class WarpBasis:
         return np.where((steps > least).all(axis=1)[:, None], parameters, lifted)
 
 
-@dataclass(frozen=True)
-class WarpFit:
-    """Warps of all subjects."""
-
-    parameters: Float
-    """(subjects, steps)"""
-    warps: Float
-    """(subjects, nodes) registered coordinate of each node, 0..1."""
-    uncertainty: Float
-    """(subjects,) mean posterior variance of the parameters, over the noise variance."""
-
-
-@dataclass(frozen=True)
-class _State:
-    parameters: Float
-    warps: Float
-    slopes: Float
-    residuals: Float
-    along: Float
-    """Slopes of the curves there."""
-    loss: Float
-
-
-@dataclass(frozen=True)
-class _Problem:
-    """Fits of warps, whatever the subjects."""
-
-    knots: Float
-    basis: WarpBasis
-    penalty: float
-    settings: RegistrationSettings
-
-    def solve(self, profiles: Float, coefficients: Float, parameters: Float) -> WarpFit:
-        """Damped Gauss-Newton steps; subjects that are done drop out."""
-        best = self.basis.lifted(parameters, LEAST_STRETCH)
-        # Adding a constant to all parameters changes nothing: keep their sum.
-        level = np.full((parameters.shape[1], parameters.shape[1]), 1 / parameters.shape[1])
-        active = np.arange(len(profiles))
-        damping = np.full(len(profiles), _DAMPING)
-        for _ in range(WARP_STEPS):
-            curves = coefficients[active]
-            state = self._state(best[active], profiles[active], curves)
-            matrix, right = self._normal(state)
-            size = np.maximum(np.trace(matrix, axis1=1, axis2=2), _LEAST_DAMPING)
-            ridge = size[:, None, None] * (level + damping[active, None, None] * np.eye(len(level)))
-            step = np.linalg.solve(matrix + ridge, right[:, :, None])[:, :, 0]
-            trial = self._state(state.parameters + step, profiles[active], curves)
-            gained = state.loss - trial.loss
-            better = gained > 0
-            best[active[better]] = trial.parameters[better]
-            eased = np.maximum(damping[active] / _FACTOR, _LEAST_DAMPING)
-            damping[active] = np.where(better, eased, damping[active] * _FACTOR)
-            is_settled = better & (gained < WARP_TOLERANCE * state.loss)
-            active = active[~is_settled & (damping[active] < _MOST_DAMPING)]
-            if not len(active):
-                break
-        last = self._state(best, profiles, coefficients)
-        matrix, _ = self._normal(last)
-        spread = np.linalg.pinv(matrix, hermitian=True)
-        uncertainty = np.trace(spread, axis1=1, axis2=2) / matrix.shape[1]
-        return WarpFit(best, last.warps, np.asarray(uncertainty, dtype=np.float64))
-
-    def _state(self, parameters: Float, profiles: Float, coefficients: Float) -> _State:
-        warps, slopes = self.basis.evaluate(parameters)
-        expected, along = _along(self.knots, coefficients, warps)
-        residuals = profiles - expected
-        loss = 0.5 * np.sum(residuals**2, axis=1)
-        loss += 0.5 * self.penalty * np.sum(parameters**2, axis=1)
-        return _State(parameters, warps, slopes, residuals, along, loss)
-
-    def _normal(self, state: _State) -> tuple[Float, Float]:
-        """Matrix and right-hand side of a Gauss-Newton step."""
-        jacobian = state.along[:, :, None] * state.slopes
-        matrix = np.swapaxes(jacobian, 1, 2) @ jacobian
-        right = np.einsum("sdi,sd->si", jacobian, state.residuals) - self.penalty * state.parameters
-        return matrix + self.penalty * np.eye(matrix.shape[1]), right
-
-
 def fit_warps(
-    profiles: Float,
-    knots: Float,
-    coefficients: Float,
-    basis: WarpBasis,
-    parameters: Float,
-    *,
-    penalty: float,
-    settings: RegistrationSettings,
-) -> WarpFit:
+    profiles: Float, knots: Float, coefficients: Float, basis: WarpBasis, parameters: Float
+) -> tuple[Float, Float]:
     """Warp each profile onto its own curve, by damped Gauss-Newton steps for all at once.
 
-    Minimizes half the sum of squared differences, plus half the penalty times the squared
-    parameters (the logarithms of local stretch, in the mean).
+    Minimizes the sum of squared differences, from ``parameters`` (subjects, steps) on. Returns
+    parameters, and warps (subjects, nodes): registered coordinate of each node, 0..1.
     """
-    problem = _Problem(knots, basis, penalty, settings)
     fits = [
-        problem.solve(profiles[block], coefficients[block], parameters[block])
+        _fit_block(profiles[block], knots, coefficients[block], basis, parameters[block])
         for block in blocks(len(profiles), _BLOCK)
     ]
-    return WarpFit(
-        parameters=np.concatenate([fit.parameters for fit in fits]),
-        warps=np.concatenate([fit.warps for fit in fits]),
-        uncertainty=np.concatenate([fit.uncertainty for fit in fits]),
-    )
+    best, warps = zip(*fits, strict=True)
+    return np.concatenate(best), np.concatenate(warps)
+
+
+def _fit_block(
+    profiles: Float, knots: Float, coefficients: Float, basis: WarpBasis, parameters: Float
+) -> tuple[Float, Float]:
+    """Fit warps of some subjects; those that are done drop out."""
+    best = basis.lifted(parameters, LEAST_STRETCH)
+    # Adding a constant to all parameters changes nothing: keep their sum.
+    level = np.full((parameters.shape[1], parameters.shape[1]), 1 / parameters.shape[1])
+    active = np.arange(len(profiles))
+    damping = np.full(len(profiles), _DAMPING)
+    for _ in range(WARP_STEPS):
+        curves = coefficients[active]
+        loss, residuals, jacobian = _evaluate(best[active], profiles[active], knots, curves, basis)
+        matrix = np.swapaxes(jacobian, 1, 2) @ jacobian
+        right = np.einsum("sdi,sd->si", jacobian, residuals)
+        size = np.maximum(np.trace(matrix, axis1=1, axis2=2), _LEAST_DAMPING)
+        ridge = size[:, None, None] * (level + damping[active, None, None] * np.eye(len(level)))
+        step = np.linalg.solve(matrix + ridge, right[:, :, None])[:, :, 0]
+        trial = best[active] + step
+        gained = loss - _evaluate(trial, profiles[active], knots, curves, basis)[0]
+        better = gained > 0
+        best[active[better]] = trial[better]
+        eased = np.maximum(damping[active] / _FACTOR, _LEAST_DAMPING)
+        damping[active] = np.where(better, eased, damping[active] * _FACTOR)
+        is_settled = better & (gained < WARP_TOLERANCE * loss)
+        active = active[~is_settled & (damping[active] < _MOST_DAMPING)]
+        if not len(active):
+            break
+    return best, basis.evaluate(best)[0]
+
+
+def _evaluate(
+    parameters: Float, profiles: Float, knots: Float, coefficients: Float, basis: WarpBasis
+) -> tuple[Float, Float, Float]:
+    """Loss (subjects,), residuals (subjects, nodes), and slopes (subjects, nodes, steps)."""
+    warps, slopes = basis.evaluate(parameters)
+    expected, along = _along(knots, coefficients, warps)
+    residuals = profiles - expected
+    return 0.5 * np.sum(residuals**2, axis=1), residuals, along[:, :, None] * slopes
 
 
 def warp_values(maps: Float, warps: Float) -> Float:

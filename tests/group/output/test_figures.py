@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from hipsta_bids.group.design.settings import ClassificationSettings
 from hipsta_bids.group.output.figures import draw_calibration, draw_roc, draw_sections, encode
-from hipsta_bids.group.output.panels import Seen, draw_measure
+from hipsta_bids.group.output.panels import draw_measure, draw_view
 from hipsta_bids.group.output.results import Analysis
 from hipsta_bids.group.output.shapes import AverageShape
 from hipsta_bids.group.output.views import across, draw_mesh, laid_out, look
@@ -48,7 +48,7 @@ def test_half_of_a_flat_sheet_has_the_color_of_its_values():
     for triangles in (mesh.triangles, mesh.triangles[:, ::-1]):
         view = look(Mesh(points=mesh.points, triangles=triangles), ABOVE, 4.0, (60, 100))
         right_and_up = (mesh.points[:, 0] > 0) & (mesh.points[:, 1] > 0)
-        shown = Seen(view, no_lines(view)).picture(right_and_up.astype(float), GRAY, None)
+        shown = draw_view(view, no_lines(view), right_and_up.astype(float), GRAY, None)
         assert shown.shape == (60, 100, 3)
         bright = (shown[..., 0] > 150) & (shown[..., 0] < 255)
         rows, columns = np.nonzero(bright)
@@ -340,7 +340,7 @@ def test_legends_of_curves_are_beside_them_and_small_groups_have_no_calibration(
     calibration = calibrate(score, score > 0, ClassificationSettings(least_calibrated=2))
     one = SimpleNamespace(
         auc=Area(0.6, 0.1, 0.4, 0.8),
-        cross_validation=SimpleNamespace(auc=0.07),
+        validated=(0.07, 0.01),
         curve=roc_curve(score, score > 0),
         calibration=calibration,
     )

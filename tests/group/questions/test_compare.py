@@ -254,8 +254,12 @@ def test_the_page_is_named_unless_it_could_not_be_made(tmp_path, monkeypatch, pr
     given = study.GroupOptions(
         bids_dir=tmp_path, out_dir=tmp_path, sheets=sheets, model=ModelRequest()
     )
+    written = study.GroupResult(
+        folder=tmp_path / "group" / "kept", n_participants=2, n_excluded=0, notes=(), warnings=()
+    )
+    result = study.with_page(given, written)
     page = tmp_path / "group" / "kept.html"
-    assert study.make_page(given, "kept") == (None if problem else page, problem)
+    assert (result.page, result.problem) == (None if problem else page, problem)
 
 
 def test_flagged_hemispheres_are_told(dataset, quick, capsys):
@@ -307,10 +311,12 @@ def test_left_out_hemispheres_are_listed_with_the_reason(tmp_path, quick):
         "--exclude",
         str(listed),
     ]
-    assert main([*arguments, "--exclude-qc", "filled_fraction > 0.05 and rule == 'labels'"]) == 0
+    conditions = ["filled_fraction > 0.05", "filled_fraction < 0"]
+    assert main([*arguments, "--exclude-qc", *conditions]) == 0
     folder = out / "group" / MODEL
     left_out = table(folder / "excluded.tsv")
     found = {(r.participant_id, r.hemi, r.reason, r.message) for r in left_out.itertuples()}
+    assert ("sub-03", "L", "quality", "filled_fraction > 0.05") in found
     assert ("sub-01", "L", "failed: too-thin", "2 voxels") in found
     assert ("sub-04", "R", "listed", "moved") in found
     assert {one[:2] for one in found if one[0] == "sub-05"} == {("sub-05", "L"), ("sub-05", "R")}

@@ -358,8 +358,7 @@ def test_refuses_files_that_do_not_fit(case, results, tmp_path, quick, capsys):
     assert words in line
 
 
-def test_standard_deviations_of_measurements_follow_the_scale_of_their_site():
-    """As their maps do: weights by uncertainty would be those of other units else."""
+def test_variables_that_sites_explain_are_noted():
     random = np.random.default_rng(4)
     n, shape = 60, (6, 5)
     sites = np.repeat(["A", "B"], n // 2)
@@ -371,7 +370,6 @@ def test_standard_deviations_of_measurements_follow_the_scale_of_their_site():
     side = SideMaps(
         rows=np.arange(n),
         maps={"thickness": walls},
-        errors={"thickness": np.full((n, *shape), 0.05)},
         subfield=np.zeros((n, *shape), np.int8),
         names=("all",),
         summary=pd.DataFrame(index=range(n)),
@@ -391,12 +389,6 @@ def test_standard_deviations_of_measurements_follow_the_scale_of_their_site():
         saved=None,
     )
     done = harmonize_cohort(cohort, plan, settings, Measures(maps=("thickness",)), {})
-    changed, (effects, _) = done.cohort.sides["L"], done.effects["map", "L", "thickness"]
-    for number, site in enumerate("AB"):
-        np.testing.assert_allclose(
-            changed.errors["thickness"][sites == site].reshape(n // 2, -1),
-            np.tile(0.05 / effects.scale[number], (n // 2, 1)),
-        )
     # Ages of the sites are 30 years apart, and vary by 5.
     assert plan.explained == {"age": pytest.approx(0.9, abs=0.03)}
     assert any("site explains 9" in note and "of age" in note for note in done.notes)

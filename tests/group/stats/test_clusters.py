@@ -8,7 +8,7 @@ from scipy import ndimage
 
 from hipsta_bids.group.design.formula import Contrast
 from hipsta_bids.group.design.settings import GlmSettings, MultiplicitySettings
-from hipsta_bids.group.output.columns import Cluster, Frame, find_clusters, peak_table
+from hipsta_bids.group.output.columns import Frame, find_clusters, peak_table
 from hipsta_bids.group.stats import clusters
 from hipsta_bids.group.stats.clusters import (
     TFCE_STEP,
@@ -120,10 +120,10 @@ def test_clusters_are_split_by_sign_and_by_neighbors():
         return find_clusters(significant.ravel(), statistic.ravel(), names, edges)
 
     assert found(8) == [
-        Cluster(extent=3, peak=6, shares={"CA1": 1 / 3, "CA2": 2 / 3}),
-        Cluster(extent=1, peak=12, shares={"CA2": 1.0}),
+        (6, {"extent": 3, "shares": "CA1 33%; CA2 67%"}),
+        (12, {"extent": 1, "shares": "CA2 100%"}),
     ]
-    assert [(one.extent, one.peak) for one in found(4)] == [(2, 6), (1, 0), (1, 12)]
+    assert [(one["extent"], peak) for peak, one in found(4)] == [(2, 6), (1, 0), (1, 12)]
 
 
 def test_clusters_on_a_mesh():
@@ -132,8 +132,8 @@ def test_clusters_on_a_mesh():
     significant = np.array([True, True, True, False, True])
     names = np.array(["a", "b", "b", "b", "b"])
     first, *others = find_clusters(significant, statistic, names, edges)
-    assert first == Cluster(extent=2, peak=1, shares={"a": 0.5, "b": 0.5})
-    assert [(one.extent, one.peak) for one in others] == [(1, 4), (1, 2)]
+    assert first == (1, {"extent": 2, "shares": "a 50%; b 50%"})
+    assert [(one["extent"], peak) for peak, one in others] == [(1, 4), (1, 2)]
 
 
 def planted(effect):
@@ -262,6 +262,6 @@ def test_families_are_maps_or_both_hemispheres():
 def test_shares_leave_out_points_without_a_subfield():
     significant = np.ones(4, dtype=bool)
     edges = sheet_edges(4, 1)
-    for words, shares in ((["n/a"] * 4, {}), (["SUB", "n/a", "n/a", "SUB"], {"SUB": 0.5})):
-        (cluster,) = find_clusters(significant, np.ones(4), np.array(words), edges)
-        assert (cluster.extent, cluster.shares) == (4, shares)
+    for words, shares in ((["n/a"] * 4, ""), (["SUB", "n/a", "n/a", "SUB"], "SUB 50%")):
+        ((_, cluster),) = find_clusters(significant, np.ones(4), np.array(words), edges)
+        assert cluster == {"extent": 4, "shares": shares}

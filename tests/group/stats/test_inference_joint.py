@@ -12,7 +12,7 @@ from hipsta_bids.group.design.settings import GlmSettings, MultiplicitySettings
 from hipsta_bids.group.output import write
 from hipsta_bids.group.stats.clusters import sheet_edges
 from hipsta_bids.group.stats.glm import fit_points
-from hipsta_bids.group.stats.inference import JointPart, PermutationPart, combine_evidence, permute
+from hipsta_bids.group.stats.inference import PermutationPart, combine_evidence, permute
 from hipsta_bids.reports.group import group_page
 
 SHEET = (6, 4)
@@ -53,7 +53,7 @@ def test_a_measure_with_itself_has_its_own_p(contrast):
     _, (part, _) = case()
     (alone,) = permute([part], contrast, settings=HOW)
     for how in ("fisher", "tippett"):
-        (twice,) = permute([JointPart([part, part], how)], contrast, settings=HOW)
+        (twice,) = permute([[part, part]], contrast, settings=HOW, combine=how)
         np.testing.assert_array_equal(twice.p_uncorrected, alone.p_uncorrected)
         np.testing.assert_array_equal(twice.p_max, alone.p_max)
 
@@ -61,7 +61,7 @@ def test_a_measure_with_itself_has_its_own_p(contrast):
 def test_evidence_of_a_part_is_that_of_its_t_tests():
     matrix, parts = case(1)
     parts[0].maps[3, 7] = np.nan  # other degrees of freedom
-    (found,) = permute([JointPart(parts, "fisher")], GROUP, settings=HOW)
+    (found,) = permute([parts], GROUP, settings=HOW, combine="fisher")
     p = [fit_points(one.maps, matrix, [GROUP], GlmSettings()).tests[0].p for one in parts]
     keep = np.arange(24) != 7
     np.testing.assert_allclose(

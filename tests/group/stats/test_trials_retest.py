@@ -9,7 +9,8 @@ from statsmodels.stats.anova import anova_lm
 
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.cohort.data import Cohort
-from hipsta_bids.group.questions.reference import retest_cohort
+from hipsta_bids.group.design.settings import GroupSettings
+from hipsta_bids.group.questions.trials import Retested
 from hipsta_bids.group.stats.trials import repeatability
 
 #: Six targets and four judges, table 2 of Shrout and Fleiss (1979).
@@ -101,18 +102,23 @@ def cohort(*visits):
     return Cohort(table=table, sides={}, x=np.zeros(1), y=np.zeros(1), units={})
 
 
+#: The fewest participants that the settings permit.
+LEAST = GroupSettings().changed(retest={"min_participants": 3})
+
+
 def test_participants_who_lack_a_session_are_left_out():
-    own = retest_cohort(cohort("b 1", "b 2", "a 2", "a 1", "c 1"), least=2)
-    assert own.participants == ("a", "b")
-    assert list(own.left_out) == ["c 1"]
+    own = Retested(cohort("b 1", "b 2", "a 2", "a 1", "c 1", "d 1", "d 2"), LEAST)
+    assert own.participants == ["a", "b", "d"]
+    assert own.complete.tolist() == [True, True, True, True, False, True, True]
     # In the order of participants and sessions, whatever that of the visits.
     values = np.array([[1.0], [2.0], [20.0], [10.0]])
-    assert own.arrange(values, np.arange(4))[:, :, 0].tolist() == [[10, 20], [1, 2]]
-    assert np.isnan(own.arrange(values[:1], np.array([3]))[:, :, 0]).sum() == 3
+    assert own.arrange(values, np.arange(4))[:2, :, 0].tolist() == [[10, 20], [1, 2]]
+    alone = own.arrange(values[:1], np.array([3]))[:, :, 0]
+    assert (alone[0, 0], np.isnan(alone).sum()) == (1, 5)
 
 
 def test_too_few_with_all_sessions_are_refused():
     with pytest.raises(ModelError, match=r"1 \(2\), 2 \(1\).*--session-label"):
-        retest_cohort(cohort("a 1", "a 2", "b 1"), least=2)
+        Retested(cohort("a 1", "a 2", "b 1"), LEAST)
     with pytest.raises(ModelError, match="no second session"):
-        retest_cohort(cohort("a 1", "b 1"), least=2)
+        Retested(cohort("a 1", "b 1"), LEAST)

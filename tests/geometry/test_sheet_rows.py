@@ -6,8 +6,7 @@ from lapy import TriaMesh
 from scipy.spatial import cKDTree
 
 from hipsta_bids.geometry.fem import Laplace, bare_mesh
-from hipsta_bids.geometry.rows import hull, straighten_rows
-from hipsta_bids.geometry.sheet import sample_sheet
+from hipsta_bids.geometry.sheet import hull, sample_sheet, straighten_rows
 from hipsta_bids.settings import SheetSettings
 
 
