@@ -90,8 +90,6 @@ class SliceSettings(toml.SettingsTable):
 class TopologySettings(toml.SettingsTable):
     """Repair of holes, bridges, islands and cavities."""
 
-    rounds: NonNegativeInt = 12
-    """Most rounds of repair."""
     flag_cut_cost: NonNegativeFloat = 2.0
     """Flag a cut that overrules more evidence than this (sum of the field)."""
     flag_fill_cost: NonNegativeFloat = 8.0
@@ -178,8 +176,6 @@ class MeasureSettings(toml.SettingsTable):
     noise along the axis with the curvature across it."""
     max_curvature: PositiveFloat = 2.5
     """Principal curvatures are bounded by this, 1/mm: the working grid holds no sharper bend."""
-    repair_reach: PositiveFloat = 0.35
-    """A column is marked as repaired this near to a grid node that a repair changed, mm."""
 
     @model_validator(mode="after")
     def _windows_hold_the_order(self) -> Self:
@@ -272,8 +268,6 @@ class UncertaintySettings(toml.SettingsTable):
     rotation: Annotated[float, Field(ge=0, le=45)] = 5.0
     """Voxels are turned by up to this about each axis, degrees, and shifted by up to half of one:
     as if the body had lain elsewhere in the scanner."""
-    spacing: Annotated[float, Field(ge=0.1, le=1)] = 0.46
-    """Least ``grid.spacing`` of copies, mm: what all copies share cancels out, and time matters."""
 
 
 class SurrogateSettings(toml.SettingsTable):
@@ -281,10 +275,6 @@ class SurrogateSettings(toml.SettingsTable):
 
     positions: toml.OpenFractions = (0.5,)
     """Where the slices are, fractions of the body's length from its posterior end."""
-    pixel: Annotated[float, Field(ge=0.02, le=1)] = 0.1
-    """Edge of the pixels on which the slices are drawn, mm."""
-    smoothing: NonNegativeFloat = 0.4
-    """Standard deviation of the Gaussian that rounds the voxels' corners, in-plane voxels."""
 
 
 #: Settings of ``--method published``: what Diers et al. 2023 describe. Topology is repaired in any

@@ -81,7 +81,7 @@ def compare_body(body: ValidationBody) -> Compared:
     others, problems = [], []
     for position in POSITIONS:
         try:
-            even, steps = surrogate_profiles(merged, position, settings.sheet, settings.surrogate)
+            even, steps = surrogate_profiles(merged, position, settings.sheet)
         except GeometryError as error:
             problems.append(error.reason)
             continue

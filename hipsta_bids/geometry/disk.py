@@ -219,7 +219,7 @@ def find_edges(disk: Disk, medial: Float, lateral: Float, height: Float) -> Edge
         raise GeometryError(
             "the sheet has no medial or no lateral edge: check the labels of the subiculum, and of "
             "CA2 and CA3 beside the dentate gyrus",
-            reason="whole-edges",
+            reason="whole-topology",
         )
     arcs = [first, second]
     count = len(disk.loop)

@@ -19,11 +19,15 @@ from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.body import Body
 from hipsta_bids.geometry.digital import piece_sizes
 from hipsta_bids.geometry.grid import in_plane_voxel
-from hipsta_bids.settings import SheetSettings, SurrogateSettings
+from hipsta_bids.settings import SheetSettings
 from hipsta_bids.types import Bool, Float
 
 #: Distance of points in the equidistant sampling, mm.
 SAMPLING_STEP = 0.5
+#: Edge of the pixels on which slices are drawn, mm.
+PIXEL = 0.1
+#: SD of the Gaussian that rounds the voxels' corners, in-plane voxels.
+SMOOTHING = 0.4
 #: Standard deviation of the Gaussian that straightens the steps of the medial axis, mm.
 AXIS_SMOOTHING = 0.5
 #: Smaller holes in a slice are filled, mm2.
@@ -70,16 +74,16 @@ class _Slice:
 
 
 def surrogate_profiles(
-    body: Body, position: float, sheet: SheetSettings, settings: SurrogateSettings
+    body: Body, position: float, sheet: SheetSettings
 ) -> tuple[SurrogateProfile, SurrogateProfile]:
     """Measure thickness in one slice at points proportional and equidistant along its axis.
 
     Proportional points are those at which the sheet has its nodes along x.
     """
-    cut = draw_slice(body, position, settings)
-    axis = _from_medial(body, cut, _medial_axis(cut, position, settings))
+    cut = draw_slice(body, position)
+    axis = _from_medial(body, cut, _medial_axis(cut, position))
     first, second = (cKDTree(side) for side in _sides(cut, axis))
-    along = _path_lengths(axis, settings.pixel)
+    along = _path_lengths(axis, PIXEL)
     nodes = np.linspace(-sheet.x_extent, sheet.x_extent, sheet.x_nodes)
 
     def profile(sampling: str, distance: Float) -> SurrogateProfile:
@@ -90,7 +94,7 @@ def surrogate_profiles(
             fraction=distance / along[-1],
             distance=distance,
             points=cut.to_ras(index),
-            thickness=np.asarray(first.query(index)[0] + second.query(index)[0]) * settings.pixel,
+            thickness=np.asarray(first.query(index)[0] + second.query(index)[0]) * PIXEL,
         )
 
     return (
@@ -105,7 +109,7 @@ def _path_lengths(index: Float, pixel: float) -> Float:
     return np.append(0.0, steps.cumsum())
 
 
-def draw_slice(body: Body, position: float, settings: SurrogateSettings) -> _Slice:
+def draw_slice(body: Body, position: float) -> _Slice:
     """Draw the merged labels where a plane between the end planes cuts them.
 
     The plane rotates from the posterior to the anterior end plane as it moves along the body.
@@ -126,9 +130,9 @@ def draw_slice(body: Body, position: float, settings: SurrogateSettings) -> _Sli
     margin = 2.0  # mm, so that smoothing and contours end inside
     reach = flat @ directions.T
     low, high = reach.min(axis=0) - margin, reach.max(axis=0) + margin
-    shape = np.ceil((high - low) / settings.pixel).astype(int)
+    shape = np.ceil((high - low) / PIXEL).astype(int)
     origin = low @ directions + (flat[0] @ normal) * normal
-    steps = directions * settings.pixel
+    steps = directions * PIXEL
     to_voxel = np.linalg.inv(body.affine)
     values = ndimage.affine_transform(
         (body.tissue > 0).astype(np.float64),
@@ -137,11 +141,11 @@ def draw_slice(body: Body, position: float, settings: SurrogateSettings) -> _Sli
         output_shape=(*shape.tolist(), 1),
         order=1,
     )[..., 0]
-    sigma = settings.smoothing * in_plane_voxel(body.affine) / settings.pixel
+    sigma = SMOOTHING * in_plane_voxel(body.affine) / PIXEL
     values = ndimage.gaussian_filter(values, sigma)
     return _Slice(
         values=values,
-        inside=_one_piece(values > 0.5, position, settings),  # noqa: PLR2004 -- half inside
+        inside=_one_piece(values > 0.5, position),  # noqa: PLR2004 -- half inside
         origin=origin,
         directions=steps,
     )
@@ -150,11 +154,11 @@ def draw_slice(body: Body, position: float, settings: SurrogateSettings) -> _Sli
 def _empty(position: float) -> GeometryError:
     return GeometryError(
         f"no labels at {position:.0%} of the body's length: choose another slice",
-        reason="surrogate-empty",
+        reason="no-medial-axis",
     )
 
 
-def _one_piece(inside: Bool, position: float, settings: SurrogateSettings) -> Bool:
+def _one_piece(inside: Bool, position: float) -> Bool:
     """Take the largest piece, fill its small holes, and refuse others."""
     pieces, _ = ndimage.label(inside)
     if not inside.any():
@@ -162,19 +166,19 @@ def _one_piece(inside: Bool, position: float, settings: SurrogateSettings) -> Bo
     largest = pieces == piece_sizes(pieces).argmax()
     # Pixels that touch by corners only separate inside, and connect outside.
     outside, count = ndimage.label(~largest, structure=np.ones((3, 3)))
-    small = np.bincount(outside.ravel(), minlength=count + 1) * settings.pixel**2
+    small = np.bincount(outside.ravel(), minlength=count + 1) * PIXEL**2
     hole = small < HOLE_AREA
     hole[0] = False
     if count - hole.sum() > 1:
         raise GeometryError(
             f"the ribbon closes on itself at {position:.0%} of the body's length: choose another"
             " slice, or look for a bridge there",
-            reason="surrogate-loop",
+            reason="no-medial-axis",
         )
     return np.asarray(largest | hole[outside])
 
 
-def _medial_axis(cut: _Slice, position: float, settings: SurrogateSettings) -> Float:
+def _medial_axis(cut: _Slice, position: float) -> Float:
     """Find the smoothed longest path through the skeleton, extended to both edges, (N, 2)."""
     skeleton = skeletonize(cut.inside)  # type: ignore[no-untyped-call]
     pixels = np.argwhere(skeleton)
@@ -190,9 +194,9 @@ def _medial_axis(cut: _Slice, position: float, settings: SurrogateSettings) -> F
         raise GeometryError(
             f"the medial axis is no line at {position:.0%} of the body's length: choose another"
             " slice, or look at its labels",
-            reason="surrogate-short",
+            reason="no-medial-axis",
         )
-    sigma = AXIS_SMOOTHING / settings.pixel
+    sigma = AXIS_SMOOTHING / PIXEL
     smooth = ndimage.gaussian_filter1d(path, sigma, axis=0, mode="nearest")[trimmed]
     lag = min(max(int(2 * width), 2), len(smooth) - 1)
     start = _to_the_edge(cut, smooth[0], smooth[0] - smooth[lag])[::-1]

@@ -17,9 +17,13 @@ from scipy.spatial import cKDTree
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry import digital, membranes
 from hipsta_bids.geometry.grid import Field
-from hipsta_bids.settings import MeasureSettings, TopologySettings
+from hipsta_bids.settings import TopologySettings
 from hipsta_bids.types import Bool, Float, Sheet, position_text
 
+#: Most rounds of repair.
+ROUNDS = 12
+#: A column is marked as repaired this near to a grid node that a repair changed, mm.
+REPAIR_REACH = 0.35
 #: A column is marked as repaired up to this much farther from a cut than what is nearest to the
 #: cut, mm.
 STUMP_REACH = 0.7
@@ -124,7 +128,7 @@ def repair_topology(
 
     edits = _before_smoothing(field)
     edits += _remove_islands(state, field, locate) + _fill_cavities(state)
-    for _ in range(settings.rounds):
+    for _ in range(ROUNDS):
         wrong = [plates for plates in (False, True) if membranes.euler(state, plates=plates) != 1]
         if not wrong:
             break
@@ -390,7 +394,7 @@ def _consistent_values(values: NDArray[np.float32], after: Bool) -> NDArray[np.f
     return np.where(corners, ambiguous, result).astype(np.float32)
 
 
-def repaired_columns(sheet: Sheet, solid: SolidField, settings: MeasureSettings) -> Bool:
+def repaired_columns(sheet: Sheet, solid: SolidField) -> Bool:
     """Mark the columns (Nx, Ny) of the sheet that a repair of the topology touched.
 
     A column represents the sheet up to halfway to its neighbors, so that a repair between two
@@ -403,7 +407,7 @@ def repaired_columns(sheet: Sheet, solid: SolidField, settings: MeasureSettings)
     valid = np.asarray(np.isfinite(sheet.points).all(axis=(2, 3)))
     if not valid.any():
         return marked
-    nodes, radii = _changed_nodes(solid, sheet.points[valid].reshape(-1, 3), settings)
+    nodes, radii = _changed_nodes(solid, sheet.points[valid].reshape(-1, 3))
     gaps = np.stack([_gaps(sheet.points, axis) for axis in (0, 1)], axis=-1)
     # Most columns are far from all repairs: only the others are interpolated.
     reach = float(radii.max() + gaps[valid].max())
@@ -415,7 +419,7 @@ def repaired_columns(sheet: Sheet, solid: SolidField, settings: MeasureSettings)
     if not len(candidates):
         return marked
     widest = gaps[tuple(candidates.T)].max(axis=0)
-    parts = np.maximum(np.ceil(widest / settings.repair_reach), 1).astype(int)
+    parts = np.maximum(np.ceil(widest / REPAIR_REACH), 1).astype(int)
     dense = _cells(sheet.points, candidates, parts)
     defined = np.isfinite(dense).all(axis=-1)
     # A balanced tree takes longer to make than it saves.
@@ -436,9 +440,7 @@ def _gaps(points: Float, axis: int) -> Float:
     return np.asarray(np.maximum(before, after))
 
 
-def _changed_nodes(
-    solid: SolidField, points: Float, settings: MeasureSettings
-) -> tuple[Float, Float]:
+def _changed_nodes(solid: SolidField, points: Float) -> tuple[Float, Float]:
     """Points (N, 3), RAS mm, of changed nodes and faces of cuts, and the reach (N,) of each, mm."""
     box = digital.box_around(digital.positions(solid.touched))
     inside, touched = solid.field.values[box] > 0, solid.touched[box]
@@ -446,7 +448,7 @@ def _changed_nodes(
     cuts, _ = ndimage.label(faces & ~touched)
     low = digital.low_corner(box)
     changed = solid.field.grid.to_ras((digital.positions(touched) + low).astype(np.float64))
-    radius = np.full(len(changed), settings.repair_reach)
+    radius = np.full(len(changed), REPAIR_REACH)
     nodes = digital.positions(cuts > 0)
     if not len(nodes):
         return changed, radius

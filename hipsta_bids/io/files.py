@@ -232,13 +232,11 @@ def read_json(path: Path, limit: float = opening.TABLE) -> dict[str, Any]:
         if _HALF_LETTERS in text.lower():  # can be read, but not be written
             json.dumps(value, ensure_ascii=False).encode()
     except FileNotFoundError as error:
-        raise InputError(
-            f"{path}: no such file; check its name", reason="unreadable-json"
-        ) from error
+        raise InputError(f"{path}: no such file; check its name", reason="bad-json") from error
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(
             f"{path}: not readable as JSON ({error}); restore or delete it",
-            reason="unreadable-json",
+            reason="bad-json",
         ) from error
     if not isinstance(value, dict):
         raise InputError(f"{path}: not a JSON object; restore or delete it", reason="bad-json")

@@ -24,6 +24,7 @@ from hipsta_bids.geometry.catalog import (
     summarize,
 )
 from hipsta_bids.geometry.checks import (
+    add_consequence,
     check_cavities,
     check_cross_sections,
     check_end_labels,
@@ -32,19 +33,16 @@ from hipsta_bids.geometry.checks import (
     check_labels,
     check_thickness,
     check_voxels_across,
+    consequence_text,
     describe_uncus,
     find_contacts,
+    flag_margins,
     name_place,
     name_subfields,
+    raise_flags,
 )
 from hipsta_bids.geometry.completion import DOUBTFUL_CAVITY
 from hipsta_bids.geometry.fem import Laplace, volume_laplace
-from hipsta_bids.geometry.findings import (
-    add_consequence,
-    consequence_text,
-    flag_margins,
-    raise_flags,
-)
 from hipsta_bids.geometry.grid import Field, in_plane_voxel, resample_body
 from hipsta_bids.geometry.label_checks import check_label_image
 from hipsta_bids.geometry.measures import bending_angle, measure_thickness
@@ -119,7 +117,7 @@ class Evidence(Measured):
     @cached_property
     def repaired(self) -> Bool:
         """Columns (Nx, Ny) that a repair touched."""
-        return repaired_columns(self.sheet, self.solid, self.settings.measures)
+        return repaired_columns(self.sheet, self.solid)
 
 
 def find_all(evidence: Evidence) -> list[Finding]:

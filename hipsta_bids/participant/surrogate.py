@@ -66,9 +66,7 @@ def _measure(item: HemisphereInput, result: ResultPlace, settings: Settings) -> 
     rows: list[list[str]] = []
     lines = []
     for position in settings.surrogate.positions:
-        for profile in surrogate.surrogate_profiles(
-            body, position, settings.sheet, settings.surrogate
-        ):
+        for profile in surrogate.surrogate_profiles(body, position, settings.sheet):
             mesh = np.full(len(profile.points), np.nan)
             if sheet is not None:
                 mesh = surrogate.compare_nearby(profile.points, *sheet, MATCH_REACH)

@@ -29,10 +29,9 @@ from scipy.spatial.transform import Rotation
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.body import extract_body
 from hipsta_bids.geometry.catalog import measure_maps, summarize
-from hipsta_bids.geometry.checks import check_thickness
+from hipsta_bids.geometry.checks import check_thickness, raise_flags
 from hipsta_bids.geometry.digital import box, to_ras
 from hipsta_bids.geometry.ends import EndPlanes
-from hipsta_bids.geometry.findings import raise_flags
 from hipsta_bids.geometry.measures import pool_sd
 from hipsta_bids.geometry.sheet_checks import RIVAL_OFF
 from hipsta_bids.io.volumes import moved
@@ -44,6 +43,8 @@ from hipsta_bids.types import EditedMask, Finding, Float, GivenEnd, HemisphereMa
 
 _Codes = NDArray[np.int64]
 
+#: Least grid spacing of copies, mm: what all copies share cancels out, and time matters.
+COPY_SPACING = 0.46
 #: Copies without which no SD is told, and which make a mode.
 LEAST = 2
 POOLED = 3
@@ -134,7 +135,7 @@ def _measure(
     volume: LabelVolume, hemi: str, settings: Settings
 ) -> tuple[Mapping[str, Float], Mapping[str, float]]:
     """Measure maps and summary alone: no flags, cross-sections or layers."""
-    grid = {"spacing": max(settings.grid.spacing, settings.uncertainty.spacing)}
+    grid = {"spacing": max(settings.grid.spacing, COPY_SPACING)}
     if settings.body.region in EXPERIMENTAL:
         whole = measure_hemisphere(volume, hemi, settings.changed(grid=grid), _no_clock)
         return whole.maps, whole.summary
@@ -180,7 +181,7 @@ def find_modes(maps: Sequence[Float], settings: CheckSettings) -> Finding | None
     by_chance = (distance[~across] ** 2).mean() / 2 * (1 / counts).sum()
     rms = float(np.sqrt(max((difference**2).mean() - by_chance, 0.0)))
     return Finding(
-        reason="two-modes",
+        reason="second-choice",
         value=rms,
         limit=settings.flag_rival,
         text=f"perturbed copies of the labels have one of two maps ({counts[0]} and {counts[1]} "

@@ -18,7 +18,7 @@ from hipsta_bids import types
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry import catalog
 from hipsta_bids.geometry.body import Body, check_side
-from hipsta_bids.geometry.checks import name_place
+from hipsta_bids.geometry.checks import columns_near, flag_margins, name_place, raise_flags
 from hipsta_bids.geometry.digital import voxel_points
 from hipsta_bids.geometry.disk import (
     Disk,
@@ -42,7 +42,6 @@ from hipsta_bids.geometry.faces import (
     whole_tissue,
 )
 from hipsta_bids.geometry.fem import volume_laplace
-from hipsta_bids.geometry.findings import columns_near, flag_margins, raise_flags
 from hipsta_bids.geometry.measures import column_area, labels_at, measure_thickness
 from hipsta_bids.geometry.mesh import fill_surface, tetra_quality, triangle_areas, unique_edges
 from hipsta_bids.geometry.sheet import coordinates_at, fill_points, label_sheet, sheet_levels
@@ -214,7 +213,7 @@ def _check_pieces(disk: Disk) -> None:
         raise GeometryError(
             f"{disk.beside:.0%} of the mid-surface is apart from the rest: the two faces of the "
             "sheet cannot be told apart; look for missing dentate gyrus or molecular layer",
-            reason="whole-pieces",
+            reason="whole-topology",
         )
 
 
@@ -247,7 +246,7 @@ def _edges(
             raise GeometryError(
                 f"the {name} edge of the sheet is {length:.0f} mm long, {MIN_EDGE:g} mm are "
                 "needed: check the labels of the subiculum, CA2 and CA3",
-                reason="whole-edges",
+                reason="whole-topology",
             )
     return edges
 

@@ -20,7 +20,7 @@ import numpy as np
 
 from hipsta_bids.derivatives.hemisphere import read_sheet
 from hipsta_bids.errors import InputError
-from hipsta_bids.geometry.findings import FLAG_REACH, spread_over
+from hipsta_bids.geometry.checks import FLAG_REACH, spread_over
 from hipsta_bids.geometry.measures import layer_area, node_shares
 from hipsta_bids.reports.page import read_table
 from hipsta_bids.reports.results import Finding, Hemisphere

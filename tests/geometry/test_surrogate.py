@@ -27,9 +27,8 @@ def drawn(spec, hemi="L"):
     return phantom, extract_body(volume, SETTINGS.body)
 
 
-def profiles(body, position=0.5, **changes):
-    settings = SETTINGS.surrogate.changed(**changes)
-    return surrogate_profiles(body, position, SETTINGS.sheet, settings)
+def profiles(body, position=0.5):
+    return surrogate_profiles(body, position, SETTINGS.sheet)
 
 
 def spec(kind="spiral", **changes):
@@ -89,9 +88,11 @@ def test_samplings_are_proportional_and_equidistant(monkeypatch):
     assert even.distance[-1] / even.fraction[-1] == pytest.approx(20.0, abs=0.6)
 
 
-def test_the_pixels_hardly_matter():
+def test_the_pixels_hardly_matter(monkeypatch):
     _, body = drawn(spec(variation=0.3))
-    coarse, fine = (profiles(body, pixel=pixel)[0] for pixel in (0.1, 0.05))
+    coarse = profiles(body)[0]
+    monkeypatch.setattr(surrogate, "PIXEL", surrogate.PIXEL / 2)
+    fine = profiles(body)[0]
     assert np.abs(coarse.thickness - fine.thickness)[3:-3].mean() < 0.02  # mm, a fifth of a pixel
 
 
@@ -111,18 +112,18 @@ def test_small_holes_are_filled_and_loops_refused(monkeypatch):
     monkeypatch.setattr(surrogate, "HOLE_AREA", 0.1)
     with pytest.raises(GeometryError, match="closes on itself") as error:
         profiles(without(0.5))
-    assert error.value.reason == "surrogate-loop"
+    assert error.value.reason == "no-medial-axis"
 
 
 def test_slices_without_labels_or_without_a_line_are_refused(monkeypatch):
     _, body = drawn(spec())
     with pytest.raises(GeometryError) as error:
-        draw_slice(replace(body, tissue=np.zeros_like(body.tissue)), 0.5, SETTINGS.surrogate)
-    assert error.value.reason == "surrogate-empty"
+        draw_slice(replace(body, tissue=np.zeros_like(body.tissue)), 0.5)
+    assert error.value.reason == "no-medial-axis"
     monkeypatch.setattr(surrogate, "FORK_LENGTH", 6.0)
     with pytest.raises(GeometryError) as error:
         profiles(body)
-    assert error.value.reason == "surrogate-short"
+    assert error.value.reason == "no-medial-axis"
 
 
 def test_agreement_of_known_numbers():

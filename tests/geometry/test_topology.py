@@ -291,10 +291,11 @@ def test_a_body_that_vanishes_is_refused():
     assert caught.value.reason == "sheet-too-thin"
 
 
-def test_giving_up_is_an_error():
+def test_giving_up_is_an_error(monkeypatch):
+    monkeypatch.setattr(topology, "ROUNDS", 0)
     mask, *_ = with_hole()
     with pytest.raises(GeometryError, match="could not be repaired") as caught:
-        solid_of(field_of(mask), TopologySettings(rounds=0))
+        solid_of(field_of(mask), TOPOLOGY)
     assert caught.value.reason == "topology"
 
 

@@ -56,7 +56,7 @@ def make_solid(*, added=(), removed=(), stumps=()):
 
 
 def marked(solid, sheet=None):
-    found = repaired_columns(sheet or make_sheet(), solid, SETTINGS)
+    found = repaired_columns(sheet or make_sheet(), solid)
     return {tuple(column) for column in np.argwhere(found).tolist()}
 
 

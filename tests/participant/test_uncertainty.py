@@ -335,7 +335,7 @@ def test_modes_are_recorded_and_flag_a_map(drawn, monkeypatch):
     assert flagged.qc["uncertainty_modes"] == 2
     assert flagged.qc["uncertainty_modes_mm"] > Settings().checks.flag_rival
     (flag,) = set(flagged.flags) - set(maps.flags)
-    assert flag.reason == "two-modes"
+    assert flag.reason == "second-choice"
     assert "of the columns" in flag.message
     assert flagged.status == Status.FLAGGED
     alike = replace(spread, modes=replace(spread.modes, value=0.1))

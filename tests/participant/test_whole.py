@@ -120,7 +120,7 @@ def test_sheet_without_its_lateral_labels_is_refused() -> None:
     tissue[0, 0, 0] = Tissue.DENTATE_GYRUS
     with pytest.raises(GeometryError) as error:
         measure(replace(volume, tissue=tissue))
-    assert error.value.reason == "whole-edges"
+    assert error.value.reason == "whole-topology"
 
 
 def test_tail_without_subfields_is_refused() -> None:

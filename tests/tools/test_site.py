@@ -58,7 +58,7 @@ def test_docstrings_are_on_the_python_page(site):
 
 def test_pages_show_every_reason_and_setting(site):
     settings = (site / "settings.html").read_text(encoding="utf-8")
-    assert "<code>topology.rounds</code>" in settings
+    assert "<code>topology.flag_part</code>" in settings
     assert 'id="body-split"' in (site / "reasons.html").read_text(encoding="utf-8")
 
 

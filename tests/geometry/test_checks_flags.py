@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from sheet_cases import plates, sheet_of
 
-from hipsta_bids.geometry import findings
-from hipsta_bids.geometry.findings import (
+from hipsta_bids.geometry import checks
+from hipsta_bids.geometry.checks import (
     add_consequence,
     consequence_text,
     flag_margins,
@@ -48,7 +48,7 @@ def test_only_what_is_beyond_its_limit_becomes_a_flag():
 def test_a_flag_says_what_it_does_to_the_mean(size, monkeypatch):
     """Columns measure 0.3 x 0.4 mm: those within 0.05 mm of the finding are its own."""
     sheet, points = thicker(size)
-    monkeypatch.setattr(findings, "FLAG_REACH", 0.05)
+    monkeypatch.setattr(checks, "FLAG_REACH", 0.05)
     (flag,) = raise_flags([finding(points=points)], sheet, lambda at: f"P{len(at)}")
     assert flag.share == pytest.approx(15 / 861)
     mean = np.average(measure_thickness(sheet), weights=column_area(sheet))
@@ -64,7 +64,7 @@ def test_columns_are_concerned_within_the_reach(monkeypatch):
     sheet, points = thicker(0.0)
     shares = []
     for reach in (0.05, 0.35, 20.0):
-        monkeypatch.setattr(findings, "FLAG_REACH", reach)
+        monkeypatch.setattr(checks, "FLAG_REACH", reach)
         shares.append(add_consequence(finding(points=points), sheet).share)
     # 0.3 mm apart along x and 0.4 mm along y: one more column on both sides of each row.
     assert shares == pytest.approx([15 / 861, 21 / 861, 1.0])
@@ -72,7 +72,7 @@ def test_columns_are_concerned_within_the_reach(monkeypatch):
 
 def test_what_concerns_all_columns_or_none_says_so(monkeypatch):
     sheet, points = thicker(0.0)
-    monkeypatch.setattr(findings, "FLAG_REACH", 20.0)
+    monkeypatch.setattr(checks, "FLAG_REACH", 20.0)
     everywhere = add_consequence(finding(points=points), sheet)
     assert consequence_text(everywhere) == "; it concerns all columns"
     beside = add_consequence(finding(points=points + 50.0), sheet)
