@@ -11,19 +11,14 @@ import contextlib
 import os
 import re
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from hipsta_bids import opening
 from hipsta_bids.errors import HipstaError, InputError
 from hipsta_bids.inputs import scan, tree
-from hipsta_bids.inputs.selection import DESIGNS, Context, LabelFile
+from hipsta_bids.inputs.selection import DESIGNS, Context, LabelFile, Verdict
 from hipsta_bids.protocols.load import load_protocol
-
-NAME = re.compile(
-    r"(?P<hemi>[lr])h\.(?P<base>hippoAmygLabels|hippoSfLabels)(?P<analysis>.*?)"
-    r"(?:\.(?P<hierarchy>CA|FS60|HBT))?(?P<coarse>\.FSvoxelSpace)?\.(?:mgz|mgh|nii|nii\.gz)"
-)
 
 #: FreeSurfer 6.0, whose files have no hierarchies.
 _OLD = "hippoSfLabels"
@@ -42,72 +37,59 @@ _UNNAMED = "unnamed"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Analysis:
-    """One run of FreeSurfer's subfield segmentation, as its files' suffix says."""
+class Run:
+    """One run of FreeSurfer's subfield segmentation, as its files' suffix says, and its files."""
 
     scans: tuple[str, ...]
     """``("T1",)``, ``("T1", "T2")``, or nothing."""
     longitudinal: bool
     version: int | None
+    coarse: bool
+    old: bool
+    files: dict[str, Path] = field(default_factory=dict)
+    """By hierarchy."""
 
     @property
     def name(self) -> str:
         """As ``--fs-analysis`` takes it."""
         long = ["long"] if self.longitudinal else []
         version = [f"v{self.version}"] if self.version is not None else []
-        return ".".join([*(["-".join(self.scans)] if self.scans else []), *long, *version]) or (
-            _UNNAMED
-        )
+        scans = ["-".join(self.scans)] if self.scans else []
+        return ".".join([*scans, *long, *version]) or _UNNAMED
 
     @property
     def rank(self) -> tuple[object, ...]:
         """Order of preference: cross-sectional, most scans, T2 before T1, newest version."""
         scans = {0: 3, 1: 2 if self.scans == ("T1",) else 1}.get(len(self.scans), 0)
-        return self.longitudinal, scans, -(self.version or 0)
-
-    def answers(self, request: "Analysis") -> bool:
-        """Check whether this is the wanted analysis (of any version, if none is wanted)."""
-        return (
-            self.scans == request.scans
-            and self.longitudinal == request.longitudinal
-            and request.version in (None, self.version)
-        )
-
-
-def parse_analysis(text: str, *, longitudinal: bool = False) -> Analysis:
-    """Understand a suffix such as ``-T1-T2.v21`` or ``.long``, or a user's spelling of it."""
-    words = [word for word in re.split(r"[-._]", text) if word and word != _UNNAMED]
-    versions = [int(word[1:]) for word in words if re.fullmatch(r"v\d+", word)]
-    return Analysis(
-        scans=tuple(word for word in words if not re.fullmatch(r"long|v\d+", word)),
-        longitudinal=longitudinal or "long" in words,
-        version=versions[0] if versions else None,
-    )
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Run:
-    """The files of one analysis at one resolution, by hierarchy."""
-
-    analysis: Analysis
-    coarse: bool
-    old: bool
-    files: dict[str, Path]
-
-    @property
-    def longitudinal(self) -> bool:
-        return self.analysis.longitudinal
-
-    @property
-    def rank(self) -> tuple[object, ...]:
-        return self.coarse, self.analysis.rank, self.old, self.way is None
+        version = -(self.version or 0)
+        return self.coarse, self.longitudinal, scans, version, self.old, self.way is None
 
     @property
     def way(self) -> tuple[str, str | None, str] | None:
         """The best way to get subfields from these files."""
         have = self.files.keys()
-        ways = (way for way in _WAYS if {way[0], way[1] or way[0]} <= have)
-        return next(ways, None)
+        return next((way for way in _WAYS if {way[0], way[1] or way[0]} <= have), None)
+
+    def answers(self, request: "Run") -> bool:
+        """Check whether this is the wanted analysis (of any version, if none is wanted)."""
+        is_version = request.version in (None, self.version)
+        key = (self.scans, self.longitudinal)
+        return is_version and key == (request.scans, request.longitudinal)
+
+
+def parse_analysis(
+    text: str, *, longitudinal: bool = False, coarse: bool = False, old: bool = False
+) -> Run:
+    """Understand a suffix such as ``-T1-T2.v21`` or ``.long``, or a user's spelling of it."""
+    words = [word for word in re.split(r"[-._]", text) if word and word != _UNNAMED]
+    versions = [int(word[1:]) for word in words if re.fullmatch(r"v\d+", word)]
+    return Run(
+        scans=tuple(word for word in words if not re.fullmatch(r"long|v\d+", word)),
+        longitudinal=longitudinal or "long" in words,
+        version=versions[0] if versions else None,
+        coarse=coarse,
+        old=old,
+    )
 
 
 def same_labels(folders: Iterable[tree.SubjectFolder]) -> dict[str, HipstaError]:
@@ -146,37 +128,35 @@ def choose_run(
     matching = [
         run
         for run in runs
-        if (run.analysis.answers(request) if request else run.longitudinal == context.longitudinal)
+        if (run.answers(request) if request else run.longitudinal == context.longitudinal)
     ]
     best = next((run for run in matching if run.way), None)
     run = best or runs[0]
     subfields, parts, protocol = run.way or (next(iter(run.files)), None, "freesurfer")
     paths = [run.files[name] for name in (subfields, parts) if name]
     coarse = "only .FSvoxelSpace exists: labels resampled to 1 mm lose thin layers"
-    yield context.input(
-        hemi,
-        load_protocol("freesurferFS60" if run.old and run.way else protocol),
-        paths,
-        _why(run, subfields, parts, analysis),
+    verdict = Verdict(
+        protocol=load_protocol("freesurferFS60" if run.old and run.way else protocol),
         parts_protocol=load_protocol("freesurferHBT") if parts else None,
-        passed_over=_passed_over(runs, run, paths),
+        explanation=_why(run, subfields, parts, analysis),
         problem=None if best else _problem(runs, matching, analysis),
         notes=(coarse,) if best and run.coarse else (),
         provenance={
             "tool": "freesurfer",
             "version": _version(run),
-            "analysis": "-".join(run.analysis.scans) or _UNNAMED,
+            "analysis": "-".join(run.scans) or _UNNAMED,
             "hierarchy": "+".join(name for name in (subfields, parts) if name),
             "space": "FSvoxelSpace" if run.coarse else None,
             "design": DESIGNS[run.longitudinal],
         },
     )
+    yield context.input(hemi, verdict, paths, _passed_over(runs, run, paths))
 
 
-def _version(run: _Run) -> str | None:
+def _version(run: Run) -> str | None:
     """Read the version of the subfields in the file's name, or else that of FreeSurfer itself."""
-    if run.analysis.version is not None:
-        return f"v{run.analysis.version}"
+    if run.version is not None:
+        return f"v{run.version}"
     stamp = next(iter(run.files.values())).parent.parent / "scripts" / "build-stamp.txt"
     with contextlib.suppress(OSError, ValueError):
         match = re.search(r"\d+\.\d+(?:\.\d+)?", opening.read_text(stamp, opening.SETTINGS))
@@ -196,15 +176,18 @@ def is_longitudinal(files: Iterable[LabelFile]) -> bool:
     return len(sides[True]) > len(sides[False])
 
 
-def _runs(files: Iterable[LabelFile]) -> list[_Run]:
+def _runs(files: Iterable[LabelFile]) -> list[Run]:
     """Group a hemisphere's files by analysis and resolution, best first."""
-    runs: dict[tuple[object, ...], _Run] = {}
+    runs: dict[tuple[object, ...], Run] = {}
     for file in files:
         traits = file.traits
-        analysis = parse_analysis(traits["analysis"] or "", longitudinal=file.longitudinal)
-        coarse, old = traits["coarse"] is not None, traits["base"] == _OLD
-        key = (str(file.path.parent), analysis.name, coarse, old)
-        run = runs.setdefault(key, _Run(analysis=analysis, coarse=coarse, old=old, files={}))
+        run = parse_analysis(
+            traits["analysis"] or "",
+            longitudinal=file.longitudinal,
+            coarse=traits["coarse"] is not None,
+            old=traits["base"] == _OLD,
+        )
+        run = runs.setdefault((str(file.path.parent), run.name, run.coarse, run.old), run)
         # Of several formats, the first by name: .mgz before .nii.
         run.files.setdefault(traits["hierarchy"] or "full", file.path)
     return sorted(runs.values(), key=lambda run: run.rank)
@@ -218,20 +201,18 @@ def each_once(folders: tuple[tree.Folder, ...]) -> tuple[tree.Folder, ...]:
     return tuple(f for f in folders if not f.longitudinal or os.path.realpath(f.path) not in paths)
 
 
-def _why(run: _Run, subfields: str, parts: str | None, requested: str | None) -> str:
+def _why(run: Run, subfields: str, parts: str | None, requested: str | None) -> str:
     hierarchy = "full hierarchy" if subfields == "full" else f"subfields from .{subfields}"
     if run.old:
         hierarchy = "subfields of FreeSurfer 6.0"
     combined = f", head/body/tail from .{parts}" if parts else ""
     choice = " (--fs-analysis)" if requested else ""
-    return f"{hierarchy}{combined}, analysis {run.analysis.name}{choice}"
+    return f"{hierarchy}{combined}, analysis {run.name}{choice}"
 
 
-def _passed_over(
-    runs: list[_Run], best: _Run, used_paths: list[Path]
-) -> Iterator[tuple[Path, str]]:
+def _passed_over(runs: list[Run], best: Run, used_paths: list[Path]) -> Iterator[tuple[Path, str]]:
     for run in runs:
-        name = run.analysis.name
+        name = run.name
         for hierarchy, path in run.files.items():
             reason = f"analysis {name} comes later by default; --fs-analysis {name} selects it"
             if run.coarse and not best.coarse:
@@ -242,10 +223,10 @@ def _passed_over(
                 yield path, reason
 
 
-def _problem(runs: list[_Run], matching: list[_Run], requested: str | None) -> HipstaError:
+def _problem(runs: list[Run], matching: list[Run], requested: str | None) -> HipstaError:
     folder = next(iter(runs[0].files.values())).parent
     if requested and not matching:
-        names = ", ".join(dict.fromkeys(run.analysis.name for run in runs))
+        names = ", ".join(dict.fromkeys(run.name for run in runs))
         return InputError(
             f"{folder}: no analysis {requested} here (found {names}); change --fs-analysis",
             reason="analysis-missing",

@@ -3,6 +3,7 @@
 import csv
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import cache, lru_cache
 from pathlib import Path
 
@@ -152,7 +153,7 @@ def choose_described(
     """
     described = [(file, verdict) for file in files if (verdict := _describe(file, context))]
     groups: dict[str, list[tuple[LabelFile, Verdict]]] = {}
-    ranked = [(file.ranked(_rank(file, verdict)), verdict) for file, verdict in described]
+    ranked = [(replace(file, rank=_rank(file, verdict)), verdict) for file, verdict in described]
     for file, verdict in sorted(ranked, key=lambda pair: (pair[0].rank, pair[0].path.name)):
         name = "" if verdict.problem else verdict.protocol.name
         groups.setdefault(name, []).append((file, verdict))
@@ -207,16 +208,13 @@ def _choose(
         for key, label in {"sub": visit.subject, "ses": visit.session}.items()
         if label and best.traits.get(key, label) != label
     ]
-    return context.input(
-        hemi,
-        verdict.protocol,
-        [best.path],
-        "".join(verdict.explanation),
-        passed_over=[(file.path, order) for file, _ in group[1:]],
+    verdict = replace(
+        verdict,
         problem=problem,
         notes=(f"the file's name says {'_'.join(mismatches)}",) if mismatches else (),
         provenance=context.provenance(tool, best) | {"atlas": verdict.protocol.name},
     )
+    return context.input(hemi, verdict, [best.path], [(file.path, order) for file, _ in group[1:]])
 
 
 def _describe(file: LabelFile, context: Context) -> Verdict | None:
@@ -233,13 +231,13 @@ def _describe(file: LabelFile, context: Context) -> Verdict | None:
         protocol = table_protocol(table, _protocol_name(file, context)) if table else users
         if protocol is not None:
             origin = table.name if table else "--scheme"
-            return Verdict(protocol=protocol, explanation=("labels named by ", origin))
+            return Verdict(protocol=protocol, explanation=f"labels named by {origin}")
     except (InputError, ProtocolError) as error:
         if error.reason == "unclear-names":
             return None
         problem = error
     unknown = scan.unknown_protocol("unknown", f"Labels of {path.name}, not described")
-    return Verdict(protocol=unknown, explanation=("labels not described", ""), problem=problem)
+    return Verdict(protocol=unknown, explanation="labels not described", problem=problem)
 
 
 def _protocol_name(file: LabelFile, context: Context) -> str:

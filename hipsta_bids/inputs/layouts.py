@@ -1,18 +1,10 @@
-"""Layouts of programs that segment subfields: a row of data each, and functions for what differs.
-
-FreeSurfer writes ``mri/{lh,rh}.hippoAmygLabels*`` (see ``freesurfer``). ASHS writes
-``*_{left,right}_lfseg_{corr_usegray,corr_nogray,heur}.nii.gz`` to ``final/`` below the subject's
-folder or directly to it; the part of the name that it takes for the subject's ID is often wrong,
-so the folder decides. HippUnfold writes ``*_hemi-{L,R}_*desc-subfields*_dseg.nii.gz``; the order
-of entities differs between its versions 0 to 2. HSF writes
-``*_{left,right}_hippocampus_seg.nii.gz`` beside the image. NextBrain writes
-``seg.{left,right}.nii.gz`` (or ``seg_{left,right}.mgz``) beside a copy of its label table. MAGeT
-Brain writes both hemispheres to one file, ``*_label*.nii.gz``: others use such names too.
-"""
+"""Layouts of programs that segment subfields: rows of a table, functions for what is special."""
 
 import re
-from collections.abc import Callable, Iterable, Iterator
+import tomllib
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -29,21 +21,30 @@ def _named_protocol(layout: "Layout", file: LabelFile, context: Context, _: str)
     """Find the protocol of a program's file."""
     users = context.selection.protocol
     if users is not None and users.tool == layout.name:
-        explanation = (layout.title, f", protocol {users.name} from --scheme")
+        explanation = f"{layout.title}{file.remark}, protocol {users.name} from --scheme"
         return Verdict(protocol=users, explanation=explanation)
     protocols = map(load_protocol, protocol_names())
     fitting = [protocol for protocol in protocols if protocol.tool == layout.name]
     if len(fitting) == 1:
-        explanation = (layout.title, f", protocol {fitting[0].name}")
+        explanation = f"{layout.title}{file.remark}, protocol {fitting[0].name}"
         return Verdict(protocol=fitting[0], explanation=explanation)
     names = " or ".join(f"--scheme {each.name} ({each.title})" for each in fitting)
     return Verdict(
         protocol=scan.unknown_protocol(layout.name, f"{layout.title}, mode not given"),
-        explanation=(layout.title, ", mode not given"),
+        explanation=f"{layout.title}{file.remark}, mode not given",
         problem=ProtocolError(
             f"{file.path}: {layout.choice}; say which: {names}", reason="ambiguous-scheme"
         ),
     )
+
+
+def _t2_first(file: LabelFile, _: Context) -> tuple[Any, ...]:
+    """Rank T2-weighted images, which show the subfields, before others."""
+    return (int("T2w" not in file.path.name),)
+
+
+def _t2_reason(file: LabelFile, _: LabelFile) -> str:
+    return "T2w comes first" if file.rank[0] else "as good as the first one"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,15 +62,15 @@ class Layout:
     """Of its names. A group ``hemi`` is the side, and there is none for both."""
     bids: bool = True
     """Names have BIDS' entities, by which a filter file selects."""
-    rank: Callable[[LabelFile, Context], tuple[Any, ...]] = lambda _, __: ()
+    rank: Callable[[LabelFile, Context], tuple[Any, ...]] = _t2_first
     """Order of preference, the least first; equal ones are not chosen between."""
-    reason: Callable[[LabelFile, LabelFile], str] = lambda _, __: ""
+    reason: Callable[[LabelFile, LabelFile], str] = _t2_reason
     """Why a file is passed over for the best one."""
     protocol: Callable[["Layout", LabelFile, Context, str], Verdict] = _named_protocol
     """Which protocol the best file has."""
     choose: Callable[[list[LabelFile], Context, str], Iterable[scan.HemisphereInput]] | None = None
     """Where more than one file matters: which, and how."""
-    beside: frozenset[str] = frozenset()
+    beside: Sequence[str] = ()
     """Files of which one lies beside those of the program; none are needed if empty."""
     distinct: bool = True
     """No other program uses such names; else the user or the dataset has to name this one."""
@@ -108,7 +109,7 @@ class Layout:
         )
         files = []
         for folder in freesurfer.each_once(context.visit.folders):
-            marked = not self.beside or not self.beside.isdisjoint(folder.names)
+            marked = not self.beside or any(name in folder.names for name in self.beside)
             if not (named or (self.distinct and marked)):
                 continue
             for name in [name for name in folder.names if self.mark in name]:
@@ -124,7 +125,7 @@ class Layout:
                 )
                 files.append((self.rank(file, context), str(path), file))
         files.sort(key=lambda entry: entry[:2])
-        return [file.ranked(rank) for rank, _, file in files]
+        return [replace(file, rank=rank) for rank, _, file in files]
 
 
 def find(layout: Layout, context: Context) -> Iterator[scan.HemisphereInput]:
@@ -147,18 +148,13 @@ def _best(
     """Take the first file of a hemisphere, unless another one is as good."""
     best = files[0]
     verdict = layout.protocol(layout, best, context, hemi)
-    note = ", both hemispheres in one file" if best.hemi is None else ""
-    return context.input(
-        hemi,
-        verdict.protocol,
-        [best.path],
-        note.join(verdict.explanation),
-        bilateral=best.hemi is None,
-        passed_over=[(file.path, layout.reason(file, best)) for file in files[1:]],
+    verdict = replace(
+        verdict,
         problem=rivals_problem(files) or verdict.problem,
-        notes=verdict.notes,
         provenance=context.provenance(layout.name, best) | verdict.provenance,
     )
+    passed_over = [(file.path, layout.reason(file, best)) for file in files[1:]]
+    return context.input(hemi, verdict, [best.path], passed_over, bilateral=best.hemi is None)
 
 
 def volume_table(path: Path, name: str) -> Path | None:
@@ -166,18 +162,6 @@ def volume_table(path: Path, name: str) -> Path | None:
     layout = _BY_NAME[name]
     match = layout.pattern.fullmatch(path.name)
     return None if match is None else path.with_name(layout.volumes.format(**match.groupdict()))
-
-
-# Programs of which a T2-weighted image comes first
-
-
-def _t2_first(file: LabelFile, _: Context) -> tuple[Any, ...]:
-    """Rank T2-weighted images, which show the subfields, before others."""
-    return (int("T2w" not in file.path.name),)
-
-
-def _t2_reason(file: LabelFile, _: LabelFile) -> str:
-    return "T2w comes first" if file.rank[0] else "as good as the first one"
 
 
 # What HippUnfold writes differs by space and atlas.
@@ -239,7 +223,7 @@ def _unfold_protocol(layout: Layout, file: LabelFile, context: Context, _: str) 
     note = "labels on the image's own grid, which may be coarse; no space-crop* file exists"
     return Verdict(
         protocol=users or load_protocol(layout.name),
-        explanation=(f"space {_space(file) or 'not named'}, atlas {atlas or 'not named'}", ""),
+        explanation=f"space {_space(file) or 'not named'}, atlas {atlas or 'not named'}",
         problem=problem,
         notes=() if _cropped(file) else (note,),
     )
@@ -281,10 +265,9 @@ def _ashs_protocol(_: Layout, file: LabelFile, context: Context, hemi: str) -> V
             "TOML file",
             reason="unknown-hemisphere",
         )
-    explanations = (file.traits["kind"] or "", f"; {explanation}")
     return Verdict(
         protocol=protocol,
-        explanation=explanations,
+        explanation=f"{file.traits['kind']}{file.remark}; {explanation}",
         problem=problem,
         provenance={"atlas": protocol.name},
     )
@@ -311,87 +294,21 @@ def atlas_finder(context: Context) -> ashs.AtlasFinder:
     return ashs.AtlasFinder(root, context.atlas, sample)
 
 
-#: All layouts, in the order in which they are looked for.
-LAYOUTS = (
-    Layout(
-        name="freesurfer",
-        title="FreeSurfer",
-        kind="freesurfer",
-        mark=".hippo",
-        pattern=freesurfer.NAME,
-        bids=False,
-        choose=freesurfer.choose_run,
-        volumes="{hemi}h.hippoSfVolumes{analysis}.txt",
-    ),
-    Layout(
-        name="ashs",
-        title="ASHS",
-        kind="ashs",
-        mark="lfseg",
-        pattern=re.compile(
-            r"(?P<stem>(?:.*_)?(?P<hemi>(?i:left|right))|.*?)_?"
-            r"lfseg_(?P<kind>corr_usegray|corr_nogray|heur)\.nii(?:\.gz)?"
-        ),
-        bids=False,
-        rank=_ashs_rank,
-        reason=_ashs_reason,
-        protocol=_ashs_protocol,
-        volumes="{stem}_{kind}_volumes.txt",
-    ),
-    Layout(
-        name="hippunfold",
-        title="HippUnfold",
-        kind="hippunfold",
-        mark="desc-subfields",
-        pattern=re.compile(
-            r"(?=.*_hemi-(?P<hemi>[LR])_)(?=.*_desc-subfields_)(?!.*_label-(?!hipp_))"
-            r".+_dseg\.nii(?:\.gz)?"
-        ),
-        rank=_unfold_rank,
-        reason=_unfold_reason,
-        protocol=_unfold_protocol,
-        generators=True,
-    ),
-    Layout(
-        name="hsf",
-        title="HSF",
-        mark="_hippocampus_seg",
-        pattern=re.compile(r".+_(?P<hemi>left|right)_hippocampus_seg\.nii(?:\.gz)?"),
-        rank=_t2_first,
-        reason=_t2_reason,
-        choice="HSF's codes depend on its ca_mode, which the file does not tell",
-    ),
-    Layout(
-        name="maget",
-        title="MAGeT Brain",
-        mark="_label",
-        pattern=re.compile(r".+_labels?(?:_\w+)?\.(?:nii|nii\.gz|mgz)"),
-        rank=_t2_first,
-        reason=_t2_reason,
-        distinct=False,
-    ),
-    Layout(
-        name="nextbrain",
-        title="NextBrain",
-        mark="seg",
-        pattern=re.compile(r"seg[._](?P<hemi>left|right)\.(?:nii\.gz|nii|mgz)"),
-        rank=_t2_first,
-        reason=_t2_reason,
-        beside=frozenset({"lut.txt", "lookup_table.txt"}),
-    ),
-    Layout(
-        name="named",
-        title="BIDS",
-        kind="named",
-        mark="dseg.",
-        pattern=re.compile(
-            r"(?=.*_hemi-(?P<hemi>[LR])_)(?!.*_desc-edited_).+_dseg\.(?:nii|nii\.gz|mgz|mgh)"
-        ),
-        choose=generic.choose_described,
-        unless="hippunfold",
-    ),
-)
-_BY_NAME = {layout.name: layout for layout in LAYOUTS}
+#: What programs do in ways of their own.
+_SPECIAL: dict[str, dict[str, Any]] = {
+    "freesurfer": {"choose": freesurfer.choose_run},
+    "ashs": {"rank": _ashs_rank, "reason": _ashs_reason, "protocol": _ashs_protocol},
+    "hippunfold": {"rank": _unfold_rank, "reason": _unfold_reason, "protocol": _unfold_protocol},
+    "named": {"choose": generic.choose_described},
+}
+
+_BY_NAME = {
+    name: Layout(name=name, pattern=re.compile(row.pop("pattern")), **row, **_SPECIAL.get(name, {}))
+    for name, row in tomllib.loads(
+        (resources.files("hipsta_bids.inputs") / "layouts.toml").read_text("utf-8")
+    ).items()
+}
+LAYOUTS = tuple(_BY_NAME.values())
 
 #: What all names of labels have in part.
 _MARKS = re.compile("|".join(re.escape(layout.mark) for layout in LAYOUTS))

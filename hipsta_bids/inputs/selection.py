@@ -5,7 +5,7 @@ import json
 import os
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -104,9 +104,10 @@ class LabelFile:
     rank: tuple[Any, ...] = ()
     """Order of preference, the least first."""
 
-    def ranked(self, rank: tuple[Any, ...]) -> "LabelFile":
-        """Return this file with its rank."""
-        return replace(self, rank=rank)
+    @property
+    def remark(self) -> str:
+        """For the explanation, where the file is one of both hemispheres."""
+        return "" if self.hemi else ", both hemispheres in one file"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,8 +115,8 @@ class Verdict:
     """Which protocol a file has, and why."""
 
     protocol: Protocol
-    explanation: tuple[str, str]
-    """Before and after a remark about the hemispheres in the file."""
+    parts_protocol: Protocol | None = None
+    explanation: str
     problem: HipstaError | None = None
     notes: tuple[str, ...] = ()
     provenance: dict[str, str | None] = field(default_factory=dict)
@@ -138,36 +139,31 @@ class Context:
     def input(
         self,
         hemi: str,
-        protocol: Protocol,
+        verdict: Verdict,
         paths: Sequence[Path],
-        explanation: str,
+        passed_over: Iterable[tuple[Path, str]],
         *,
-        parts_protocol: Protocol | None = None,
         bilateral: bool = False,
-        passed_over: Iterable[tuple[Path, str]] = (),
-        problem: HipstaError | None = None,
-        notes: tuple[str, ...] = (),
-        provenance: Mapping[str, str | None],
     ) -> scan.HemisphereInput:
         """Make the input of one hemisphere of the visit."""
         return scan.HemisphereInput(
             subject=self.visit.subject,
             session=self.visit.session,
             hemi=hemi,
-            protocol=protocol,
+            protocol=verdict.protocol,
             files=tuple(paths),
-            parts_protocol=parts_protocol,
+            parts_protocol=verdict.parts_protocol,
             bilateral=bilateral,
             source=self.source.name,
             source_path=self.source.path,
-            explanation=explanation,
+            explanation=verdict.explanation,
             passed_over=tuple(
                 (path.name if path.parent == paths[0].parent else str(path), reason)
                 for path, reason in passed_over
             ),
-            problem=problem,
-            notes=notes,
-            provenance={key: text for key, text in provenance.items() if text},
+            problem=verdict.problem,
+            notes=verdict.notes,
+            provenance={key: text for key, text in verdict.provenance.items() if text},
         )
 
     def provenance(self, tool: str, file: LabelFile) -> dict[str, str | None]:
