@@ -19,7 +19,7 @@ _SYSTEM = ("/proc/", "/sys/", "/dev/")
 _POINTERS = (b"/annex/objects/", b"version https://git-lfs.github.com/")
 
 #: Pointers are not larger than this, bytes.
-POINTER_SIZE = 1024
+_POINTER_SIZE = 1024
 
 
 class UnfitFileError(OSError):
@@ -30,9 +30,11 @@ class UnfitFileError(OSError):
 
 
 def not_fetched(path: Path) -> str | None:
-    """Tell what to do if the content of a file is elsewhere: DataLad's and Git LFS' pointers."""
+    """Tell what to do if the content of a file is elsewhere; links and small files are opened."""
     try:
-        open_regular(path).close()
+        status = path.lstat()
+        if stat.S_ISLNK(status.st_mode) or 0 < status.st_size < _POINTER_SIZE:
+            open_regular(path).close()
     except OSError as error:
         return error.strerror if error.errno == errno.ENODATA else None
     return None
@@ -50,7 +52,7 @@ def open_regular(path: Path) -> BufferedReader:
             raise fetch from None
         raise
     status = os.fstat(file.fileno())
-    is_pointer = 0 < status.st_size < POINTER_SIZE and file.peek(1).startswith(_POINTERS)
+    is_pointer = 0 < status.st_size < _POINTER_SIZE and file.peek(1).startswith(_POINTERS)
     # Files of the system say that they are empty.
     is_system = not status.st_size and os.path.realpath(path).startswith(_SYSTEM)
     if not stat.S_ISREG(status.st_mode) or is_system or is_pointer:

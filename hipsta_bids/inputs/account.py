@@ -16,7 +16,7 @@ from hipsta_bids.inputs.generic import find_table
 from hipsta_bids.inputs.layouts import layout_of
 from hipsta_bids.inputs.scan import HemisphereInput
 from hipsta_bids.inputs.selection import Context
-from hipsta_bids.io.files import hide_home
+from hipsta_bids.io.files import MISSING, hide_home
 
 Owner = tree.Ignored | HemisphereInput
 
@@ -33,20 +33,19 @@ _DEPTH, _MOST_ENTRIES = 5, 3000
 
 
 def selection_table(items: Iterable[HemisphereInput]) -> list[dict[str, str]]:
-    """Describe what was found and reason, one row per hemisphere and protocol."""
+    """Describe what was found and why, one row per hemisphere and protocol."""
     return [
         {
             "subject": item.subject,
-            "session": item.session or "n/a",
+            "session": item.session or MISSING,
             "hemisphere": item.hemi,
             "file": " + ".join(_relative(path, item.source_path) for path in item.files),
             "scheme": item.protocol.name,
             "why": "; ".join((f"{item.source}: {item.explanation}", *item.notes))
             + (f"; NOT USABLE: {item.problem}" if item.problem else ""),
             "edited": " + ".join(_relative(edit.path, edit.source_path) for edit in item.edits)
-            or "n/a",
-            "passed over": "; ".join(f"{name}: {reason}" for name, reason in item.passed_over)
-            or "n/a",
+            or MISSING,
+            "passed over": "; ".join(map(": ".join, item.passed_over)) or MISSING,
         }
         for item in items
     ]
@@ -55,11 +54,8 @@ def selection_table(items: Iterable[HemisphereInput]) -> list[dict[str, str]]:
 def ignored_table(ignored: Iterable[tree.Ignored]) -> list[dict[str, str]]:
     """Describe what was not used, one row per folder."""
     return [
-        {
-            "not used": f"{entry.path} hemi-{entry.hemi}" if entry.hemi else str(entry.path),
-            "why": entry.reason,
-        }
-        for entry in ignored
+        {"not used": " hemi-".join(filter(None, (str(e.path), e.hemi))), "why": e.reason}
+        for e in ignored
     ]
 
 
@@ -68,9 +64,9 @@ def other_entries_table(other_entries: Iterable[tree.Ignored]) -> list[dict[str,
 
     All have a row of their own in ``inputs.tsv``.
     """
-    other_entries = [entry for entry in other_entries if entry.status == tree.NO_SEGMENTATION]
-    inner = Counter(entry.path.parent for entry in other_entries if entry.subject)
-    rows = {str(e.path): e.reason for e in other_entries if not e.subject}
+    entries = [entry for entry in other_entries if entry.template]
+    inner = Counter(entry.path.parent for entry in entries if entry.subject)
+    rows = {str(entry.path): entry.reason for entry in entries if not entry.subject}
     rows |= {f"{path}/*/*": f"in the folders of {n} visits" for path, n in inner.items()}
     return [{"not a segmentation": path, "why": reason} for path, reason in rows.items()]
 
@@ -80,33 +76,25 @@ def input_table(
 ) -> list[dict[str, str]]:
     """Account for all that a search found, one row per hemisphere, file or folder."""
 
-    def row(
-        path: Path, visit: tree.Ignored | HemisphereInput, status: str, reason: str
-    ) -> dict[str, str]:
-        cells = {
-            "path": hide_home(_relative(path, bids_dir)),
-            "status": status,
-            "reason": hide_home(reason),
+    def row(path: Path, visit: Owner, status: str, reason: str) -> dict[str, str]:
+        labels = {"subject": visit.subject, "session": visit.session, "hemi": visit.hemi}
+        place = hide_home(_relative(path, bids_dir))
+        return {"path": place, "status": status, "reason": hide_home(reason)} | {
+            key: {"subject": "sub-", "session": "ses-"}.get(key, "") + label
+            for key, label in labels.items()
+            if label
         }
-        if visit.subject:
-            cells["subject"] = f"sub-{visit.subject}"
-        if visit.session:
-            cells["session"] = f"ses-{visit.session}"
-        return cells | ({"hemi": visit.hemi} if visit.hemi else {})
 
     rows = []
     for item in items:
-        status, reason = (
-            (tree.FAILED, str(item.problem)) if item.problem else (tree.IS_USED, item.explanation)
-        )
-        of_item = [item.origin | row(item.files[0], item, status, reason)]
-        beside = "head, body and tail of the same labels"
-        of_item += [row(path, item, status, beside) for path in item.files[1:]]
-        of_item += [
-            # An absolute path replaces the folder.
-            row(item.files[0].parent / name, item, tree.NOT_USED, reason)
-            for name, reason in item.passed_over
-        ]
+        status = tree.FAILED if item.problem else tree.IS_USED
+        main, *parts = item.files
+        reasons = [(main, status, str(item.problem or item.explanation))]
+        reasons += [(path, status, "head, body and tail of the same labels") for path in parts]
+        # An absolute path replaces the folder.
+        reasons += [(main.parent / name, tree.NOT_USED, why) for name, why in item.passed_over]
+        of_item = [row(path, item, *reason) for path, *reason in reasons]
+        of_item[0] = item.origin | of_item[0]
         rows += [cells | {"seg": item.protocol.name} for cells in of_item]
     return rows + [row(entry.path, entry, entry.status, entry.reason) for entry in unused]
 
@@ -127,10 +115,9 @@ def looked_into(entry: tree.Ignored) -> tree.Ignored:
     name = _first_labels(entry.path)
     if name is None:
         return entry
-    reason = "labels, but in no subject's folder"
-    if name:
-        reason = f"labels in it ({name}), but it is no subject's by its name"
-    reason += "; --participants-map FILE says entry_of folders are"
+    reason = f"labels in it ({name}), but it is no subject's by its name"
+    reason = reason if name else "labels, but in no subject's folder"
+    reason += "; --participants-map FILE says whose folders are"
     return replace(entry, reason=reason, status=tree.NOT_USED, quiet=False)
 
 
@@ -174,21 +161,17 @@ def unused_of_visit(
     sides = {item.hemi for item in items}
     for hemi in context.selection.wanted_hemis() if sides else ():
         if hemi not in sides:
-            path = items[0].files[0].parent
-            yield entry_of(
-                path=path, hemi=hemi, reason="no labels of this hemisphere, but of the other"
-            )
+            reason = "no labels of this hemisphere, but of the other"
+            yield entry_of(path=items[0].files[0].parent, hemi=hemi, reason=reason)
     if not has_labels and explain | bool(visit.session):
         yield _without_labels(context, entry_of)
     elif n_other:
         reason = f"{n_other} other files beside the labels"
-        yield replace(
-            tree.no_segmentation(top, reason), subject=visit.subject, session=visit.session
-        )
+        yield entry_of(path=top, reason=reason, status=tree.NO_SEGMENTATION, quiet=True)
 
 
 def _inner_reason(folder: Path, name: str) -> str:
-    """Tell reason a folder inside of a subject's is not searched, if somebody may miss it."""
+    """Tell why a folder inside of a subject's is not searched, if somebody may miss it."""
     if layout_of(name):
         return "a folder, though it is named as labels are"
     if name in _OTHER_FOLDERS or tree.is_inner(name):
@@ -198,7 +181,7 @@ def _inner_reason(folder: Path, name: str) -> str:
 
 
 def _why_not(path: Path, context: Context) -> tuple[str, bool]:
-    """Explain reason a file with a name of labels was not taken, and whether nobody misses it."""
+    """Explain why a file with a name of labels was not taken, and whether nobody misses it."""
     layout = layout_of(path.name)
     if layout is None:
         raise ValueError(path.name)
@@ -218,7 +201,7 @@ def _why_not(path: Path, context: Context) -> tuple[str, bool]:
 
 
 def _without_labels(context: Context, entry_of: Callable[..., tree.Ignored]) -> tree.Ignored:
-    """Explain reason a visit has no labels."""
+    """Explain why a visit has no labels."""
     folders = context.visit.folders
     inner = {name for folder in folders for name in folder.inner}
     top = next((folder.path for folder in folders if folder.path.name == "mri"), None)
@@ -226,10 +209,8 @@ def _without_labels(context: Context, entry_of: Callable[..., tree.Ignored]) -> 
         return entry_of(path=top.parent, reason="its mri folder holds no hippocampal subfields")
     path = folders[0].path
     if not inner.isdisjoint({"final", "bootstrap", "multiatlas"}):
-        reason = "ASHS has not finished: no labels in final/"
-        if "final" in inner:
-            reason = "ASHS has not finished: final/ holds no labels"
-        return entry_of(path=path, reason=reason)
+        reason = "final/ holds no labels" if "final" in inner else "no labels in final/"
+        return entry_of(path=path, reason=f"ASHS has not finished: {reason}")
     quiet = not context.source.explicit
     status = tree.NO_SEGMENTATION if quiet else tree.NOT_USED
     return entry_of(path=path, reason="no labels of subfields in it", status=status, quiet=quiet)

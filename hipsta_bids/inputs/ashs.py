@@ -1,7 +1,7 @@
 """Which atlas ASHS's segmentations were made with: atlases use the same codes for other regions."""
 
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from functools import cached_property
 from pathlib import Path
 
@@ -9,7 +9,7 @@ from hipsta_bids.errors import HipstaError, InputError, ProtocolError
 from hipsta_bids.inputs import scan
 from hipsta_bids.inputs.generic import find_table, read_table, table_protocol
 from hipsta_bids.inputs.labels import label_values
-from hipsta_bids.inputs.selection import measurable
+from hipsta_bids.inputs.selection import LabelFile, Verdict, measurable
 from hipsta_bids.protocols.load import agrees, load_protocol, protocol_names
 from hipsta_bids.protocols.protocol import Protocol, Tissue
 
@@ -58,19 +58,35 @@ class AtlasFinder:
         self._values: dict[Image, frozenset[int]] = {}
         self._tables: dict[Path, Protocol] = {}
 
-    def identify(self, image: Image) -> tuple[Protocol, str, HipstaError | None]:
-        """Identify one file's atlas: the protocol, why this one, and what is wrong."""
-        if self._option is not None:
-            return self._option, "atlas from --ashs-atlas", None
+    def identify(self, file: LabelFile, hemi: str) -> Verdict:
+        """Identify one file's atlas; a file of both hemispheres takes one that tells them apart."""
+        image = (file.path, hemi, file.hemi is None)
+        problem: HipstaError | None = None
         try:
-            table = find_table(image[0], self._root)
-            if table is not None:
-                return self._from_table(table), f"atlas from {table.name}", None
-            return *self._from_values(image), None
-        except (ProtocolError, InputError) as found:
-            problem = self._without_subfields(image) or found
-            unknown = scan.unknown_protocol(_TOOL, "ASHS, atlas not identified")
-            return unknown, "atlas not identified", problem
+            protocol, explanation = self._atlas_of(image)
+            if file.hemi is None and not protocol.offset:
+                problem = InputError(
+                    f"{file.path}: neither left nor right is in its name, and the protocol "
+                    f"{protocol.name} does not say how the hemispheres differ; set right_offset in "
+                    "its TOML file",
+                    reason="unknown-hemisphere",
+                )
+        except (ProtocolError, InputError) as error:
+            protocol = scan.unknown_protocol(_TOOL, "ASHS, atlas not identified")
+            explanation, problem = "atlas not identified", self._without_subfields(image) or error
+        return Verdict(
+            protocol=protocol,
+            explanation=f"{file.traits['kind']}{file.remark}; {explanation}",
+            problem=problem,
+            provenance={"atlas": protocol.name},
+        )
+
+    def _atlas_of(self, image: Image) -> tuple[Protocol, str]:
+        if self._option is not None:
+            return self._option, "atlas from --ashs-atlas"
+        if table := find_table(image[0], self._root):
+            return self._from_table(table), f"atlas from {table.name}"
+        return self._from_values(image)
 
     def _from_table(self, path: Path) -> Protocol:
         if path not in self._tables:
@@ -83,32 +99,30 @@ class AtlasFinder:
 
     def _from_values(self, image: Image) -> tuple[Protocol, str]:
         shared, count = self._shared
+        others = f"{count} other file{'' if count == 1 else 's'} of the dataset"
         if shared and image not in self._values:
             # Not opened here; reading it later will fail if its values do not fit.
-            return shared[0], f"atlas from the labels of {_others(count)}{_or_another(shared)}"
+            return _first(shared, f"atlas from the labels of {others}")
         fitting = self._fitting(image)
         if len(fitting) == 1:
             return fitting[0], "only this atlas has such labels"
         left = [protocol for protocol in shared if protocol in fitting]
         if left and len(left) < len(fitting):
-            fitting_text = "this one" if len(left) == 1 else _names(left)
-            difference = f"those of {_others(count)} only {fitting_text}"
-            return left[0], f"its labels fit {_names(fitting)}, {difference}{_or_another(left)}"
+            only = "this one" if len(left) == 1 else _names(left)
+            return _first(left, f"its labels fit {_names(fitting)}, those of {others} only {only}")
         if _one_body(fitting):
-            return fitting[0], f"its labels fit {_names(fitting)}{_or_another(fitting)}"
+            return _first(fitting, f"its labels fit {_names(fitting)}")
         values = ", ".join(map(str, sorted(self._read(image))))
-        if fitting:
-            raise ProtocolError(
-                f"{image[0]}: labels {values} fit {_names(fitting)}; "
-                "say which atlas was used with --ashs-atlas",
-                reason="ambiguous-atlas",
+        text = (
+            f"{_names(fitting)}; say which atlas was used with --ashs-atlas"
+            if fitting
+            else (
+                f"no bundled ASHS atlas ({_names(_protocols())}); "
+                "describe them in a TOML file and give it to --ashs-atlas"
             )
-        raise ProtocolError(
-            f"{image[0]}: labels {values} fit no bundled ASHS atlas "
-            f"({_names(list(_protocols()))}); describe them in a TOML file and give it to "
-            "--ashs-atlas",
-            reason="unknown-atlas",
         )
+        reason = "ambiguous-atlas" if fitting else "unknown-atlas"
+        raise ProtocolError(f"{image[0]}: labels {values} fit {text}", reason=reason)
 
     @cached_property
     def _shared(self) -> tuple[list[Protocol], int]:
@@ -160,18 +174,15 @@ def _plain(name: str) -> str:
     return re.sub("[^a-z0-9]", "", name.lower())
 
 
-def _others(count: int) -> str:
-    return f"{count} other file{'' if count == 1 else 's'} of the dataset"
-
-
-def _names(protocols: list[Protocol]) -> str:
+def _names(protocols: Sequence[Protocol]) -> str:
     *leading_names, last = (protocol.name for protocol in protocols)
     return f"{', '.join(leading_names)} and {last}" if leading_names else last
 
 
-def _or_another(protocols: list[Protocol]) -> str:
-    """Say what to do if several protocols with the same body are possible."""
-    return "; the body is the same, --ashs-atlas names the other" if len(protocols) > 1 else ""
+def _first(protocols: Sequence[Protocol], text: str) -> tuple[Protocol, str]:
+    """Take the first of the protocols that are possible, all with the same body."""
+    other = "; the body is the same, --ashs-atlas names the other" if len(protocols) > 1 else ""
+    return protocols[0], text + other
 
 
 def _one_body(protocols: list[Protocol]) -> bool:

@@ -92,27 +92,6 @@ def parse_analysis(
     )
 
 
-def same_labels(folders: Iterable[tree.SubjectFolder]) -> dict[str, HipstaError]:
-    """Describe, by label, the folders of several names that would get the same labels."""
-    spellings: dict[tuple[str, str | None], set[str]] = {}
-    renamed = set()
-    for folder in folders:
-        spellings.setdefault((folder.subject, None), set()).add(folder.spelling)
-        stem = folder.path.name.partition(".long.")[0]
-        spellings.setdefault((folder.subject, folder.session or ""), set()).add(stem)
-        if folder.renamed:
-            renamed.add(folder.subject)
-    return {
-        label: InputError(
-            f"{' and '.join(sorted(names))} would all be sub-{label}"
-            f"{f'_ses-{session}' if session else ''}; say whose they are with --participants-map",
-            reason="same-label",
-        )
-        for (label, session), names in reversed(spellings.items())
-        if len(names) > 1 and label in renamed
-    }
-
-
 def choose_run(
     files: Sequence[LabelFile], context: Context, hemi: str
 ) -> Iterator[scan.HemisphereInput]:

@@ -10,7 +10,7 @@ from pathlib import Path
 from hipsta_bids import opening
 from hipsta_bids.errors import HipstaError, InputError, ProtocolError
 from hipsta_bids.inputs import scan, tree
-from hipsta_bids.inputs.selection import Context, LabelFile, Verdict, rivals_problem
+from hipsta_bids.inputs.selection import Context, LabelFile, Verdict
 from hipsta_bids.io.files import entities
 from hipsta_bids.protocols.load import NamedCode, protocol_from_names
 from hipsta_bids.protocols.protocol import Protocol
@@ -194,7 +194,6 @@ def _choose(
     """Take the first of several files of one protocol."""
     (best, verdict), visit = group[0], context.visit
     problem, space = verdict.problem, best.traits.get("space") or ""
-    problem = problem or rivals_problem([file for file, _ in group])
     if problem is None and not _OWN_SPACE.fullmatch(space):
         problem = InputError(
             f"{best.path}: space {space} is a template's, which changes thickness; "
@@ -212,9 +211,11 @@ def _choose(
         verdict,
         problem=problem,
         notes=(f"the file's name says {'_'.join(mismatches)}",) if mismatches else (),
-        provenance=context.provenance(tool, best) | {"atlas": verdict.protocol.name},
+        provenance={"atlas": verdict.protocol.name},
     )
-    return context.input(hemi, verdict, [best.path], [(file.path, order) for file, _ in group[1:]])
+    files = [file for file, _ in group]
+    passed_over = [(file.path, order) for file in files[1:]]
+    return context.first(files, verdict, hemi, passed_over, tool=tool)
 
 
 def _describe(file: LabelFile, context: Context) -> Verdict | None:

@@ -10,7 +10,7 @@ from typing import Any
 
 from hipsta_bids.errors import InputError, ProtocolError
 from hipsta_bids.inputs import ashs, freesurfer, generic, scan, tree
-from hipsta_bids.inputs.selection import Context, LabelFile, Verdict, rivals_problem
+from hipsta_bids.inputs.selection import Context, LabelFile, Verdict
 from hipsta_bids.io.files import entities
 from hipsta_bids.protocols.load import load_protocol, protocol_names
 
@@ -136,25 +136,12 @@ def find(layout: Layout, context: Context) -> Iterator[scan.HemisphereInput]:
     context = replace(context, longitudinal=freesurfer.is_longitudinal(all_files))
     for hemi in context.selection.wanted_hemis():
         files = [file for file in all_files if file.hemi in (hemi, None)]
-        if layout.choose is not None:
-            yield from layout.choose(files, context, hemi) if files else ()
+        if files and layout.choose is not None:
+            yield from layout.choose(files, context, hemi)
         elif files:
-            yield _best(layout, files, context, hemi)
-
-
-def _best(
-    layout: Layout, files: list[LabelFile], context: Context, hemi: str
-) -> scan.HemisphereInput:
-    """Take the first file of a hemisphere, unless another one is as good."""
-    best = files[0]
-    verdict = layout.protocol(layout, best, context, hemi)
-    verdict = replace(
-        verdict,
-        problem=rivals_problem(files) or verdict.problem,
-        provenance=context.provenance(layout.name, best) | verdict.provenance,
-    )
-    passed_over = [(file.path, layout.reason(file, best)) for file in files[1:]]
-    return context.input(hemi, verdict, [best.path], passed_over, bilateral=best.hemi is None)
+            verdict = layout.protocol(layout, files[0], context, hemi)
+            passed_over = [(file.path, layout.reason(file, files[0])) for file in files[1:]]
+            yield context.first(files, verdict, hemi, passed_over, tool=layout.name)
 
 
 def volume_table(path: Path, name: str) -> Path | None:
@@ -253,24 +240,8 @@ def _ashs_reason(file: LabelFile, best: LabelFile) -> str:
 
 
 def _ashs_protocol(_: Layout, file: LabelFile, context: Context, hemi: str) -> Verdict:
-    """Identify the atlas; a file of both hemispheres takes one that tells them apart."""
-    bilateral = file.hemi is None
-    protocol, explanation, problem = (context.atlases or atlas_finder(context)).identify(
-        (file.path, hemi, bilateral)
-    )
-    if problem is None and bilateral and not protocol.offset:
-        problem = InputError(
-            f"{file.path}: neither left nor right is in its name, and the protocol "
-            f"{protocol.name} does not say how the hemispheres differ; set right_offset in its "
-            "TOML file",
-            reason="unknown-hemisphere",
-        )
-    return Verdict(
-        protocol=protocol,
-        explanation=f"{file.traits['kind']}{file.remark}; {explanation}",
-        problem=problem,
-        provenance={"atlas": protocol.name},
-    )
+    """Identify the atlas."""
+    return (context.atlases or atlas_finder(context)).identify(file, hemi)
 
 
 #: Subjects whose files are opened to find out a dataset's atlas, spread over the dataset.

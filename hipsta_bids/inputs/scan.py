@@ -279,7 +279,8 @@ def _datasets(source: Source, depth: int, ignored: list[tree.Ignored]) -> list[P
             continue
         entries = tree.read_names(path, listed[0], any_name=source.any_name)
         folders = [entry for entry in entries.values() if isinstance(entry, tree.SubjectFolder)]
-        inner = [name for name, entry in entries.items() if entry is None]
+        others = [entry for entry in entries.values() if isinstance(entry, tree.Ignored)]
+        inner = [entry.path.name for entry in others if entry.reason == tree.NO_SUBJECT]
         if (
             folders
             or any(name.startswith("sub-") for name in entries)
@@ -293,11 +294,8 @@ def _datasets(source: Source, depth: int, ignored: list[tree.Ignored]) -> list[P
                     for f in folders
                 ]
         else:
-            unused += [e for e in entries.values() if isinstance(e, tree.Ignored)]
-            names = [*inner, *listed[1]]
-            unused += [
-                tree.no_segmentation(path / n, tree.NO_SUBJECT) for n in names if n != "sourcedata"
-            ]
+            others += [tree.no_segmentation(path / name, tree.NO_SUBJECT) for name in listed[1]]
+            unused += [entry for entry in others if entry.path.name != "sourcedata"]
             inner = list(entries)
         for name in reversed(inner):
             if name == "sourcedata":

@@ -15,10 +15,8 @@ A picture of labels on an image from another space misleads, so pages show only 
   grid of voxels.
 """
 
-import contextlib
 import os
 import re
-import stat
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -30,7 +28,6 @@ from hipsta_bids.inputs import tree
 from hipsta_bids.inputs.account import looked_into, unused_of_visit
 from hipsta_bids.inputs.ashs import choose_atlas
 from hipsta_bids.inputs.edits import EditedFile, attach_edits, each_once, edits_of_visit, list_edits
-from hipsta_bids.inputs.freesurfer import same_labels
 from hipsta_bids.inputs.generic import forget_tables, without_side
 from hipsta_bids.inputs.layouts import LAYOUTS, atlas_finder, find, volume_table
 from hipsta_bids.inputs.scan import (
@@ -43,7 +40,7 @@ from hipsta_bids.inputs.scan import (
 )
 from hipsta_bids.inputs.selection import Context, Selection, make_selection
 from hipsta_bids.io.files import entities
-from hipsta_bids.opening import POINTER_SIZE, not_fetched
+from hipsta_bids.opening import not_fetched
 from hipsta_bids.protocols.protocol import Protocol
 from hipsta_bids.types import Hemisphere
 
@@ -113,29 +110,26 @@ def find_inputs(request: InputRequest) -> Findings:
     option = choose_atlas(request)
     forget_tables()
     results = _Found()
-    sources = list_sources(request, results.strays)
-    results.edited = list_edits(request, selection, results.ignored)
+    sources = list_sources(request, results.unused)
+    results.edited = list_edits(request, selection, results.unused)
     for source in sources:
         _search(source, selection, option, results)
-    unused = results.unused(sources)
-    unused += [
+    results.unused += [
         tree.Ignored(path=Path(folder), reason="named in --participants-map, but no dataset has it")
         for folder in tree.read_people(request.participants_map)
         if not any((source.path / folder).is_dir() for source in sources)
     ]
-    unused = [entry for entry in unused if selection.misses(entry)]
-    ignored = tuple(entry for entry in unused if not entry.quiet)
-    other_entries = (*(entry for entry in unused if entry.quiet), *results.other_entries)
+    entries = [entry for entry in results.entries(sources) if selection.misses(entry)]
+    ignored = tuple(entry for entry in entries if not entry.quiet)
     accounted = {item.subject for item in results.items} | {entry.subject for entry in ignored}
-    missing = [
-        tree.Ignored(
+    missing = {
+        f.path: tree.Ignored(
             path=f.path, subject=f.subject, reason="no dataset has labels of it", quiet=True
         )
         for f in (() if request.bids_database_dir else tree.sort_folders(request.bids_dir)[0])
         if f.subject not in accounted and selection.wants_folder(f)
-    ]
-    without = {entry.path for entry in missing}
-    other_entries = tuple(entry for entry in other_entries if entry.path not in without)
+    }
+    others = [entry for entry in entries if entry.quiet and entry.path not in missing]
     if not results.items:
         error = _nothing(request, sources, ignored)
         for entry in ignored:
@@ -157,9 +151,8 @@ def find_inputs(request: InputRequest) -> Findings:
         notes += (f"no labels of one hemisphere: {_count(sides, 'visit')}",)
     if text := _unused(ignored):
         notes += (f"not used: {text}; --dry-run and the log say why",)
-    return Findings(
-        items=items, notes=notes, ignored=ignored, other_entries=(*other_entries, *missing)
-    )
+    others += missing.values()
+    return Findings(items=items, notes=notes, ignored=ignored, other_entries=tuple(others))
 
 
 @dataclass(kw_only=True)
@@ -168,35 +161,31 @@ class _Found:
 
     items: list[HemisphereInput] = field(default_factory=list)
     edited: list[EditedFile] = field(default_factory=list)
-    ignored: list[tree.Ignored] = field(default_factory=list)
-    strays: list[tree.Ignored] = field(default_factory=list)
-    """Entries that are no subject's by their names, unless an option says otherwise."""
+    unused: list[tree.Ignored] = field(default_factory=list)
     renamed: list[tree.SubjectFolder] = field(default_factory=list)
     """Folders of wanted subjects whose names are not their labels."""
 
-    other_entries: list[tree.Ignored] = field(default_factory=list)
-    """What else lies in subjects' folders."""
-
-    def unused(self, sources: Sequence[Source]) -> list[tree.Ignored]:
+    def entries(self, sources: Sequence[Source]) -> list[tree.Ignored]:
         """List each entry that was not used once, sorted by path."""
+        # What is known about an entry inside of a subject's folder comes first.
+        beside = [entry for entry in self.unused if entry.inside and entry.template]
+        strays = [entry for entry in self.unused if entry.inside is None]
+        missed = [entry for entry in self.unused if entry.inside and not entry.template]
         searched = {os.path.realpath(source.path) for source in sources}
-        searched |= {_place(folder.path) for folder in self.renamed} if self.strays else set()
+        searched |= {_place(folder.path) for folder in self.renamed} if strays else set()
         entry_of: dict[tuple[str, str | None], tree.Ignored] = {}
-        for entry in (*self.ignored, *self.strays):
+        for entry in (*missed, *strays):
             entry_of.setdefault((_place(entry.path), entry.hemi), entry)
         claims = [place for (place, _), entry in entry_of.items() if not entry.quiet]
         above = {str(parent) for path in (*searched, *claims) for parent in Path(path).parents}
-        strays = set(map(id, self.strays))
-        return sorted(
-            (
-                looked_into(entry)
-                for (place, _), entry in entry_of.items()
-                # What holds other entries, or is used by an option, has no row of its own.
-                if not (entry.quiet and place in above)
-                and not (id(entry) in strays and place in searched)
-            ),
-            key=lambda entry: (entry.path, entry.hemi or ""),
-        )
+        listed = [
+            looked_into(entry)
+            for (place, _), entry in entry_of.items()
+            # What holds other entries, or is used by an option, has no row of its own.
+            if not (entry.quiet and place in above)
+            and not (entry.inside is None and place in searched)
+        ]
+        return sorted(listed, key=lambda entry: (entry.path, entry.hemi or "")) + beside
 
 
 def _renaming(folders: Iterable[tree.SubjectFolder]) -> dict[tuple[str, str | None], str]:
@@ -248,25 +237,28 @@ def dataset_notes(request: InputRequest, items: Iterable[HemisphereInput]) -> tu
 def _search(source: Source, selection: Selection, option: Protocol | None, results: _Found) -> None:
     """Search one dataset for all kinds of segmentations, and add the edited files beside them."""
     all_folders, strays = source.folders()
-    refused = same_labels(all_folders)
+    refused = tree.same_labels(all_folders)
     folders = list(filter(selection.wants_folder, all_folders))
-    results.strays += strays
+    results.unused += strays
     results.renamed += [folder for folder in folders if folder.renamed]
     renaming = _renaming(folders)
     context = Context(source=source, selection=selection, atlas=option)
     context = replace(context, atlases=atlas_finder(context))
     searched = [layout for layout in LAYOUTS if layout.kind in source.layouts]
-    visits = list(filter(selection.wants_visit, tree.list_visits(folders, results.ignored)))
+    closed: list[tree.Ignored] = []
+    visits = list(filter(selection.wants_visit, tree.list_visits(folders, closed)))
+    results.unused += closed
     # Folders that cannot be listed have rows of their own, and the parents of sessions need none.
-    explained = {entry.subject for entry in results.ignored if entry.inside}
-    explained |= {visit.subject for visit in visits if visit.session}
+    explained = {entry.subject for entry in closed} | {
+        visit.subject for visit in visits if visit.session
+    }
     for visit in visits:
         results.edited += edits_of_visit(visit, source.path, source.name, beside=True)
         visit_context = replace(context, visit=visit)
         items = [item for layout in searched for item in find(layout, visit_context)]
-        results.ignored += without_side(visit) if "named" in source.layouts else ()
-        for entry in unused_of_visit(visit_context, items, explain=visit.subject not in explained):
-            (results.other_entries if entry.template else results.ignored).append(entry)
+        results.unused += without_side(visit) if "named" in source.layouts else ()
+        explain = visit.subject not in explained
+        results.unused += unused_of_visit(visit_context, items, explain=explain)
         for item in items:
             problem = refused.get(item.subject) or item.problem or _not_fetched(item.files)
             note = renaming.get((item.subject, item.session))
@@ -277,13 +269,10 @@ def _search(source: Source, selection: Selection, option: Protocol | None, resul
 
 
 def _not_fetched(paths: Sequence[Path]) -> InputError | None:
-    """Tell that the content of a file is elsewhere; links and small files alone are looked into."""
+    """Tell that the content of a file is elsewhere."""
     for path in paths:
-        with contextlib.suppress(OSError):
-            status = path.lstat()
-            may_point = stat.S_ISLNK(status.st_mode) or 0 < status.st_size < POINTER_SIZE
-            if may_point and (message := not_fetched(path)):
-                return InputError(f"{path}: {message}", reason="not-fetched")
+        if message := not_fetched(path):
+            return InputError(f"{path}: {message}", reason="not-fetched")
     return None
 
 
@@ -334,16 +323,16 @@ def _nothing(
 ) -> NothingToDoError:
     """Describe what was looked for, and where, and what was not used."""
     searched = ", ".join(str(source.path) for source in sources)
-    restricted = (
-        *(f"--participant-label {label}" for label in request.participant_labels[:_LISTED_NAMES]),
-        *(
-            f"--exclude-participant-label {label}"
-            for label in request.excluded_labels[:_LISTED_NAMES]
-        ),
-        *(f"--session-label {label}" for label in request.session_labels[:_LISTED_NAMES]),
-        *(f"--hemi {hemi}" for hemi in request.hemis if request.hemis != HEMIS),
-        *([f"--bids-filter-file {request.bids_filter_file}"] if request.bids_filter_file else []),
-    )
+    limits: dict[str, Sequence[object]] = {
+        "--participant-label": request.participant_labels,
+        "--exclude-participant-label": request.excluded_labels,
+        "--session-label": request.session_labels,
+        "--hemi": () if request.hemis == HEMIS else request.hemis,
+        "--bids-filter-file": list(filter(None, [request.bids_filter_file])),
+    }
+    restricted = [
+        f"{option} {value}" for option, values in limits.items() for value in values[:_LISTED_NAMES]
+    ]
     missed = [entry for entry in ignored if not entry.template]
     unused = f". Not used: {_unused(missed)}: {missed[0].reason}" if missed else ""
     if not sources:

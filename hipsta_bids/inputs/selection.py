@@ -5,7 +5,7 @@ import json
 import os
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -166,6 +166,24 @@ class Context:
             provenance={key: text for key, text in verdict.provenance.items() if text},
         )
 
+    def first(
+        self,
+        files: Sequence[LabelFile],
+        verdict: Verdict,
+        hemi: str,
+        passed_over: Iterable[tuple[Path, str]],
+        *,
+        tool: str,
+    ) -> scan.HemisphereInput:
+        """Take the first file of a hemisphere, unless another one is as good."""
+        best = files[0]
+        verdict = replace(
+            verdict,
+            problem=verdict.problem or rivals_problem(files),
+            provenance=self.provenance(tool, best) | verdict.provenance,
+        )
+        return self.input(hemi, verdict, [best.path], passed_over, bilateral=best.hemi is None)
+
     def provenance(self, tool: str, file: LabelFile) -> dict[str, str | None]:
         """Tell where a file comes from by its name and place."""
         versions = [text for name, text in self.source.generators.items() if tool in name]
@@ -213,13 +231,14 @@ def make_selection(request: scan.InputRequest) -> Selection:
             f"--hemi {' '.join(map(str, wrong))}: choose among {', '.join(scan.HEMIS)}"
         )
     choice = request.protocol or None
+
+    def plain(labels: tuple[str, ...]) -> tuple[str, ...]:
+        """Read names of folders as labels, where these may have any name."""
+        return tuple(map(tree.plain_label, labels)) if request.any_name else labels
+
     return Selection(
-        subjects=_labels(
-            _plain(request, request.participant_labels), "sub-", "--participant-label"
-        ),
-        excluded=_labels(
-            _plain(request, request.excluded_labels), "sub-", "--exclude-participant-label"
-        ),
+        subjects=_labels(plain(request.participant_labels), "sub-", "--participant-label"),
+        excluded=_labels(plain(request.excluded_labels), "sub-", "--exclude-participant-label"),
         sessions=_labels(request.session_labels, "ses-", "--session-label"),
         hemis=request.hemis,
         rules=_rules(request.bids_filter_file) if request.bids_filter_file else {},
@@ -235,11 +254,6 @@ def measurable(protocol: Protocol) -> Protocol:
     if protocol.refused:
         raise ProtocolError(protocol.refused, reason="no-subfields")
     return protocol
-
-
-def _plain(request: scan.InputRequest, labels: tuple[str, ...]) -> tuple[str, ...]:
-    """Read names of folders as labels, where these may have any name."""
-    return tuple(map(tree.plain_label, labels)) if request.any_name else labels
 
 
 def _labels(labels: Iterable[str], prefix: str, option: str) -> frozenset[str]:

@@ -52,12 +52,16 @@ _MARKS = {
 class SubjectFolder(Visit):
     """A folder that belongs to a subject, by its name or a table."""
 
-    longitudinal: bool
     path: Path
     spelling: str
     """What stands for the subject in its name."""
     renamed: bool = False
     """Whether the labels are not what the folder is called."""
+
+    @property
+    def longitudinal(self) -> bool:
+        """Whether it is of one of FreeSurfer's longitudinal runs."""
+        return ".long." in self.path.name
 
 
 IS_USED, FAILED, NOT_USED = "used", "failed", "not used"
@@ -183,17 +187,16 @@ def sort_folders(
     of this dataset, it alone says whose folders are.
     """
     names, files = list_folder(root)
-    entries = read_names(root, names, any_name=any_name)
+    entries = read_names(root, names, any_name=any_name).values()
     named = people_in(root, people)
-    folders = [] if named else [e for e in entries.values() if isinstance(e, SubjectFolder)]
-    other_entries = [entry for entry in entries.values() if isinstance(entry, Ignored)]
-    for name, entry in entries.items():
-        if entry is None:
-            other_entries.append(no_segmentation(root / name, NO_SUBJECT))
-        elif named and isinstance(entry, SubjectFolder):
-            other_entries.append(
-                Ignored(path=root / name, reason=_NOT_NAMED, subject=entry.subject)
-            )
+    folders = [] if named else [entry for entry in entries if isinstance(entry, SubjectFolder)]
+    other_entries = [
+        entry
+        if isinstance(entry, Ignored)
+        else Ignored(path=entry.path, reason=_NOT_NAMED, subject=entry.subject)
+        for entry in entries
+        if named or isinstance(entry, Ignored)
+    ]
     paths = {root / folder for folder in named}
     above = {parent for path in paths for parent in path.parents if root in parent.parents}
     other_entries = [entry for entry in other_entries if entry.path not in paths | above]
@@ -203,32 +206,25 @@ def sort_folders(
         for name in list_folder(parent)[0]
         if parent / name not in paths | above and _tools_inside(parent / name, if_closed="any")
     ]
-    for folder, (subject, session) in named.items():
-        path = root / folder
-        folders.append(
-            SubjectFolder(
-                subject=subject,
-                session=session,
-                longitudinal=".long." in path.name,
-                path=path,
-                spelling=subject,
-                renamed=True,
-            )
+    folders += [
+        SubjectFolder(
+            subject=subject, session=session, path=root / folder, spelling=subject, renamed=True
         )
+        for folder, (subject, session) in named.items()
+    ]
     for name in files:
-        match = _SUBJECT.fullmatch(name)
-        if match:
-            reason, subject = "no folder, or a link that leads nowhere", match["subject"]
-            other_entries.append(Ignored(path=root / name, reason=reason, subject=subject))
-        else:
-            other_entries.append(no_segmentation(root / name, NO_SUBJECT))
+        entry = no_segmentation(root / name, NO_SUBJECT)
+        if match := _SUBJECT.fullmatch(name):
+            reason = "no folder, or a link that leads nowhere"
+            entry = Ignored(path=root / name, reason=reason, subject=match["subject"])
+        other_entries.append(entry)
     return folders, sorted(other_entries, key=lambda entry: entry.path)
 
 
 def read_names(
     root: Path, names: Sequence[str], *, any_name: str
-) -> dict[str, SubjectFolder | Ignored | None]:
-    """Tell by their names whose folders they are, or why nobody's; ``None`` claims nothing."""
+) -> dict[str, SubjectFolder | Ignored]:
+    """Tell by their names whose folders they are, or why nobody's."""
     stems = {name: name.partition(".long.")[0] for name in names}
     base_of = {stem: name.partition(".long.")[2] for name, stem in stems.items() if stem != name}
     inside = {
@@ -238,7 +234,7 @@ def read_names(
     }
     visits_of = Counter(base_of.values())
     bases = {*visits_of, *(name for name, tools in inside.items() if "base" in tools)}
-    entries: dict[str, SubjectFolder | Ignored | None] = {}
+    entries: dict[str, SubjectFolder | Ignored] = {}
     for name, stem in stems.items():
         path, match = root / name, _SUBJECT.fullmatch(stem) if name not in inside else None
         # A time point begins with the name of its base, and goes on with no letter or digit.
@@ -251,7 +247,6 @@ def read_names(
             entries[name] = SubjectFolder(
                 subject=match["subject"],
                 session=match["session"],
-                longitudinal=stem != name,
                 path=path,
                 spelling=stem.partition("_ses-")[0],
             )
@@ -260,7 +255,7 @@ def read_names(
             tools = inside.get(name, frozenset())
             entries[name] = _renamed(path, stem, base, tools=tools, allowed=allowed)
         else:
-            entries[name] = None
+            entries[name] = no_segmentation(path, NO_SUBJECT)
     return entries
 
 
@@ -274,24 +269,24 @@ def _renamed(
         spelling = _BASE_END.sub("", base) or base
         session = stem.removeprefix(spelling).strip("-_.").removeprefix("ses-") or None
     label, visit = plain_label(spelling), plain_label(session or "") or None
+    reason = ""
     if _TEMPLATE.fullmatch(path.name):
         reason = "comes with FreeSurfer, and is no subject"
         return Ignored(path=path, reason=reason, subject=label, status=NO_SEGMENTATION)
     if not label or bool(session) != bool(visit):
-        letters = any(letter.isalnum() for letter in spelling)
-        reason = "its name has letters that labels cannot have" if letters else "no letter or digit"
-        reason += "; --participants-map names it" if letters else " in its name"
-        return Ignored(path=path, reason=reason, subject=label)
-    if not allowed:
+        reason = "no letter or digit in its name"
+        if any(letter.isalnum() for letter in spelling):
+            reason = "its name has letters that labels cannot have; --participants-map names it"
+    elif not allowed:
         reason = "its name is not sub-LABEL or sub-LABEL_ses-LABEL, of letters and digits"
         for tool in sorted(tools.intersection(_MARKS)):
             reason += f"; --{tool}-dir {path.parent} takes it as sub-{label}"
             reason += f"_ses-{visit}" if base and visit else ""
+    if reason:
         return Ignored(path=path, reason=reason, subject=label)
     return SubjectFolder(
         subject=label,
         session=visit,
-        longitudinal=stem != path.name,
         path=path,
         spelling=base or stem.partition("_ses-")[0],
         renamed=True,
@@ -339,6 +334,27 @@ def read_people(path: Path | None) -> People:
 def people_in(root: Path, people: People) -> People:
     """Select the folders of a dataset that ``--participants-map`` names."""
     return {folder: visit for folder, visit in people.items() if (root / folder).is_dir()}
+
+
+def same_labels(folders: Iterable[SubjectFolder]) -> dict[str, InputError]:
+    """Describe, by label, the folders of several names that would get the same labels."""
+    spellings: dict[tuple[str, str | None], set[str]] = {}
+    renamed = set()
+    for folder in folders:
+        spellings.setdefault((folder.subject, None), set()).add(folder.spelling)
+        stem = folder.path.name.partition(".long.")[0]
+        spellings.setdefault((folder.subject, folder.session or ""), set()).add(stem)
+        if folder.renamed:
+            renamed.add(folder.subject)
+    return {
+        label: InputError(
+            f"{' and '.join(sorted(names))} would all be sub-{label}"
+            f"{f'_ses-{session}' if session else ''}; say whose they are with --participants-map",
+            reason="same-label",
+        )
+        for (label, session), names in reversed(spellings.items())
+        if len(names) > 1 and label in renamed
+    }
 
 
 def list_visits(
