@@ -99,17 +99,19 @@ class AtlasFinder:
 
     def _from_values(self, image: Image) -> tuple[Protocol, str]:
         shared, count = self._shared
-        others = f"{count} other file{'' if count == 1 else 's'} of the dataset"
+        rest_text = f"{count} other file{'' if count == 1 else 's'} of the dataset"
         if shared and image not in self._values:
             # Not opened here; reading it later will fail if its values do not fit.
-            return _first(shared, f"atlas from the labels of {others}")
+            return _first(shared, f"atlas from the labels of {rest_text}")
         fitting = self._fitting(image)
         if len(fitting) == 1:
             return fitting[0], "only this atlas has such labels"
         left = [protocol for protocol in shared if protocol in fitting]
         if left and len(left) < len(fitting):
-            only = "this one" if len(left) == 1 else _names(left)
-            return _first(left, f"its labels fit {_names(fitting)}, those of {others} only {only}")
+            choice = "this one" if len(left) == 1 else _names(left)
+            return _first(
+                left, f"its labels fit {_names(fitting)}, those of {rest_text} only {choice}"
+            )
         if _one_body(fitting):
             return _first(fitting, f"its labels fit {_names(fitting)}")
         values = ", ".join(map(str, sorted(self._read(image))))
@@ -181,8 +183,8 @@ def _names(protocols: Sequence[Protocol]) -> str:
 
 def _first(protocols: Sequence[Protocol], text: str) -> tuple[Protocol, str]:
     """Take the first of the protocols that are possible, all with the same body."""
-    other = "; the body is the same, --ashs-atlas names the other" if len(protocols) > 1 else ""
-    return protocols[0], text + other
+    text += "; the body is the same, --ashs-atlas names the other" if len(protocols) > 1 else ""
+    return protocols[0], text
 
 
 def _one_body(protocols: list[Protocol]) -> bool:

@@ -19,21 +19,20 @@ _SIDES = {"left": "L", "right": "R", "l": "L", "r": "R"}
 
 def _named_protocol(layout: "Layout", file: LabelFile, context: Context, _: str) -> Verdict:
     """Find the protocol of a program's file."""
-    users = context.selection.protocol
+    users, names = context.selection.protocol, protocol_names()
+    fitting = [each for each in map(load_protocol, names) if each.tool == layout.name]
     if users is not None and users.tool == layout.name:
-        explanation = f"{layout.title}{file.remark}, protocol {users.name} from --scheme"
-        return Verdict(protocol=users, explanation=explanation)
-    protocols = map(load_protocol, protocol_names())
-    fitting = [protocol for protocol in protocols if protocol.tool == layout.name]
+        fitting = [users]
     if len(fitting) == 1:
-        explanation = f"{layout.title}{file.remark}, protocol {fitting[0].name}"
+        origin = " from --scheme" if users in fitting else ""
+        explanation = f"{layout.title}{file.remark}, protocol {fitting[0].name}{origin}"
         return Verdict(protocol=fitting[0], explanation=explanation)
-    names = " or ".join(f"--scheme {each.name} ({each.title})" for each in fitting)
+    choices = " or ".join(f"--scheme {each.name} ({each.title})" for each in fitting)
     return Verdict(
         protocol=scan.unknown_protocol(layout.name, f"{layout.title}, mode not given"),
         explanation=f"{layout.title}{file.remark}, mode not given",
         problem=ProtocolError(
-            f"{file.path}: {layout.choice}; say which: {names}", reason="ambiguous-scheme"
+            f"{file.path}: {layout.choice}; say which: {choices}", reason="ambiguous-scheme"
         ),
     )
 
@@ -86,15 +85,16 @@ class Layout:
     def reads(self, name: str, source: scan.Source) -> dict[str, str | None] | None:
         """Return what a file's name says, if it is one of this program's."""
         match = self.pattern.fullmatch(name)
-        if match is None or (
-            self.generators
-            and source.generators
-            and not any(self.name in generator for generator in source.generators)
-        ):
+        is_foreign = self.generators and source.generators and not self.made(source)
+        if match is None or is_foreign:
             return None
         if self.unless and _BY_NAME[self.unless].reads(name, source) is not None:
             return None
         return (entities(name) if self.bids else {}) | {"hemi": None, **match.groupdict()}
+
+    def made(self, source: scan.Source) -> bool:
+        """Check whether a dataset names this program in its description."""
+        return any(self.name in generator for generator in source.generators)
 
     def side(self, name: str) -> str | None:
         """Return the hemisphere of a file by its name; None for both."""
@@ -104,9 +104,7 @@ class Layout:
     def files(self, context: Context) -> list[LabelFile]:
         """List the files of one visit, best first."""
         source, users = context.source, context.selection.protocol
-        named = (users is not None and users.tool == self.name) or any(
-            self.name in generator for generator in source.generators
-        )
+        named = (users is not None and users.tool == self.name) or self.made(source)
         files = []
         for folder in freesurfer.each_once(context.visit.folders):
             marked = not self.beside or any(name in folder.names for name in self.beside)
@@ -116,16 +114,14 @@ class Layout:
                 traits, path = self.reads(name, source), folder.path / name
                 if traits is None or (self.bids and not context.selection.wants_file(path)):
                     continue
-                side = (traits.get("hemi") or "").lower()
                 file = LabelFile(
                     path=path,
-                    hemi=_SIDES.get(side),
+                    hemi=self.side(name),
                     traits=traits,
                     longitudinal=folder.longitudinal,
                 )
-                files.append((self.rank(file, context), str(path), file))
-        files.sort(key=lambda entry: entry[:2])
-        return [replace(file, rank=rank) for rank, _, file in files]
+                files.append(replace(file, rank=self.rank(file, context)))
+        return sorted(files, key=lambda file: (file.rank, str(file.path)))
 
 
 def find(layout: Layout, context: Context) -> Iterator[scan.HemisphereInput]:
@@ -250,11 +246,10 @@ _SAMPLE = 8
 
 def atlas_finder(context: Context) -> ashs.AtlasFinder:
     """Prepare what identifies the atlases of one dataset of ASHS."""
-    root = context.source.path
 
     def sample() -> Iterator[ashs.Image]:
         """List some of the dataset's segmentations, the same whoever is processed."""
-        folders = tree.sort_folders(root, any_name=context.source.any_name)[0]
+        folders = context.source.folders()[0]
         for visit in tree.list_visits(folders[:: max(len(folders) // _SAMPLE, 1)]):
             files = _BY_NAME["ashs"].files(replace(context, visit=visit))
             for hemi in scan.HEMIS:
@@ -262,7 +257,7 @@ def atlas_finder(context: Context) -> ashs.AtlasFinder:
                 if best is not None:
                     yield best.path, hemi, best.hemi is None
 
-    return ashs.AtlasFinder(root, context.atlas, sample)
+    return ashs.AtlasFinder(context.source.path, context.atlas, sample)
 
 
 #: What programs do in ways of their own.

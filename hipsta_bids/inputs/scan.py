@@ -279,8 +279,8 @@ def _datasets(source: Source, depth: int, ignored: list[tree.Ignored]) -> list[P
             continue
         entries = tree.read_names(path, listed[0], any_name=source.any_name)
         folders = [entry for entry in entries.values() if isinstance(entry, tree.SubjectFolder)]
-        others = [entry for entry in entries.values() if isinstance(entry, tree.Ignored)]
-        inner = [entry.path.name for entry in others if entry.reason == tree.NO_SUBJECT]
+        unclaimed = [entry for entry in entries.values() if isinstance(entry, tree.Ignored)]
+        inner = [entry.path.name for entry in unclaimed if entry.reason == tree.NO_SUBJECT]
         if (
             folders
             or any(name.startswith("sub-") for name in entries)
@@ -294,8 +294,8 @@ def _datasets(source: Source, depth: int, ignored: list[tree.Ignored]) -> list[P
                     for f in folders
                 ]
         else:
-            others += [tree.no_segmentation(path / name, tree.NO_SUBJECT) for name in listed[1]]
-            unused += [entry for entry in others if entry.path.name != "sourcedata"]
+            unclaimed += [tree.no_segmentation(path / name, tree.NO_SUBJECT) for name in listed[1]]
+            unused += [entry for entry in unclaimed if entry.path.name != "sourcedata"]
             inner = list(entries)
         for name in reversed(inner):
             if name == "sourcedata":

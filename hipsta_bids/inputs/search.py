@@ -24,25 +24,18 @@ from pathlib import Path
 
 from hipsta_bids.derivatives.dataset import read_description
 from hipsta_bids.errors import InputError, NothingToDoError, UsageError
-from hipsta_bids.inputs import tree
+from hipsta_bids.inputs import scan, tree
 from hipsta_bids.inputs.account import looked_into, unused_of_visit
 from hipsta_bids.inputs.ashs import choose_atlas
 from hipsta_bids.inputs.edits import EditedFile, attach_edits, each_once, edits_of_visit, list_edits
 from hipsta_bids.inputs.generic import forget_tables, without_side
 from hipsta_bids.inputs.layouts import LAYOUTS, atlas_finder, find, volume_table
-from hipsta_bids.inputs.scan import (
-    HEMIS,
-    HemisphereInput,
-    InputRequest,
-    Source,
-    list_participants,
-    list_sources,
-)
+from hipsta_bids.inputs.scan import HEMIS, HemisphereInput, InputRequest, Source
 from hipsta_bids.inputs.selection import Context, Selection, make_selection
 from hipsta_bids.io.files import entities
 from hipsta_bids.opening import not_fetched
 from hipsta_bids.protocols.protocol import Protocol
-from hipsta_bids.types import Hemisphere
+from hipsta_bids.types import Hemisphere, VisitKey
 
 __all__ = [
     "HEMIS",
@@ -110,7 +103,7 @@ def find_inputs(request: InputRequest) -> Findings:
     option = choose_atlas(request)
     forget_tables()
     results = _Found()
-    sources = list_sources(request, results.unused)
+    sources = scan.list_sources(request, results.unused)
     results.edited = list_edits(request, selection, results.unused)
     for source in sources:
         _search(source, selection, option, results)
@@ -129,7 +122,7 @@ def find_inputs(request: InputRequest) -> Findings:
         for f in (() if request.bids_database_dir else tree.sort_folders(request.bids_dir)[0])
         if f.subject not in accounted and selection.wants_folder(f)
     }
-    others = [entry for entry in entries if entry.quiet and entry.path not in missing]
+    unmissed = [entry for entry in entries if entry.quiet and entry.path not in missing]
     if not results.items:
         error = _nothing(request, sources, ignored)
         for entry in ignored:
@@ -151,8 +144,8 @@ def find_inputs(request: InputRequest) -> Findings:
         notes += (f"no labels of one hemisphere: {_count(sides, 'visit')}",)
     if text := _unused(ignored):
         notes += (f"not used: {text}; --dry-run and the log say why",)
-    others += missing.values()
-    return Findings(items=items, notes=notes, ignored=ignored, other_entries=tuple(others))
+    unmissed += missing.values()
+    return Findings(items=items, notes=notes, ignored=ignored, other_entries=tuple(unmissed))
 
 
 @dataclass(kw_only=True)
@@ -188,15 +181,13 @@ class _Found:
         return sorted(listed, key=lambda entry: (entry.path, entry.hemi or "")) + beside
 
 
-def _renaming(folders: Iterable[tree.SubjectFolder]) -> dict[tuple[str, str | None], str]:
+def _renaming(folders: Iterable[tree.SubjectFolder]) -> dict[VisitKey, list[str]]:
     """Write a note for each visit whose folders have names that are not its labels."""
-    names: dict[tuple[str, str | None], list[str]] = {}
+    names: dict[VisitKey, list[str]] = {}
     for folder in folders:
         if folder.renamed:
             names.setdefault((folder.subject, folder.session), []).append(folder.path.name)
-    return {
-        key: f"the folder of sub-{key[0]} is {' and '.join(known)}" for key, known in names.items()
-    }
+    return {key: [f"the folder of sub-{key[0]} is {' and '.join(names[key])}"] for key in names}
 
 
 def _place(path: Path) -> str:
@@ -211,7 +202,7 @@ def list_subjects(request: InputRequest) -> tuple[str, ...]:
         sorted(
             {
                 folder.subject
-                for source in list_sources(request)
+                for source in scan.list_sources(request)
                 for folder in source.folders()[0]
                 if selection.wants_folder(folder)
             }
@@ -227,7 +218,7 @@ def dataset_notes(request: InputRequest, items: Iterable[HemisphereInput]) -> tu
             f"{request.bids_dir} has no dataset_description.json, which BIDS requires; going on"
         )
     selection = make_selection(request)
-    expected = selection.subjects or list_participants(request)
+    expected = selection.subjects or scan.list_participants(request)
     without = sorted(expected - selection.excluded - {item.subject for item in items})
     if without:
         notes.append(f"no segmentation found for {_count(without, 'participant')}")
@@ -259,13 +250,15 @@ def _search(source: Source, selection: Selection, option: Protocol | None, resul
         results.unused += without_side(visit) if "named" in source.layouts else ()
         explain = visit.subject not in explained
         results.unused += unused_of_visit(visit_context, items, explain=explain)
-        for item in items:
-            problem = refused.get(item.subject) or item.problem or _not_fetched(item.files)
-            note = renaming.get((item.subject, item.session))
-            if problem is not item.problem or note is not None:
-                notes = item.notes if note is None else (*item.notes, note)
-                item = replace(item, problem=problem, notes=notes)  # noqa: PLW2901 (the same one)
-            results.items.append(item)
+        notes = renaming.get((visit.subject, visit.session), ())
+        results.items += [
+            replace(
+                item,
+                problem=refused.get(item.subject) or item.problem or _not_fetched(item.files),
+                notes=(*item.notes, *notes),
+            )
+            for item in items
+        ]
 
 
 def _not_fetched(paths: Sequence[Path]) -> InputError | None:

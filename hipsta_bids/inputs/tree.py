@@ -269,10 +269,10 @@ def _renamed(
         spelling = _BASE_END.sub("", base) or base
         session = stem.removeprefix(spelling).strip("-_.").removeprefix("ses-") or None
     label, visit = plain_label(spelling), plain_label(session or "") or None
-    reason = ""
     if _TEMPLATE.fullmatch(path.name):
         reason = "comes with FreeSurfer, and is no subject"
         return Ignored(path=path, reason=reason, subject=label, status=NO_SEGMENTATION)
+    reason = ""
     if not label or bool(session) != bool(visit):
         reason = "no letter or digit in its name"
         if any(letter.isalnum() for letter in spelling):
@@ -388,15 +388,8 @@ def _inner_folders(
         if listed is None:
             continue
         names, files = listed
-        yield (
-            session,
-            Folder(
-                path=path,
-                names=tuple(files),
-                inner=tuple(names),
-                longitudinal=folder.longitudinal,
-            ),
-        )
+        inner, is_long = tuple(names), folder.longitudinal
+        yield session, Folder(path=path, names=tuple(files), inner=inner, longitudinal=is_long)
         connectome |= path == folder.path and "T1w" in names
         for name in names:
             match = _SESSION.fullmatch(name)
@@ -407,11 +400,7 @@ def _inner_folders(
             elif outer and name.startswith("ses-"):
                 reason = "its name is not ses-LABEL, of letters and digits"
                 reason = "a session inside of a session" if match else reason
-                ignored.append(
-                    Ignored(
-                        path=path / name, reason=reason, subject=folder.subject, inside=folder.path
-                    )
-                )
+                ignored.append(_inside(folder, path / name, reason))
             elif connectome and (_HCP.fullmatch(name) or name == folder.path.name):
                 # Below T1w are FreeSurfer's folder of this name, and HippUnfold's dataset.
                 waiting.append((session, path / name, name not in {"T1w", "T2w", "T1wT2w"}))
@@ -425,8 +414,10 @@ def try_to_list(
         return list_folder(path)
     except InputError as error:
         reason = str(error).removeprefix(f"{path}: ")
-        subject_folder = (folder.subject, folder.path) if folder else (None, None)
-        ignored.append(
-            Ignored(path=path, reason=reason, subject=subject_folder[0], inside=subject_folder[1])
-        )
+        entry = Ignored(path=path, reason=reason)
+        ignored.append(_inside(folder, path, reason) if folder else entry)
         return None
+
+
+def _inside(folder: SubjectFolder, path: Path, reason: str) -> Ignored:
+    return Ignored(path=path, reason=reason, subject=folder.subject, inside=folder.path)
