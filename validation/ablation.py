@@ -116,7 +116,7 @@ def run(full: bool, labels: Path | None = None) -> Iterator[Content]:
             for pose in poses
         ]
         subjects = [
-            one for one in continuity.subjects(labels, full) if full or labels is None
+            continuity.Subject(labels=item) for item in cases.fine_segmentations(labels, 0.6)
         ] or continuity.subjects(None, full)
         for kind, perturbations in (("small", SMALL), ("edges", continuity.EDGES)):
             groups[name, kind] = [

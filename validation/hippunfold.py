@@ -61,8 +61,8 @@ Source = HemisphereInput | tuple[Path, str]
 """A person's labels, or a template's folder and side."""
 
 
-Pair = tuple[Float, Float]
-"""Thickness (Nx, Ny), mm: ours, and HippUnfold's where our mid-surface is."""
+Pair = tuple[HemisphereMaps, Float]
+"""Our maps, and HippUnfold's thickness (Nx, Ny) where our mid-surface is, mm."""
 
 
 @suite("hippunfold")
@@ -284,7 +284,7 @@ def _pair(maps: HemisphereMaps, points: Float, thickness: Float) -> Pair:
     """Take thickness at the one of (N, 3) vertices that is nearest to each mid-surface node."""
     middle = maps.sheet.points[:, :, maps.sheet.middle]
     nearest = cKDTree(points).query(middle.reshape(-1, 3))[1]
-    return maps.thickness, thickness[nearest].reshape(maps.thickness.shape)
+    return maps, thickness[nearest].reshape(maps.thickness.shape)
 
 
 def draw_template(folder: Path, hemi: str) -> tuple[LabelVolume, Float, Float]:
@@ -350,7 +350,8 @@ def _row(name: str, walls: str, result: Pair | Refusal) -> Cells:
     cells: dict[str, Cell] = {"hemisphere": name, "labels": walls}
     met = False
     if not isinstance(result, Refusal):
-        ours, theirs = result
+        maps, theirs = result
+        ours = maps.thickness
         both = [_two(ours[part], theirs[part]) for part in ((slice(None),) * 2, _INNER)]
         bias = float((ours - theirs).mean())
         of_rows = (ours - theirs).mean(axis=0)

@@ -226,6 +226,7 @@ def find_cavities(
     pieces, _ = ndimage.label(enclosed, structure=digital.CUBE)
     most_open = 1.0 if edges[through] > settings.slit_voxel else CAVITY_OPENNESS
     narrow, wide, doubtful = list[Index](), list[Index](), False
+    layered = bool((volume.tissue[around] == Tissue.MOLECULAR_LAYER).any())
     for number, part in enumerate(ndimage.find_objects(pieces), 1):
         room = digital.box_around(
             digital.positions(pieces[part] == number) + digital.low_corner(part)
@@ -242,7 +243,8 @@ def find_cavities(
         ratios = np.array([opened, radius / CAVITY_RADIUS])
         near = (ratios > 1 / CAVITY_MARGIN) & (ratios < CAVITY_MARGIN)
         near &= len(index) * float(np.prod(edges)) > DOUBTFUL_CAVITY
-        doubtful |= bool(near[0] or (near[1] and opened <= 1))
+        # Without a layer, both kinds are divided alike.
+        doubtful |= bool(near[0] or (near[1] and opened <= 1 and layered))
         is_open, is_wide = (ratios > 1) ^ (near & second)
         if not is_open:
             (wide if is_wide else narrow).append(index)

@@ -174,19 +174,25 @@ def continued_nodes(grid: WedgeGrid, body: Body, depth: float) -> Float:
         missing = depth + (points - plane.point) @ plane.normal * np.sign(slope)
         short = missing > 0
         depths, inward = missing[short], -outward / abs(slope)
-        center, change = _motion(body, end, inward)
-        moved = points[short] - center + depths[:, None] * inward
-        matrix = np.eye(3) - depths[:, None, None] * change
-        points[short] = center + np.linalg.solve(matrix, moved[..., None])[..., 0]
+        center, across, change = _motion(body, end, inward)
+        flat = points[short] + depths[:, None] * inward
+        first, second = ((flat - center) @ across.T).T
+        # Solve (1 - depth change) x = moved on the plane.
+        (a, b), (c, d) = -depths * change[:, :, None]
+        scale = (1 + a) * (1 + d) - b * c
+        step = np.stack([(1 + d) * first - b * second, (1 + a) * second - c * first], axis=1)
+        step = step / scale[:, None] - np.stack([first, second], axis=1)
+        points[short] = flat + step @ across
     return points
 
 
-def _motion(body: Body, end: End, inward: Float) -> tuple[Float, Float]:
-    """Fit how a cross-section changes behind an end plane: its center (3,), change (3, 3) per mm.
+def _motion(body: Body, end: End, inward: Float) -> tuple[Float, Float, Float]:
+    """Fit how a cross-section changes behind an end plane.
 
-    A point at x from the center moves by ``inward`` (3,) and by change @ x per mm of depth. Along
-    such motions the smoothed mask stays as it is, in the sense of least squares (optical flow;
-    Lucas and Kanade 1981, Proc. IJCAI, 674-679).
+    Returns its center (3,), directions across (2, 3), and the change (2, 2) per mm of depth: a
+    point at x from the center, along these directions, moves by ``inward`` (3,) and by change @ x.
+    Along such motions the smoothed mask stays as it is, in the sense of least squares (optical
+    flow; Lucas and Kanade 1981, Proc. IJCAI, 674-679).
     """
     plane = body.ends[end]
     normal = plane.normal * np.sign(plane.normal @ inward)
@@ -214,7 +220,7 @@ def _motion(body: Body, end: End, inward: Float) -> tuple[Float, Float]:
     matrix = columns.T @ (weight[:, None] * columns)
     matrix[2:, 2:] += MOTION_PRIOR * np.trace(matrix[2:, 2:]) / 4 * np.eye(4)
     solution = np.linalg.solve(matrix, columns.T @ (weight * -(slopes @ inward)))
-    return center, across.T @ solution[2:].reshape(2, 2) @ across
+    return center, across, solution[2:].reshape(2, 2)
 
 
 def _nodes_in(voxels: Index, body: Body, points: Float, shape: tuple[int, int, int]) -> Bool | None:

@@ -24,8 +24,7 @@ TEMPLATES = DATA / "templates"
 def person(hemi):
     """Our maps of the person, and HippUnfold's thickness at our points, mm."""
     (item,) = find_hemispheres(InputRequest(bids_dir=DATA, hemis=(hemi,)))
-    pair = hippunfold.measure_person(item)
-    return pair.maps, pair.theirs
+    return hippunfold.measure_person(item)
 
 
 def test_thickness_of_a_person_is_hippunfolds_but_for_where_the_walls_are():
@@ -50,9 +49,9 @@ def test_the_body_of_a_person_ends_where_the_dentate_gyrus_does():
 
 def test_labels_drawn_from_hippunfolds_walls_have_its_thickness():
     """Of one of the four sides; the others are in the suite of HippUnfold."""
-    pair = hippunfold.measure_template((TEMPLATES / "tpl-OASIS30ANTs", "L"))
-    difference = pair.maps.thickness - pair.theirs
-    assert pair.maps.qc["posterior_end_rule"] == "core"
+    maps, own = hippunfold.measure_template((TEMPLATES / "tpl-OASIS30ANTs", "L"))
+    difference = maps.thickness - own
+    assert maps.qc["posterior_end_rule"] == "core"
     # Phantoms: a thirteenth of a voxel; here, the nearest vertex is not on the same line.
     assert abs(difference.mean()) < 0.03
     assert difference.std() < 0.2

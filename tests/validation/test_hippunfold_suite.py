@@ -1,5 +1,7 @@
 """The suite about HippUnfold: two maps are compared, and the suite says where there are none."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -14,7 +16,7 @@ THEIRS = RANDOM.uniform(1.0, 2.0, (41, 21))
 def pair(bias=0.0, noise=0.0, edges=0.0):
     ours = THEIRS + bias + noise * RANDOM.normal(size=THEIRS.shape)
     ours[:4] += edges
-    return ours, THEIRS
+    return SimpleNamespace(thickness=ours), THEIRS
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,6 @@ from statsmodels.regression.mixed_linear_model import MixedLM
 
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.design.formula import Contrast
-from hipsta_bids.group.design.model import asymmetry
 from hipsta_bids.group.design.settings import GlmSettings, LongitudinalSettings
 from hipsta_bids.group.stats.glm import fit_points
 from hipsta_bids.group.stats.mixed import CORRELATIONS, MAX_CORRELATION, fit_mixed
@@ -190,12 +189,6 @@ def test_two_sessions_give_the_paired_t_test():
     expected = stats.ttest_1samp(maps[1::2] - maps[::2], 0)
     np.testing.assert_allclose(fit.tests[2].statistic, expected.statistic, rtol=1e-6)
     np.testing.assert_allclose(fit.tests[2].p, expected.pvalue, rtol=1e-4)
-
-
-def test_asymmetry():
-    left, right = np.array([2.0, 1.0, np.nan, 0.0]), np.array([1.0, 1.0, 1.0, 0.0])
-    np.testing.assert_allclose(asymmetry(left, right, relative=False), [1, 0, np.nan, 0])
-    np.testing.assert_allclose(asymmetry(left, right, relative=True), [2 / 3, 0, np.nan, np.nan])
 
 
 def test_refusals():
