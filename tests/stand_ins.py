@@ -129,6 +129,13 @@ def make_input(folder, subject="01", *, hemi="L", act="ok", problem=None, sessio
     )
 
 
+class Act(str):
+    """What a stand-in does, as its volume of labels."""
+
+    __slots__ = ()
+    affine = np.diag([-0.4, 0.4, 1.2, 1.0])
+
+
 def act_out(act, hemi, clock):
     """Behave as the input file says."""
     with clock("surface"):
@@ -154,7 +161,7 @@ def act_out(act, hemi, clock):
 def replace_measurement():
     """Put stand-ins in the place of reading and measuring, in this process."""
     images = types.ModuleType("hipsta_bids.inputs.labels")
-    images.read_label_volume = lambda item, _region: item.files[0].read_text().split()[0]
+    images.read_label_volume = lambda item, _region: Act(item.files[0].read_text().split()[0])
     participant = types.ModuleType("hipsta_bids.participant.measure")
     participant.find_body = lambda *_: None
     participant.measure_hemisphere = lambda volume, hemi, _, clock: act_out(volume, hemi, clock)

@@ -102,6 +102,8 @@ _DATASET_FILES = {
     "citation": "a methods paragraph with references, for your article",
     "status": "one row per hemisphere: status, reason, message, time per stage, peak memory",
     "status_sidecar": "its columns",
+    "inputs": "each hemisphere, file and folder of the inputs: used or not, and why",
+    "inputs_sidecar": "its columns",
     "logs": "one file per run",
     "group": "results of the [group level](group.md#what-is-written), one folder per model",
     "report": "all hemispheres; beside it a page per participant and session",

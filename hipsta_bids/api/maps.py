@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
-from hipsta_bids.derivatives.dataset import identity
+from hipsta_bids.derivatives.dataset import identity, provenance_of
 from hipsta_bids.derivatives.hemisphere import POSITION, STATE, read_sheet, sheet_labels, verdict
 from hipsta_bids.errors import InputError, NothingToDoError
 from hipsta_bids.geometry.catalog import MAPS
@@ -323,7 +323,8 @@ class Results(NamedTuple):
     maps: "xr.Dataset"
     """(participant, session, side, x, y), read when values are used."""
     table: pd.DataFrame
-    """One row per hemisphere: who, status, reason, message, and the summary measures."""
+    """One row per hemisphere: who, status, reason, message, where the labels come from (tool,
+    version, analysis and so on), and the summary measures."""
 
 
 def load(out_dir: str | Path, *, protocol: str | None = None, region: str = "body") -> Results:
@@ -407,6 +408,7 @@ def _row(side: Hemisphere) -> dict[str, object]:
         "status": side.status.value,
         "reason": side.record.get("reason") or "",
         "message": side.message,
+        **provenance_of(side.record),
         **side.summary,
     }
 

@@ -175,7 +175,7 @@ def run_surrogate(arguments: Sequence[str]) -> ExitCode:
     from hipsta_bids.settings import load_settings  # noqa: PLC0415  (start-up time)
 
     settings = load_settings(options.settings)
-    from hipsta_bids.inputs import search  # noqa: PLC0415  (heavy)
+    from hipsta_bids.inputs import account, search  # noqa: PLC0415  (heavy)
     from hipsta_bids.participant.surrogate import crosscheck  # noqa: PLC0415  (heavy)
 
     request = participant.input_request(options)
@@ -183,8 +183,8 @@ def run_surrogate(arguments: Sequence[str]) -> ExitCode:
     for note in (*search.dataset_notes(request, findings.items), *findings.notes):
         echo(f"note: {note}")
     if options.dry_run:
-        echo_table(search.selection_table(findings.items))
-        echo_table(search.ignored_table(findings.ignored))
+        echo_table(account.selection_table(findings.items))
+        echo_table(account.ignored_table(findings.ignored))
         return ExitCode.OK
     participant.check_output_is_no_input(options.output_dir, findings.items)
     return crosscheck(findings.items, options.output_dir, settings, echo, warn)

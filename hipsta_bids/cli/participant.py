@@ -88,6 +88,7 @@ def add_segmentations(parser: Parser) -> None:
     add("--ashs-dir", "DIR")
     add("--hippunfold-dir", "DIR")
     add("--fs-analysis", "NAME")
+    add("--participants-map", "FILE.tsv")
     add("--ashs-atlas", "SCHEME")
     add("--scheme --protocol", "FILE.toml")
     add("--edited-dir", "DIR")
@@ -203,9 +204,9 @@ def _run(options: "Namespace", arguments: Sequence[str]) -> ExitCode:
         console.echo(f"note: region {settings.body.region} is experimental")
     request = input_request(options)
     console.echo_start(options.analysis_level, options.bids_dir)
+    from hipsta_bids.inputs import account, search  # noqa: PLC0415  (heavy)
     from hipsta_bids.inputs.edits import attach_ends  # noqa: PLC0415  (heavy)
     from hipsta_bids.inputs.maps import attach, map_requests  # noqa: PLC0415  (heavy)
-    from hipsta_bids.inputs.search import dataset_notes, ignored_table, selection_table  # noqa: PLC0415  (heavy)
     from hipsta_bids.io.volumes import limit_memory  # noqa: PLC0415  (heavy)
 
     limit_memory(options.mem)
@@ -216,12 +217,17 @@ def _run(options: "Namespace", arguments: Sequence[str]) -> ExitCode:
         return ExitCode.OK
     items, end_notes = attach_ends(findings.items, options.ends)
     items, map_notes = attach(items, requests, options.roi, options.bids_dir)
-    notes = (*dataset_notes(request, items), *findings.notes, *end_notes, *map_notes)
+    notes = (*search.dataset_notes(request, items), *findings.notes, *end_notes, *map_notes)
+    unused = (*findings.ignored, *findings.other_entries)
+    inputs = account.input_table(items, unused, options.bids_dir)
     for note in notes:
         console.echo(f"note: {note}")
+    counts = f"inputs: {account.count_inputs(inputs)}"
     if options.dry_run:
-        console.echo_table(selection_table(items))
-        console.echo_table(ignored_table(findings.ignored))
+        console.echo(counts)
+        console.echo_table(account.selection_table(items))
+        console.echo_table(account.ignored_table(findings.ignored))
+        console.echo_table(account.other_entries_table(findings.other_entries))
         _check_labels(items, settings)
         return ExitCode.OK
     check_output_is_no_input(options.output_dir, items)
@@ -229,6 +235,8 @@ def _run(options: "Namespace", arguments: Sequence[str]) -> ExitCode:
 
     notes += tuple(f"not used: {entry.path}: {entry.reason}" for entry in findings.ignored)
     out, run_options = options.output_dir, _run_options(options, arguments, notes)
+    run_options = replace(run_options, inputs=tuple(inputs), is_whole=request.is_whole)
+    console.echo(counts)
     with console.Progress(-1 if options.quiet else options.verbose) as progress:
         if collects:
             result = collect(items, out, settings, run_options)
@@ -350,13 +358,14 @@ def input_request(options: "Namespace") -> "InputRequest":
 
 
 def _settle_labels(options: "Namespace") -> None:
-    """Read names of FreeSurfer's folders as labels where they have their option, else refuse."""
-    from hipsta_bids.inputs.scan import plain_label  # noqa: PLC0415  (heavy)
+    """Read names of folders as labels where these have their option, else refuse."""
+    from hipsta_bids.inputs.tree import plain_label  # noqa: PLC0415  (heavy)
 
     for option in ("participant_label", "exclude_participant_label"):
         labels = getattr(options, option)
         wrong = [label for label in labels if label != plain_label(label)]
-        if wrong and options.freesurfer_dir is None:
+        folders = (options.freesurfer_dir, options.ashs_dir, options.hippunfold_dir)
+        if wrong and not any(folders):
             raise UsageError(
                 f"--{option.replace('_', '-')}: {wrong[0]!r} is not a BIDS label (letters and"
                 " digits)"

@@ -64,12 +64,16 @@ def read_description(root: Path) -> dict[str, Any] | None:
         return {} if path.exists() else None
 
 
-def generated_by(description: Mapping[str, Any] | None) -> list[str]:
-    """Names of the software that a dataset description says it was made by."""
+def generated_by(description: Mapping[str, Any] | None) -> dict[str, str]:
+    """Names of the software that a dataset description says it was made by, with versions."""
     entries = (description or {}).get("GeneratedBy")
     if not isinstance(entries, list):
         entries = [(description or {}).get("PipelineDescription")]  # BIDS before 1.4
-    return [str(e["Name"]) for e in entries if isinstance(e, Mapping) and "Name" in e]
+    return {
+        str(entry["Name"]): str(entry.get("Version") or "")
+        for entry in entries
+        if isinstance(entry, Mapping) and "Name" in entry
+    }
 
 
 def settle_settings(root: Path, settings: Settings) -> str:
@@ -342,7 +346,7 @@ COLUMNS = TABLES["status"]
 NOT_FINISHED = "not-finished"
 """Reason of a hemisphere that a run has not reached yet."""
 
-_KEY = ("subject", "session", "hemi", "seg")
+KEY = ("subject", "session", "hemi", "seg")
 
 #: Cells that the quality record has too.
 RECORDED = ("status", "reason", "version", "settings_hash", "input_hash")
@@ -365,7 +369,7 @@ def row_key(row: Row) -> tuple[str, ...]:
     """Cells that distinguish rows."""
     region = row.get("region", files.MISSING)
     # Rows of a table without that column are about the body.
-    return *(row[key] for key in _KEY), "body" if region == files.MISSING else region
+    return *(row[key] for key in KEY), "body" if region == files.MISSING else region
 
 
 def table_path(shard: str | None = None) -> str:
@@ -396,7 +400,7 @@ def read_table(path: Path) -> list[dict[str, str]]:
         rows = files.read_tsv(path)
     except InputError:
         return []
-    return [row for row in rows if all(key in row for key in _KEY)]
+    return [row for row in rows if all(key in row for key in KEY)]
 
 
 def _current(root: Path, rows: Sequence[dict[str, str]]) -> dict[str, str]:
@@ -466,3 +470,34 @@ def describe_columns(columns: Mapping[str, Sequence[str]]) -> dict[str, dict[str
     """Describe columns as sidecars do, by their definitions and units."""
     keys = ("Description", "Units")
     return {name: dict(zip(keys, about, strict=False)) for name, about in columns.items()}
+
+
+#: Where the labels of a hemisphere come from: keys of ``provenance`` in its quality record.
+PROVENANCE = tuple(TABLES["provenance"])
+
+
+def provenance_of(record: Mapping[str, Any]) -> dict[str, str]:
+    """Return where the labels of a quality record come from; ``n/a`` where it does not say."""
+    entry = record.get("provenance")
+    fields = entry if isinstance(entry, Mapping) else {}
+    return {key: str(fields.get(key) or files.MISSING) for key in PROVENANCE}
+
+
+def write_inputs(root: Path, rows: Iterable[Row], *, is_whole: bool = True) -> None:
+    """Write ``inputs.tsv``, an account of what a search found.
+
+    Rows of earlier searches stay if they are about other participants and this one was not about
+    every participant.
+    """
+    path, table = root / DATASET_FILES["inputs"], TABLES["inputs"]
+    columns = {"path": table["path"], **{name: COLUMNS[name] for name in KEY}, **table}
+    columns |= TABLES["provenance"]
+    listed = [{**dict.fromkeys(columns, files.MISSING), **row} for row in rows]
+    with locked(root, DATASET):
+        if not is_whole:
+            subjects = {row["subject"] for row in listed}
+            listed += [row for row in read_table(path) if row["subject"] not in subjects]
+        listed.sort(key=lambda row: [row[key] for key in KEY])
+        cells = ([row.get(name, files.MISSING) for name in columns] for row in listed)
+        files.write_tsv(path, tuple(columns), cells)
+        files.write_json(root / DATASET_FILES["inputs_sidecar"], describe_columns(columns))

@@ -31,6 +31,7 @@ from hipsta_bids.geometry.catalog import MAPS, PER_SUBFIELD, SECTIONS, SUMMARY, 
 from hipsta_bids.geometry.sheet import is_left_handed, layer_depth
 from hipsta_bids.io import files, gifti
 from hipsta_bids.io.volumes import mask_bytes
+from hipsta_bids.opening import open_regular
 from hipsta_bids.protocols import EXPERIMENTAL
 from hipsta_bids.protocols.protocol import Label, Part, Protocol, Tissue
 from hipsta_bids.types import BodyMask, Bool, Flag, Float, HemisphereMaps, Sheet, Status
@@ -474,6 +475,7 @@ def read_sheet(
     are read; without ``shape`` the last row says how many nodes there are.
     """
     try:
+        open_regular(path).close()
         if numbers is None:
             with path.open(encoding="utf-8") as file:
                 columns = file.readline().rstrip("\n").split("\t")

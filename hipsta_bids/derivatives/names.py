@@ -204,6 +204,8 @@ DATASET_FILES: dict[str, str] = {
     "citation": "CITATION.md",
     "status": "status.tsv",
     "status_sidecar": "status.json",
+    "inputs": "inputs.tsv",
+    "inputs_sidecar": "inputs.json",
     "logs": files.LOGS,
     "group": "group",
     "report": "report.html",

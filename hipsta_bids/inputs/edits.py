@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import cast
 
 from hipsta_bids.errors import HipstaError, InputError
-from hipsta_bids.inputs import scan
+from hipsta_bids.inputs import scan, tree
 from hipsta_bids.inputs.generic import is_edited, table_protocol
 from hipsta_bids.inputs.selection import Selection
 from hipsta_bids.io import files
@@ -52,7 +52,7 @@ class EditedFile(Visit):
 
 
 def edits_of_visit(
-    visit: scan.VisitFolders, root: Path, source: str, *, beside: bool
+    visit: tree.VisitFolders, root: Path, source: str, *, beside: bool
 ) -> Iterator[EditedFile]:
     """List the edited files in the folders of one visit."""
     for folder in visit.folders:
@@ -63,7 +63,7 @@ def edits_of_visit(
 
 
 def list_edits(
-    request: scan.InputRequest, selection: Selection, ignored: list[scan.Ignored]
+    request: scan.InputRequest, selection: Selection, ignored: list[tree.Ignored]
 ) -> list[EditedFile]:
     """List the edited files of ``--edited-dir`` and of the output dataset."""
     edited_files = []
@@ -77,14 +77,14 @@ def list_edits(
 
 
 def _edits_of_dataset(
-    root: Path, name: str, selection: Selection, ignored: list[scan.Ignored]
+    root: Path, name: str, selection: Selection, ignored: list[tree.Ignored]
 ) -> list[EditedFile]:
-    folders, other_entries = scan.sort_folders(root)
-    ignored += other_entries
+    folders, other_entries = tree.sort_folders(root)
+    ignored += [entry for entry in other_entries if not entry.quiet]
     selected_folders = filter(selection.wants_folder, folders)
     return [
         file
-        for visit in filter(selection.wants_visit, scan.list_visits(selected_folders, ignored))
+        for visit in filter(selection.wants_visit, tree.list_visits(selected_folders, ignored))
         for file in edits_of_visit(visit, root, name, beside=False)
     ]
 

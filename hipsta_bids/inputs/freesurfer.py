@@ -7,21 +7,18 @@ the analysis, ``.long`` in longitudinal folders, and otherwise nothing. It also 
 folders, which have the same layout.
 """
 
+import contextlib
 import os
 import re
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
+from hipsta_bids import opening
 from hipsta_bids.errors import HipstaError, InputError
-from hipsta_bids.inputs import scan
-from hipsta_bids.inputs.selection import Selection
+from hipsta_bids.inputs import scan, tree
+from hipsta_bids.inputs.selection import DESIGNS, Context, LabelFile, Verdict
 from hipsta_bids.protocols.load import load_protocol
-
-_NAME = re.compile(
-    r"(?P<hemi>[lr])h\.(?P<base>hippoAmygLabels|hippoSfLabels)(?P<analysis>.*?)"
-    r"(?:\.(?P<hierarchy>CA|FS60|HBT))?(?P<coarse>\.FSvoxelSpace)?\.(?:mgz|mgh|nii|nii\.gz)"
-)
 
 #: FreeSurfer 6.0, whose files have no hierarchies.
 _OLD = "hippoSfLabels"
@@ -40,162 +37,142 @@ _UNNAMED = "unnamed"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Analysis:
-    """One run of FreeSurfer's subfield segmentation, as its files' suffix says."""
+class Run:
+    """One run of FreeSurfer's subfield segmentation, as its files' suffix says, and its files."""
 
     scans: tuple[str, ...]
     """``("T1",)``, ``("T1", "T2")``, or nothing."""
     longitudinal: bool
     version: int | None
+    coarse: bool
+    old: bool
+    files: dict[str, Path] = field(default_factory=dict)
+    """By hierarchy."""
 
     @property
     def name(self) -> str:
         """As ``--fs-analysis`` takes it."""
         long = ["long"] if self.longitudinal else []
         version = [f"v{self.version}"] if self.version is not None else []
-        return ".".join([*(["-".join(self.scans)] if self.scans else []), *long, *version]) or (
-            _UNNAMED
-        )
+        scans = ["-".join(self.scans)] if self.scans else []
+        return ".".join([*scans, *long, *version]) or _UNNAMED
 
     @property
     def rank(self) -> tuple[object, ...]:
         """Order of preference: cross-sectional, most scans, T2 before T1, newest version."""
         scans = {0: 3, 1: 2 if self.scans == ("T1",) else 1}.get(len(self.scans), 0)
-        return self.longitudinal, scans, -(self.version or 0)
-
-    def answers(self, request: "Analysis") -> bool:
-        """Check whether this is the wanted analysis (of any version, if none is wanted)."""
-        return (
-            self.scans == request.scans
-            and self.longitudinal == request.longitudinal
-            and request.version in (None, self.version)
-        )
-
-
-def parse_analysis(text: str, *, longitudinal: bool = False) -> Analysis:
-    """Understand a suffix such as ``-T1-T2.v21`` or ``.long``, or a user's spelling of it."""
-    words = [word for word in re.split(r"[-._]", text) if word and word != _UNNAMED]
-    versions = [int(word[1:]) for word in words if re.fullmatch(r"v\d+", word)]
-    return Analysis(
-        scans=tuple(word for word in words if not re.fullmatch(r"long|v\d+", word)),
-        longitudinal=longitudinal or "long" in words,
-        version=versions[0] if versions else None,
-    )
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Run:
-    """The files of one analysis at one resolution, by hierarchy."""
-
-    analysis: Analysis
-    coarse: bool
-    old: bool
-    files: dict[str, Path]
-
-    @property
-    def rank(self) -> tuple[object, ...]:
-        return self.coarse, self.analysis.rank, self.old, self.way is None
+        version = -(self.version or 0)
+        return self.coarse, self.longitudinal, scans, version, self.old, self.way is None
 
     @property
     def way(self) -> tuple[str, str | None, str] | None:
         """The best way to get subfields from these files."""
         have = self.files.keys()
-        ways = (way for way in _WAYS if {way[0], way[1] or way[0]} <= have)
-        return next(ways, None)
+        return next((way for way in _WAYS if {way[0], way[1] or way[0]} <= have), None)
+
+    def answers(self, request: "Run") -> bool:
+        """Check whether this is the wanted analysis (of any version, if none is wanted)."""
+        is_version = request.version in (None, self.version)
+        key = (self.scans, self.longitudinal)
+        return is_version and key == (request.scans, request.longitudinal)
 
 
-def volume_table(path: Path) -> Path | None:
-    """Name the table of volumes that was written with a segmentation."""
-    match = _NAME.fullmatch(path.name)
-    if match is None:
-        return None
-    return path.with_name(f"{match['hemi']}h.hippoSfVolumes{match['analysis']}.txt")
+def parse_analysis(
+    text: str, *, longitudinal: bool = False, coarse: bool = False, old: bool = False
+) -> Run:
+    """Understand a suffix such as ``-T1-T2.v21`` or ``.long``, or a user's spelling of it."""
+    words = [word for word in re.split(r"[-._]", text) if word and word != _UNNAMED]
+    versions = [int(word[1:]) for word in words if re.fullmatch(r"v\d+", word)]
+    return Run(
+        scans=tuple(word for word in words if not re.fullmatch(r"long|v\d+", word)),
+        longitudinal=longitudinal or "long" in words,
+        version=versions[0] if versions else None,
+        coarse=coarse,
+        old=old,
+    )
 
 
-def without_labels(visit: scan.VisitFolders) -> Iterator[Path]:
-    """List the subjects' folders of FreeSurfer that hold no segmentation of subfields."""
-    for folder in visit.folders:
-        if folder.path.name == "mri" and not any(map(_NAME.fullmatch, folder.names)):
-            yield folder.path.parent
-
-
-def same_labels(folders: Iterable[scan.SubjectFolder]) -> dict[str, HipstaError]:
-    """Describe, by label, the folders of several names that would get the same label."""
-    spellings: dict[str, set[str]] = {}
-    renamed = set()
-    for folder in folders:
-        spellings.setdefault(folder.subject, set()).add(folder.spelling)
-        if folder.renamed:
-            renamed.add(folder.subject)
-    return {
-        label: InputError(
-            f"{' and '.join(sorted(names))} would all be sub-{label}; give links with other names"
-            " in place of all but one",
-            reason="same-label",
-        )
-        for label, names in spellings.items()
-        if len(names) > 1 and label in renamed
-    }
-
-
-def find_freesurfer(
-    visit: scan.VisitFolders, source: scan.Source, selection: Selection
+def choose_run(
+    files: Sequence[LabelFile], context: Context, hemi: str
 ) -> Iterator[scan.HemisphereInput]:
-    """Find FreeSurfer's segmentations of one visit.
+    """Choose one hemisphere's files among FreeSurfer's.
 
     Taken are the files that are not resampled, of the preferred analysis (see
     :attr:`Analysis.rank`), in the full hierarchy; else ``.FS60`` or ``.CA``, combined with
     ``.HBT`` where that exists.
     """
-    for hemi in selection.wanted_hemis():
-        runs = _runs(visit, hemi)
-        if not runs:
-            continue
-        request = parse_analysis(selection.fs_analysis) if selection.fs_analysis else None
-        matching = [run for run in runs if request is None or run.analysis.answers(request)]
-        usable = [run for run in matching if run.way]
-        best = usable[0] if usable else None
-        problem = None if best else _problem(runs, matching, selection.fs_analysis)
-        run = best or runs[0]
-        subfields, parts, protocol = run.way or (next(iter(run.files)), None, "freesurfer")
-        files = tuple(run.files[name] for name in (subfields, parts) if name)
-        if run.old and run.way:
-            protocol = "freesurferFS60"
-        coarse = "only .FSvoxelSpace exists: labels resampled to 1 mm lose thin layers"
-        yield scan.HemisphereInput(
-            subject=visit.subject,
-            session=visit.session,
-            hemi=hemi,
-            protocol=load_protocol(protocol),
-            files=files,
-            parts_protocol=load_protocol("freesurferHBT") if parts else None,
-            source=source.name,
-            source_path=source.path,
-            explanation=_why(run, subfields, parts, selection.fs_analysis),
-            passed_over=tuple(_passed_over(runs, run, files)),
-            problem=problem,
-            notes=(coarse,) if best and run.coarse else (),
-        )
+    analysis = context.selection.fs_analysis
+    request = parse_analysis(analysis) if analysis else None
+    runs = _runs(files)
+    matching = [
+        run
+        for run in runs
+        if (run.answers(request) if request else run.longitudinal == context.longitudinal)
+    ]
+    best = next((run for run in matching if run.way), None)
+    run = best or runs[0]
+    subfields, parts, protocol = run.way or (next(iter(run.files)), None, "freesurfer")
+    paths = [run.files[name] for name in (subfields, parts) if name]
+    coarse = "only .FSvoxelSpace exists: labels resampled to 1 mm lose thin layers"
+    verdict = Verdict(
+        protocol=load_protocol("freesurferFS60" if run.old and run.way else protocol),
+        parts_protocol=load_protocol("freesurferHBT") if parts else None,
+        explanation=_why(run, subfields, parts, analysis),
+        problem=None if best else _problem(runs, matching, analysis),
+        notes=(coarse,) if best and run.coarse else (),
+        provenance={
+            "tool": "freesurfer",
+            "version": _version(run),
+            "analysis": "-".join(run.scans) or _UNNAMED,
+            "hierarchy": "+".join(name for name in (subfields, parts) if name),
+            "space": "FSvoxelSpace" if run.coarse else None,
+            "design": DESIGNS[run.longitudinal],
+        },
+    )
+    yield context.input(hemi, verdict, paths, _passed_over(runs, run, paths))
 
 
-def _runs(visit: scan.VisitFolders, hemi: str) -> list[_Run]:
+def _version(run: Run) -> str | None:
+    """Read the version of the subfields in the file's name, or else that of FreeSurfer itself."""
+    if run.version is not None:
+        return f"v{run.version}"
+    stamp = next(iter(run.files.values())).parent.parent / "scripts" / "build-stamp.txt"
+    with contextlib.suppress(OSError, ValueError):
+        match = re.search(r"\d+\.\d+(?:\.\d+)?", opening.read_text(stamp, opening.SETTINGS))
+        return match[0] if match else None
+    return None
+
+
+def is_longitudinal(files: Iterable[LabelFile]) -> bool:
+    """Choose between the kinds of runs of a visit: both sides come from one, cross-sectional first.
+
+    The longitudinal run comes first only if it alone has more sides.
+    """
+    sides: dict[bool, set[str | None]] = {False: set(), True: set()}
+    for file in files:
+        longitudinal = "long" in re.split(r"[-._]", file.traits.get("analysis") or "")
+        sides[file.longitudinal or longitudinal].add(file.hemi)
+    return len(sides[True]) > len(sides[False])
+
+
+def _runs(files: Iterable[LabelFile]) -> list[Run]:
     """Group a hemisphere's files by analysis and resolution, best first."""
-    runs: dict[tuple[object, ...], _Run] = {}
-    for folder in _each_once(visit.folders):
-        for name in folder.names:
-            match = _NAME.fullmatch(name) if ".hippo" in name else None
-            if match is None or match["hemi"] != hemi.lower():
-                continue
-            analysis = parse_analysis(match["analysis"], longitudinal=folder.longitudinal)
-            coarse, old = match["coarse"] is not None, match["base"] == _OLD
-            key = (str(folder.path), analysis.name, coarse, old)
-            run = runs.setdefault(key, _Run(analysis=analysis, coarse=coarse, old=old, files={}))
-            # Of several formats, the first by name: .mgz before .nii.
-            run.files.setdefault(match["hierarchy"] or "full", folder.path / name)
+    runs: dict[tuple[object, ...], Run] = {}
+    for file in files:
+        traits = file.traits
+        run = parse_analysis(
+            traits["analysis"] or "",
+            longitudinal=file.longitudinal,
+            coarse=traits["coarse"] is not None,
+            old=traits["base"] == _OLD,
+        )
+        run = runs.setdefault((str(file.path.parent), run.name, run.coarse, run.old), run)
+        # Of several formats, the first by name: .mgz before .nii.
+        run.files.setdefault(traits["hierarchy"] or "full", file.path)
     return sorted(runs.values(), key=lambda run: run.rank)
 
 
-def _each_once(folders: tuple[scan.Folder, ...]) -> tuple[scan.Folder, ...]:
+def each_once(folders: tuple[tree.Folder, ...]) -> tuple[tree.Folder, ...]:
     """Leave out longitudinal folders that are links to others here, as FastSurfer's tools make."""
     if not any(folder.longitudinal for folder in folders):
         return folders
@@ -203,38 +180,41 @@ def _each_once(folders: tuple[scan.Folder, ...]) -> tuple[scan.Folder, ...]:
     return tuple(f for f in folders if not f.longitudinal or os.path.realpath(f.path) not in paths)
 
 
-def _why(run: _Run, subfields: str, parts: str | None, requested: str | None) -> str:
+def _why(run: Run, subfields: str, parts: str | None, requested: str | None) -> str:
     hierarchy = "full hierarchy" if subfields == "full" else f"subfields from .{subfields}"
     if run.old:
         hierarchy = "subfields of FreeSurfer 6.0"
     combined = f", head/body/tail from .{parts}" if parts else ""
     choice = " (--fs-analysis)" if requested else ""
-    return f"{hierarchy}{combined}, analysis {run.analysis.name}{choice}"
+    return f"{hierarchy}{combined}, analysis {run.name}{choice}"
 
 
-def _passed_over(
-    runs: list[_Run], best: _Run, used_paths: tuple[Path, ...]
-) -> Iterator[tuple[str, str]]:
+def _passed_over(runs: list[Run], best: Run, used_paths: list[Path]) -> Iterator[tuple[Path, str]]:
     for run in runs:
+        name = run.name
         for hierarchy, path in run.files.items():
-            if path in used_paths:
-                continue
+            reason = f"analysis {name} comes later by default; --fs-analysis {name} selects it"
             if run.coarse and not best.coarse:
                 reason = "resampled to 1 mm; a finer file exists"
             elif run is best:
                 reason = f"{hierarchy} hierarchy: less detail than what was taken"
-            else:
-                name = run.analysis.name
-                reason = f"analysis {name} comes later by default; --fs-analysis {name} selects it"
-            yield path.name, reason
+            if path not in used_paths:
+                yield path, reason
 
 
-def _problem(runs: list[_Run], matching: list[_Run], requested: str | None) -> HipstaError:
+def _problem(runs: list[Run], matching: list[Run], requested: str | None) -> HipstaError:
     folder = next(iter(runs[0].files.values())).parent
     if requested and not matching:
-        names = ", ".join(dict.fromkeys(run.analysis.name for run in runs))
+        names = ", ".join(dict.fromkeys(run.name for run in runs))
         return InputError(
             f"{folder}: no analysis {requested} here (found {names}); change --fs-analysis",
+            reason="analysis-missing",
+        )
+    if not matching:
+        kind = "longitudinal" if runs[0].longitudinal else "cross-sectional"
+        return InputError(
+            f"{folder}: this side has a {kind} run only, and the visit's other side another kind; "
+            "choose with --fs-analysis",
             reason="analysis-missing",
         )
     return InputError(

@@ -2,15 +2,15 @@
 
 import csv
 import re
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import cache, lru_cache
 from pathlib import Path
 
+from hipsta_bids import opening
 from hipsta_bids.errors import HipstaError, InputError, ProtocolError
-from hipsta_bids.inputs import scan
-from hipsta_bids.inputs.selection import Selection
-from hipsta_bids.inputs.tools import is_hippunfold
+from hipsta_bids.inputs import scan, tree
+from hipsta_bids.inputs.selection import Context, LabelFile, Verdict
 from hipsta_bids.io.files import entities
 from hipsta_bids.protocols.load import NamedCode, protocol_from_names
 from hipsta_bids.protocols.protocol import Protocol
@@ -55,7 +55,7 @@ def table_protocol(path: Path, name: str) -> Protocol:
 def read_table(path: Path) -> tuple[NamedCode, ...]:
     """Read a label table."""
     try:
-        text = path.read_text("utf-8-sig")
+        text = opening.read_text(path, opening.SETTINGS, encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(
             f"{path}: cannot read the label table ({error}); it has to be UTF-8 text",
@@ -113,7 +113,7 @@ def forget_tables() -> None:
 def _tables_in(folder: Path) -> tuple[dict[str, dict[str, str]], bool]:
     """List a folder's ``dseg.tsv`` tables by the entities they require, and look for ITK-SNAP's."""
     try:
-        names = scan.list_folder(folder)[1]
+        names = tree.list_folder(folder)[1]
     except InputError:  # no such folder, which is the usual case for "snap"
         return {}, False
     parsed = {name: entities(name) for name in names if name.endswith("dseg.tsv")}
@@ -131,25 +131,6 @@ _IMAGES = {".nii.gz", ".nii", ".mgz", ".mgh"}
 _OWN_SPACE = re.compile(r"|T1w|T2w|orig|scanner|individual|crop\w*")
 
 
-@dataclass(frozen=True, kw_only=True)
-class _File:
-    path: Path
-    space: str
-    protocol: Protocol | None
-    """None where nothing says what the codes are."""
-    origin: str
-    """Where the protocol comes from."""
-    problem: HipstaError | None = None
-    """Why there is no protocol."""
-
-    @property
-    def rank(self) -> tuple[bool, bool, bool, int, str]:
-        """Described, in the subject's space, cropped or in no named space, fewest entities."""
-        coarse = bool(self.space) and not self.space.startswith("crop")
-        template = not _OWN_SPACE.fullmatch(self.space)
-        return self.protocol is None, template, coarse, self.path.name.count("_"), self.path.name
-
-
 def is_edited(name: str) -> bool:
     """Check whether a file name is that of edited labels or an edited mask."""
     if "desc-edited" not in name:
@@ -162,26 +143,35 @@ def is_edited(name: str) -> bool:
     )
 
 
-def find_named(
-    visit: scan.VisitFolders, source: scan.Source, selection: Selection
+def choose_described(
+    files: Sequence[LabelFile], context: Context, hemi: str
 ) -> Iterator[scan.HemisphereInput]:
-    """Find segmentations of one visit that a table or the user's protocol describes.
+    """Choose one hemisphere's files among those that a table or the user's protocol describes.
 
     Files whose table names no subiculum and CA1 are of something else, and are left out; so are
     files without any table in datasets that the user did not name.
     """
-    for hemi in selection.wanted_hemis():
-        files = _files(visit, hemi, source, selection)
-        groups: dict[str, list[_File]] = {}
-        for file in sorted(files, key=lambda file: file.rank):
-            groups.setdefault(file.protocol.name if file.protocol else "", []).append(file)
-        for name, group in groups.items():
-            # A file that nothing describes matters only if there is no other.
-            if name or (source.explicit and len(groups) == 1):
-                yield _choose(group, visit, hemi, source)
+    described = [(file, verdict) for file in files if (verdict := _describe(file, context))]
+    groups: dict[str, list[tuple[LabelFile, Verdict]]] = {}
+    ranked = [(replace(file, rank=_rank(file, verdict)), verdict) for file, verdict in described]
+    for file, verdict in sorted(ranked, key=lambda pair: (pair[0].rank, pair[0].path.name)):
+        name = "" if verdict.problem else verdict.protocol.name
+        groups.setdefault(name, []).append((file, verdict))
+    for name, group in groups.items():
+        # A file that nothing describes matters only if there is no other.
+        if name or (context.source.explicit and len(groups) == 1):
+            yield _choose(group, context, hemi)
 
 
-def without_side(visit: scan.VisitFolders) -> Iterator[scan.Ignored]:
+def _rank(file: LabelFile, verdict: Verdict) -> tuple[bool, bool, bool, int]:
+    """Rank files in the subject's space, cropped or in no named space, with fewest entities."""
+    space, name = file.traits.get("space") or "", file.path.name
+    coarse = bool(space) and not space.startswith("crop")
+    problem = verdict.problem is not None
+    return problem, not _OWN_SPACE.fullmatch(space), coarse, name.count("_")
+
+
+def without_side(visit: tree.VisitFolders) -> Iterator[tree.Ignored]:
     """List label images whose names have a ``hemi`` that is neither L nor R."""
     for folder in visit.folders:
         for name in folder.names:
@@ -195,91 +185,65 @@ def without_side(visit: scan.VisitFolders) -> Iterator[scan.Ignored]:
                 and pairs["extension"] in _IMAGES
             ):
                 reason = f"hemi-{hemi} is neither hemi-L nor hemi-R"
-                yield scan.Ignored(path=folder.path / name, reason=reason, subject=visit.subject)
+                yield tree.Ignored(path=folder.path / name, reason=reason, subject=visit.subject)
 
 
 def _choose(
-    files: list[_File], visit: scan.VisitFolders, hemi: str, source: scan.Source
+    group: list[tuple[LabelFile, Verdict]], context: Context, hemi: str
 ) -> scan.HemisphereInput:
-    best = files[0]
-    problem = best.problem
-    if problem is None and not _OWN_SPACE.fullmatch(best.space):
+    """Take the first of several files of one protocol."""
+    (best, verdict), visit = group[0], context.visit
+    problem, space = verdict.problem, best.traits.get("space") or ""
+    if problem is None and not _OWN_SPACE.fullmatch(space):
         problem = InputError(
-            f"{best.path}: space {best.space} is a template's, which changes thickness; "
+            f"{best.path}: space {space} is a template's, which changes thickness; "
             "use labels in the subject's own space",
             reason="template-space",
         )
+    tool = next(iter(context.source.generators), "")
     order = "the subject's own space, the finest grid and the shortest name come first"
-    named, visit_entities = entities(best.path.name), {"sub": visit.subject, "ses": visit.session}
     mismatches = [
-        f"{k}-{named[k]}" for k, v in visit_entities.items() if v and named.get(k, v) != v
+        f"{key}-{best.traits[key]}"
+        for key, label in {"sub": visit.subject, "ses": visit.session}.items()
+        if label and best.traits.get(key, label) != label
     ]
-    return scan.HemisphereInput(
-        subject=visit.subject,
-        session=visit.session,
-        hemi=hemi,
-        protocol=best.protocol
-        or scan.unknown_protocol("unknown", f"Labels of {best.path.name}, not described"),
-        files=(best.path,),
-        source=source.name,
-        source_path=source.path,
-        explanation=f"labels named by {best.origin}" if best.protocol else "labels not described",
-        passed_over=tuple((file.path.name, order) for file in files[1:]),
+    verdict = replace(
+        verdict,
         problem=problem,
         notes=(f"the file's name says {'_'.join(mismatches)}",) if mismatches else (),
+        provenance={"atlas": verdict.protocol.name},
     )
+    files = [file for file, _ in group]
+    passed_over = [(file.path, order) for file in files[1:]]
+    return context.first(files, verdict, hemi, passed_over, tool=tool)
 
 
-def _files(
-    visit: scan.VisitFolders, hemi: str, source: scan.Source, selection: Selection
-) -> Iterator[_File]:
-    for folder in visit.folders:
-        for name in folder.names:
-            if f"_hemi-{hemi}_" not in name or "dseg." not in name or is_edited(name):
-                continue
-            pairs = entities(name)
-            path = folder.path / name
-            if (
-                pairs["suffix"] == "dseg"
-                and pairs["extension"] in _IMAGES
-                and not is_hippunfold(name, source)
-                and selection.wants_file(path)
-            ):
-                file = _describe(path, pairs, source, selection)
-                if file is not None:
-                    yield file
-
-
-def _describe(
-    path: Path, pairs: dict[str, str], source: scan.Source, selection: Selection
-) -> _File | None:
+def _describe(file: LabelFile, context: Context) -> Verdict | None:
     """Find out what a file's labels mean; None if they are not the hippocampus's."""
-    space = pairs.get("space", "")
-    users = selection.protocol
+    path, users, root = file.path, context.selection.protocol, context.source.path
     # A tool's protocol, which the user chose for the files of that tool, replaces no table.
-    table = find_table(path, source.path) if users is None or users.tool else None
-    if users is not None and table is None:
-        return _File(path=path, space=space, protocol=users, origin="--scheme")
-    problem: HipstaError
-    if table is None:
-        problem = ProtocolError(
-            f"{path}: no _dseg.tsv says what its labels are; add one, "
-            "or describe them in a TOML file and pass it with --scheme",
-            reason="undescribed-labels",
-        )
-        return _File(path=path, space=space, protocol=None, origin="", problem=problem)
+    table = find_table(path, root) if users is None or users.tool else None
+    problem: HipstaError = ProtocolError(
+        f"{path}: no _dseg.tsv says what its labels are; add one, "
+        "or describe them in a TOML file and pass it with --scheme",
+        reason="undescribed-labels",
+    )
     try:
-        protocol = table_protocol(table, _protocol_name(pairs, source))
+        protocol = table_protocol(table, _protocol_name(file, context)) if table else users
+        if protocol is not None:
+            origin = table.name if table else "--scheme"
+            return Verdict(protocol=protocol, explanation=f"labels named by {origin}")
     except (InputError, ProtocolError) as error:
         if error.reason == "unclear-names":
             return None
-        return _File(path=path, space=space, protocol=None, origin=table.name, problem=error)
-    return _File(path=path, space=space, protocol=protocol, origin=table.name)
+        problem = error
+    unknown = scan.unknown_protocol("unknown", f"Labels of {path.name}, not described")
+    return Verdict(protocol=unknown, explanation="labels not described", problem=problem)
 
 
-def _protocol_name(pairs: dict[str, str], source: scan.Source) -> str:
+def _protocol_name(file: LabelFile, context: Context) -> str:
     """Name a protocol after the file's atlas, or else its dataset."""
-    for text in (pairs.get("atlas"), pairs.get("seg"), source.name):
+    for text in (file.traits.get("atlas"), file.traits.get("seg"), context.source.name):
         plain = re.sub("[^A-Za-z0-9]", "", text or "")
         if plain:
             return plain

@@ -6,15 +6,16 @@ is not understood, hides nothing but itself, and is named.
 
 import os
 import re
-import stat
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from hipsta_bids.derivatives.dataset import NAME, generated_by, read_description
+from hipsta_bids.derivatives.dataset import NAME, PROVENANCE, generated_by, read_description
 from hipsta_bids.errors import HipstaError, InputError
+from hipsta_bids.inputs import tree
+from hipsta_bids.io.files import MISSING
 from hipsta_bids.protocols.protocol import Protocol
-from hipsta_bids.types import GivenEnd, Hemisphere, Visit
+from hipsta_bids.types import GivenEnd, Hemisphere
 
 # What is asked for, and what was found: the values that the search for inputs works with.
 
@@ -53,6 +54,19 @@ class InputRequest:
     """Where results go, and where a person may have corrected them."""
     bids_filter_file: Path | None = None
     bids_database_dir: Path | None = None
+    participants_map: Path | None = None
+    """Table with the participant and session of each folder."""
+
+    @property
+    def any_name(self) -> bool:
+        """Whether an option takes folders of any name."""
+        return any((self.freesurfer_dir, self.ashs_dir, self.hippunfold_dir))
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether all participants and sessions are asked for."""
+        limits = (self.participant_labels, self.excluded_labels, self.session_labels)
+        return not any(limits) and self.bids_filter_file is None and self.hemis == HEMIS
 
 
 def unknown_protocol(name: str, title: str) -> Protocol:
@@ -114,6 +128,8 @@ class HemisphereInput(Hemisphere):
     """Found, but not usable: this hemisphere fails, the others go on."""
     notes: tuple[str, ...] = ()
     """What a reader should know about this choice."""
+    provenance: Mapping[str, str] = field(default_factory=dict)
+    """Tool, version and so on, as far as names tell (``PROVENANCE`` of ``derivatives``)."""
     edits: tuple[Edit, ...] = ()
     """Corrections by a person that take the place of what the files say."""
     ends: tuple[GivenEnd, ...] = ()
@@ -133,6 +149,13 @@ class HemisphereInput(Hemisphere):
         return tuple(dict.fromkeys(edit.kind for edit in self.edits))
 
     @property
+    def origin(self) -> dict[str, str]:
+        """Where the labels come from, as far as is known before they are read."""
+        return {**dict.fromkeys(PROVENANCE, MISSING), **self.provenance} | {
+            "edited": "+".join(self.edited) or MISSING
+        }
+
+    @property
     def code_offset(self) -> int:
         """What is to be subtracted from the codes of this hemisphere."""
         return self.protocol.shift(self.hemi) if self.bilateral else 0
@@ -143,28 +166,6 @@ class HemisphereInput(Hemisphere):
         return self.subject, self.session or "", self.hemi, self.protocol.name
 
 
-#: ``sub-X``, ``sub-X_ses-Y``, and FreeSurfer's longitudinal ``sub-X_ses-Y.long.BASE``.
-_SUBJECT = re.compile(
-    r"sub-(?P<subject>[A-Za-z0-9+]+)(?:_ses-(?P<session>[A-Za-z0-9+]+))?(?P<long>\.long\..+)?"
-)
-
-#: The same for FreeSurfer's folders of any name.
-_ANY_NAME = re.compile(
-    r"(?:sub-)?(?P<subject>.+?)(?:_ses-(?P<session>[A-Za-z0-9+]+))?(?P<long>\.long\..+)?"
-)
-
-#: What comes with FreeSurfer and is nobody's: its template brains and averages.
-_TEMPLATE = re.compile(r"fsaverage.*|cvs_avg35.*|[lr]h\.EC_average|V1_average")
-
-_SESSION = re.compile(r"ses-(?P<session>[A-Za-z0-9+]+)")
-
-#: Folders below a subject or a session that can hold segmentations.
-_INNER = re.compile(r"anat|mri|final|seg\w*")
-
-LAYOUTS = ("freesurfer", "ashs", "hippunfold", "tools", "named")
-"""Kinds of folders that can be searched; ``tools`` are those without an option of their own, and
-``named`` is any ``_hemi-?_..._dseg`` file with names."""
-
 #: Never indexed: nothing in them says who takes part.
 _IGNORED = tuple(
     re.compile(rf"^/{name}(/|$)")
@@ -172,211 +173,9 @@ _IGNORED = tuple(
 )
 
 
-@dataclass(frozen=True, kw_only=True)
-class SubjectFolder(Visit):
-    """A folder that belongs to a subject, by its name."""
-
-    longitudinal: bool
-    path: Path
-
-    @property
-    def renamed(self) -> bool:
-        """Whether the label is not what the folder is called."""
-        return _SUBJECT.fullmatch(self.path.name) is None
-
-    @property
-    def spelling(self) -> str:
-        """The part of its name that stands for the subject."""
-        return re.split(r"_ses-|\.long\.", self.path.name)[0]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Ignored:
-    """An entry that looks as if it were meant to be used, but was not."""
-
-    path: Path
-    reason: str
-    """In one phrase."""
-    subject: str | None = None
-    """Label of the subject that it seems to belong to; ``None`` for a whole dataset."""
-    template: bool = False
-    """One of FreeSurfer's template brains, which nobody misses."""
-    inside: Path | None = None
-    """The subject's folder that it is in, if it is not that itself."""
-
-    @property
-    def name(self) -> str:
-        """Its name, with that of the subject's folder."""
-        return str(self.path.relative_to(self.inside.parent)) if self.inside else self.path.name
-
-
-@dataclass(frozen=True, kw_only=True)
-class Folder:
-    """A folder and the names of the files directly in it."""
-
-    path: Path
-    names: tuple[str, ...]
-    longitudinal: bool = False
-
-
-@dataclass(frozen=True, kw_only=True)
-class VisitFolders(Visit):
-    """All candidate folders of one subject, or of one of its sessions."""
-
-    folders: tuple[Folder, ...]
-
-
-def list_folder(path: Path) -> tuple[list[str], list[str]]:
-    """List a folder."""
-    folders: list[str] = []
-    files: list[str] = []
-    try:
-        with os.scandir(path) as entries:
-            for entry in entries:
-                if not entry.name.startswith("."):
-                    (folders if _is_folder(entry) else files).append(entry.name)
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: no such folder; check the path") from error
-    except NotADirectoryError as error:
-        raise InputError(f"{path}: is a file, but a folder is needed") from error
-    except OSError as error:
-        raise InputError(
-            f"{path}: cannot list the folder ({error.strerror}); check its permissions"
-        ) from error
-    return sorted(folders), sorted(files)
-
-
-def _is_folder(entry: os.DirEntry[str]) -> bool:
-    """Whether it can be listed as a folder; a link that leads back to itself cannot."""
-    try:
-        return entry.is_dir()
-    except OSError:
-        return False
-
-
-def plain_label(name: str) -> str:
-    """Make a BIDS label of a name: ``AD_05`` and ``sub-AD_05`` become ``AD05``."""
-    return re.sub(r"[^A-Za-z0-9+]", "", name.removeprefix("sub-"))
-
-
-def sort_folders(
-    root: Path, *, any_name: bool = False
-) -> tuple[list[SubjectFolder], list[Ignored]]:
-    """List the subjects' folders of a dataset, and what looks like one, each sorted by name.
-
-    With ``any_name``, FreeSurfer's folders (they hold ``mri``) need not be called ``sub-*``.
-    """
-    names, files = list_folder(root)
-    entries = [_read_name(root / name, any_name=any_name) for name in names]
-    no_folder = "no folder, or a link that leads nowhere"
-    return (
-        [entry for entry in entries if isinstance(entry, SubjectFolder)],
-        [entry for entry in entries if isinstance(entry, Ignored)]
-        + [
-            Ignored(path=root / name, reason=no_folder, subject=match["subject"])
-            for name in files
-            if (match := _SUBJECT.fullmatch(name))
-        ],
-    )
-
-
-def _read_name(path: Path, *, any_name: bool) -> SubjectFolder | Ignored | None:
-    """Tell by the name whose folder it is, or why it is nobody's; ``None`` if it claims nothing."""
-    match = _SUBJECT.fullmatch(path.name)
-    label = match["subject"] if match else ""
-    if match is None:
-        claims = path.name.startswith("sub-")
-        freesurfer = _holds_mri(path, if_closed=any_name)
-        if not (claims or freesurfer):
-            return None
-        match = _ANY_NAME.fullmatch(path.name)
-        label = plain_label(match["subject"]) if match else ""
-        if _TEMPLATE.fullmatch(path.name):
-            reason = "comes with FreeSurfer, and is no subject"
-            return Ignored(path=path, reason=reason, subject=label, template=True)
-        if match is None or not label:
-            return Ignored(path=path, reason="no letter or digit in its name", subject=label)
-        if not (any_name and freesurfer):
-            reason = "its name is not sub-LABEL or sub-LABEL_ses-LABEL, of letters and digits"
-            if freesurfer:
-                reason += f"; --freesurfer-dir {path.parent} takes it as sub-{label}"
-            return Ignored(path=path, reason=reason, subject=label)
-    return SubjectFolder(
-        subject=label,
-        session=match["session"],
-        longitudinal=match["long"] is not None,
-        path=path,
-    )
-
-
-def _holds_mri(path: Path, *, if_closed: bool) -> bool:
-    """Whether it looks like a subject's folder of FreeSurfer."""
-    try:
-        return stat.S_ISDIR((path / "mri").stat().st_mode)
-    except PermissionError:
-        return if_closed
-    except OSError:
-        return False
-
-
-def list_visits(
-    folders: Iterable[SubjectFolder], ignored: list[Ignored] | None = None
-) -> list[VisitFolders]:
-    """List the candidate files of some subjects; what cannot be listed is added to ``ignored``."""
-    folders_of: dict[tuple[str, str | None], list[Folder]] = {}
-    for folder in folders:
-        for session, inner in _inner_folders(folder, [] if ignored is None else ignored):
-            folders_of.setdefault((folder.subject, session), []).append(inner)
-    return [
-        VisitFolders(subject=subject, session=session, folders=tuple(inner))
-        for (subject, session), inner in folders_of.items()
-    ]
-
-
-def _inner_folders(
-    folder: SubjectFolder, ignored: list[Ignored]
-) -> Iterator[tuple[str | None, Folder]]:
-    """Walk over a subject's folder: itself, its sessions, and the folders inside both."""
-    waiting = [(folder.session, folder.path, True)]
-    while waiting:
-        session, path, outer = waiting.pop()
-        listed = _try_to_list(path, ignored, folder)
-        if listed is None:
-            continue
-        names, files = listed
-        if files:
-            yield (
-                session,
-                Folder(path=path, names=tuple(files), longitudinal=folder.longitudinal),
-            )
-        for name in names if outer else ():
-            match = _SESSION.fullmatch(name)
-            if match and session is None:
-                waiting.append((match["session"], path / name, True))
-            elif _INNER.fullmatch(name):
-                waiting.append((session, path / name, False))
-            elif match is None and name.startswith("ses-"):
-                reason = "its name is not ses-LABEL, of letters and digits"
-                ignored.append(
-                    Ignored(
-                        path=path / name, reason=reason, subject=folder.subject, inside=folder.path
-                    )
-                )
-
-
-def _try_to_list(
-    path: Path, ignored: list[Ignored], folder: SubjectFolder | None = None
-) -> tuple[list[str], list[str]] | None:
-    """List a folder, or add it to what is ignored."""
-    try:
-        return list_folder(path)
-    except InputError as error:
-        reason = str(error).removeprefix(f"{path}: ")
-        subject_folder = (folder.subject, folder.path) if folder else (None, None)
-        ignored.append(
-            Ignored(path=path, reason=reason, subject=subject_folder[0], inside=subject_folder[1])
-        )
-        return None
+LAYOUTS = ("freesurfer", "ashs", "hippunfold", "tools", "named")
+"""Kinds of folders that can be searched; ``tools`` are those without an option of their own, and
+``named`` is any ``_hemi-?_..._dseg`` file with names."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -387,18 +186,29 @@ class Source:
     path: Path
     explicit: bool
     """Given by the user, not found by default."""
+    origin: str = ""
+    """Where it was found by default: ``derivatives`` or ``sourcedata``."""
     layouts: tuple[str, ...] = LAYOUTS
     """Kinds of segmentation to look for here."""
-    generators: frozenset[str] = frozenset()
-    """Software named in its ``dataset_description.json``."""
+    generators: Mapping[str, str] = field(default_factory=dict)
+    """Software named in its ``dataset_description.json``, with versions."""
+
+    people: tree.People = field(default_factory=dict)
+    """Of ``--participants-map``."""
 
     @property
-    def any_name(self) -> bool:
-        """Whether subjects' folders may have other names than ``sub-*``."""
-        return self.layouts == ("freesurfer",)
+    def any_name(self) -> str:
+        """The program whose folders may have other names than ``sub-*``; empty if none may."""
+        return self.layouts[0] if len(self.layouts) == 1 else ""
+
+    def folders(self) -> tuple[list[tree.SubjectFolder], list[tree.Ignored]]:
+        """List the subjects' folders, and all other entries."""
+        return tree.sort_folders(self.path, any_name=self.any_name, people=self.people)
 
 
-def list_sources(request: InputRequest, ignored: list[Ignored] | None = None) -> tuple[Source, ...]:
+def list_sources(
+    request: InputRequest, ignored: list[tree.Ignored] | None = None
+) -> tuple[Source, ...]:
     """List the datasets to search; earlier ones take precedence.
 
     What the user names comes first (``-d``, then ``--freesurfer-dir``, ``--ashs-dir`` and
@@ -411,73 +221,98 @@ def list_sources(request: InputRequest, ignored: list[Ignored] | None = None) ->
     sources: dict[Path, Source] = {}
     for source in _candidates(request, [] if ignored is None else ignored):
         description = read_description(source.path)
-        made_by = frozenset(name.lower() for name in generated_by(description))
+        made_by = {name.lower(): version for name, version in generated_by(description).items()}
         key = Path(os.path.realpath(source.path))  # also where links go round in circles
         if NAME not in {name.replace("-", "_") for name in made_by} and key not in sources:
             sources[key] = replace(source, generators=made_by)
     return tuple(sources.values())
 
 
-def _candidates(request: InputRequest, ignored: list[Ignored]) -> Iterator[Source]:
-    top, _ = list_folder(request.bids_dir)
+def _candidates(request: InputRequest, ignored: list[tree.Ignored]) -> Iterator[Source]:
+    top, _ = tree.list_folder(request.bids_dir)
+    people = tree.read_people(request.participants_map)
     options = (request.freesurfer_dir, request.ashs_dir, request.hippunfold_dir)
     named: list[tuple[str, Path, tuple[str, ...]]]
     named = [(name, path, LAYOUTS) for name, path in request.derivatives.items()]
     named += [(name, path, (name,)) for name, path in zip(LAYOUTS, options, strict=False) if path]
     for name, path, layouts in named:
-        list_folder(path)  # what the user named has to be readable
-        source = Source(name=name, path=path, explicit=True, layouts=layouts)
-        for root in _datasets(path, 1, ignored, any_name=source.any_name) or [path]:
+        tree.list_folder(path)  # what the user named has to be readable
+        source = Source(name=name, path=path, explicit=True, layouts=layouts, people=people)
+        roots = [] if tree.people_in(path, people) else _datasets(source, 1, ignored)
+        for root in roots or [path]:
             yield replace(source, path=root)
     for folder in ("derivatives", "sourcedata"):
         if folder in top:
-            for root in _datasets(request.bids_dir / folder, 2, ignored):
-                yield Source(name=root.name, path=root, explicit=False)
+            path = request.bids_dir / folder
+            source = Source(name=folder, path=path, explicit=False, origin=folder, people=people)
+            for root in _datasets(source, 2, ignored):
+                yield replace(source, name=root.name, path=root)
     # A dataset without a description may be a bare folder of subjects.
     description = read_description(request.bids_dir)
     derived = description is None or description.get("DatasetType") == "derivative"
     if derived or generated_by(description):
-        yield Source(name=request.bids_dir.resolve().name, path=request.bids_dir, explicit=False)
+        name = request.bids_dir.resolve().name
+        yield Source(name=name, path=request.bids_dir, explicit=False, people=people)
     else:
-        ignored += sort_folders(request.bids_dir)[1]
+        ignored += [e for e in tree.sort_folders(request.bids_dir)[1] if not e.template]
 
 
-def _datasets(
-    root: Path, depth: int, ignored: list[Ignored], *, any_name: bool = False
-) -> list[Path]:
-    """Find the folders that hold ``sub-*`` folders, or with ``any_name`` FreeSurfer's.
+def _datasets(source: Source, depth: int, ignored: list[tree.Ignored]) -> list[Path]:
+    """Find the folders that hold subjects' folders by name, or by program where that is asked for.
 
     Searched are ``depth`` levels below the root, and the folders in each ``sourcedata`` on the way.
-    What cannot be listed is left out: ``sourcedata`` is often closed to all but a few.
+    What cannot be listed is left out: ``sourcedata`` is often closed to all but a few. Several
+    folders of which none but the program's names say whose they are may be people with sessions as
+    well as datasets, so these are not used.
     """
     datasets: list[Path] = []
-    unused: list[Ignored] = []
+    unsure: dict[Path, list[tree.Ignored]] = {}
+    unused: list[tree.Ignored] = []
     visited: set[str] = set()
-    waiting = [(root, depth)]
+    waiting = [(source.path, depth)]
     while waiting:
         path, below = waiting.pop()
         key = os.path.realpath(path)
-        listed = None if key in visited else _try_to_list(path, ignored)
+        listed = None if key in visited else tree.try_to_list(path, ignored)
         visited.add(key)
         if listed is None:
             continue
-        entries = {name: _read_name(path / name, any_name=any_name) for name in listed[0]}
-        inner = [name for name, entry in entries.items() if entry is None]
-        has_subjects = any(isinstance(entry, SubjectFolder) for entry in entries.values())
-        if has_subjects or any(name.startswith("sub-") for name in entries):
+        entries = tree.read_names(path, listed[0], any_name=source.any_name)
+        folders = [entry for entry in entries.values() if isinstance(entry, tree.SubjectFolder)]
+        unclaimed = [entry for entry in entries.values() if isinstance(entry, tree.Ignored)]
+        inner = [entry.path.name for entry in unclaimed if entry.reason == tree.NO_SUBJECT]
+        if (
+            folders
+            or any(name.startswith("sub-") for name in entries)
+            or (tree.people_in(path, source.people))
+        ):
             datasets.append(path)
             inner, below = [name for name in inner if name == "sourcedata"], 0
+            if path != source.path and all(folder.renamed for folder in folders):
+                unsure[path] = [
+                    tree.Ignored(path=f.path, reason=tree.UNSURE, subject=f.subject)
+                    for f in folders
+                ]
         else:
-            unused += [entry for entry in entries.values() if isinstance(entry, Ignored)]
+            unclaimed += [tree.no_segmentation(path / name, tree.NO_SUBJECT) for name in listed[1]]
+            unused += [entry for entry in unclaimed if entry.path.name != "sourcedata"]
             inner = list(entries)
         for name in reversed(inner):
             if name == "sourcedata":
                 waiting.append((path / name, 1))
             elif below:
                 waiting.append((path / name, below - 1))
-    # A folder of datasets may hold one that is called mri.
+    if len(unsure) > 1:
+        datasets = [path for path in datasets if path not in unsure]
+        unused += [entry for entries in unsure.values() for entry in entries]
+    # A folder of datasets may hold one that is called mri; a folder's row stands for its content.
+    claims = (*datasets, *(entry.path for entry in unused if not entry.template))
+    inside = {source.path, *(parent for path in claims for parent in path.parents)}
     ignored += [
-        entry for entry in unused if not any(path.is_relative_to(entry.path) for path in datasets)
+        entry
+        for entry in unused
+        if entry.path not in inside.union(datasets)
+        and (entry.path.parent in inside or not entry.template)
     ]
     return datasets
 
@@ -489,7 +324,7 @@ def list_participants(request: InputRequest) -> frozenset[str]:
     the names of the folders, as indexing thousands of subjects takes minutes.
     """
     if request.bids_database_dir is None:
-        return frozenset(folder.subject for folder in sort_folders(request.bids_dir)[0])
+        return frozenset(folder.subject for folder in tree.sort_folders(request.bids_dir)[0])
     return _from_index(request.bids_dir, request.bids_database_dir)
 
 

@@ -1,8 +1,8 @@
 """Finding the segmentations of each hemisphere.
 
 The flow: which datasets to search, and which subjects and sessions they hold (``scan``), which
-files are segmentations (one module per layout: ``freesurfer``, ``ashs``, ``hippunfold``,
-``tools``, ``generic``), and which of several to take. No image is opened, except where ASHS's atlas
+files are segmentations (``layouts``; ``freesurfer``, ``ashs`` and ``generic`` have what is
+special), and which of several to take. No image is opened, except where ASHS's atlas
 can only be told from the labels.
 
 A picture of labels on an image from another space misleads, so pages show only these images:
@@ -18,36 +18,24 @@ A picture of labels on an image from another space misleads, so pages show only 
 import os
 import re
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from hipsta_bids.derivatives.dataset import read_description
 from hipsta_bids.errors import InputError, NothingToDoError, UsageError
-from hipsta_bids.inputs import ashs, freesurfer
-from hipsta_bids.inputs.ashs import AtlasFinder, choose_atlas, find_ashs
+from hipsta_bids.inputs import scan, tree
+from hipsta_bids.inputs.account import looked_into, unused_of_visit
+from hipsta_bids.inputs.ashs import choose_atlas
 from hipsta_bids.inputs.edits import EditedFile, attach_edits, each_once, edits_of_visit, list_edits
-from hipsta_bids.inputs.freesurfer import find_freesurfer, same_labels, without_labels
-from hipsta_bids.inputs.generic import find_named, forget_tables, without_side
-from hipsta_bids.inputs.scan import (
-    HEMIS,
-    HemisphereInput,
-    Ignored,
-    InputRequest,
-    Source,
-    SubjectFolder,
-    VisitFolders,
-    list_folder,
-    list_participants,
-    list_sources,
-    list_visits,
-    sort_folders,
-)
-from hipsta_bids.inputs.selection import Selection, make_selection
-from hipsta_bids.inputs.tools import find_hippunfold, find_tools
+from hipsta_bids.inputs.generic import forget_tables, without_side
+from hipsta_bids.inputs.layouts import LAYOUTS, atlas_finder, find, volume_table
+from hipsta_bids.inputs.scan import HEMIS, HemisphereInput, InputRequest, Source
+from hipsta_bids.inputs.selection import Context, Selection, make_selection
 from hipsta_bids.io.files import entities
+from hipsta_bids.opening import not_fetched
 from hipsta_bids.protocols.protocol import Protocol
-from hipsta_bids.types import Hemisphere
+from hipsta_bids.types import Hemisphere, VisitKey
 
 __all__ = [
     "HEMIS",
@@ -57,9 +45,7 @@ __all__ = [
     "dataset_notes",
     "find_hemispheres",
     "find_inputs",
-    "ignored_table",
     "list_subjects",
-    "selection_table",
 ]
 
 _LOOKED_FOR = (
@@ -67,8 +53,6 @@ _LOOKED_FOR = (
     "*_desc-subfields*_dseg, HSF's *_hippocampus_seg, NextBrain's seg*, and *_hemi-*_dseg with a "
     "table"
 )
-
-_NO_LABELS = "its mri folder holds no hippocampal subfields"
 
 #: How many names an error message lists.
 _LISTED_NAMES = 6
@@ -82,8 +66,10 @@ class Findings:
     """Sorted by subject, session, hemisphere, protocol. Some may have a ``problem``."""
     notes: tuple[str, ...] = ()
     """One line for each edited file that is not used, and for what is named anew or ignored."""
-    ignored: tuple[Ignored, ...] = ()
-    """What was not used though it seems meant to be, sorted by path."""
+    ignored: tuple[tree.Ignored, ...] = ()
+    """What was not used though it seems meant to be, and templates, sorted by path."""
+    other_entries: tuple[tree.Ignored, ...] = ()
+    """All other entries: nothing in them is a segmentation."""
 
 
 def find_hemispheres(request: InputRequest) -> tuple[HemisphereInput, ...]:
@@ -117,11 +103,26 @@ def find_inputs(request: InputRequest) -> Findings:
     option = choose_atlas(request)
     forget_tables()
     results = _Found()
-    sources = list_sources(request, results.strays)
-    results.edited = list_edits(request, selection, results.ignored)
+    sources = scan.list_sources(request, results.unused)
+    results.edited = list_edits(request, selection, results.unused)
     for source in sources:
         _search(source, selection, option, results)
-    ignored = tuple(filter(selection.misses, results.unused()))
+    results.unused += [
+        tree.Ignored(path=Path(folder), reason="named in --participants-map, but no dataset has it")
+        for folder in tree.read_people(request.participants_map)
+        if not any((source.path / folder).is_dir() for source in sources)
+    ]
+    entries = [entry for entry in results.entries(sources) if selection.misses(entry)]
+    ignored = tuple(entry for entry in entries if not entry.quiet)
+    accounted = {item.subject for item in results.items} | {entry.subject for entry in ignored}
+    missing = {
+        f.path: tree.Ignored(
+            path=f.path, subject=f.subject, reason="no dataset has labels of it", quiet=True
+        )
+        for f in (() if request.bids_database_dir else tree.sort_folders(request.bids_dir)[0])
+        if f.subject not in accounted and selection.wants_folder(f)
+    }
+    unmissed = [entry for entry in entries if entry.quiet and entry.path not in missing]
     if not results.items:
         error = _nothing(request, sources, ignored)
         for entry in ignored:
@@ -133,13 +134,18 @@ def find_inputs(request: InputRequest) -> Findings:
     )
     subjects = {item.subject for item in items}
     renamed = [
-        f"{f.path.name} as sub-{f.subject}" for f in results.renamed if f.subject in subjects
+        f"{f.path.name} as sub-{f.subject}{f'_ses-{f.session}' if f.session else ''}"
+        for f in results.renamed
+        if f.subject in subjects
     ]
     if renamed:
-        notes += (f"renamed: {_count(renamed, 'FreeSurfer folder')}",)
-    if unused := _unused(ignored):
-        notes += (f"not used: {unused}; --dry-run and the log say why",)
-    return Findings(items=items, notes=notes, ignored=ignored)
+        notes += (f"renamed: {_count(renamed, 'folder')}",)
+    if sides := [f"{e.inside.name} {e.hemi}" for e in ignored if e.hemi and e.inside]:
+        notes += (f"no labels of one hemisphere: {_count(sides, 'visit')}",)
+    if text := _unused(ignored):
+        notes += (f"not used: {text}; --dry-run and the log say why",)
+    unmissed += missing.values()
+    return Findings(items=items, notes=notes, ignored=ignored, other_entries=tuple(unmissed))
 
 
 @dataclass(kw_only=True)
@@ -148,41 +154,45 @@ class _Found:
 
     items: list[HemisphereInput] = field(default_factory=list)
     edited: list[EditedFile] = field(default_factory=list)
-    ignored: list[Ignored] = field(default_factory=list)
-    strays: list[Ignored] = field(default_factory=list)
-    """Entries that are no subject's by their names, unless an option says otherwise."""
-    renamed: list[SubjectFolder] = field(default_factory=list)
+    unused: list[tree.Ignored] = field(default_factory=list)
+    renamed: list[tree.SubjectFolder] = field(default_factory=list)
     """Folders of wanted subjects whose names are not their labels."""
 
-    def unused(self) -> list[Ignored]:
+    def entries(self, sources: Sequence[Source]) -> list[tree.Ignored]:
         """List each entry that was not used once, sorted by path."""
-        renamed_paths = {_place(folder.path) for folder in self.renamed} if self.strays else set()
-        entry_of = {_place(entry.path): entry for entry in reversed(self.strays)}
-        entry_of = {path: entry for path, entry in entry_of.items() if path not in renamed_paths}
-        entry_of |= {_place(entry.path): entry for entry in reversed(self.ignored)}
-        return sorted(entry_of.values(), key=lambda entry: entry.path)
+        # What is known about an entry inside of a subject's folder comes first.
+        beside = [entry for entry in self.unused if entry.inside and entry.template]
+        strays = [entry for entry in self.unused if entry.inside is None]
+        missed = [entry for entry in self.unused if entry.inside and not entry.template]
+        searched = {os.path.realpath(source.path) for source in sources}
+        searched |= {_place(folder.path) for folder in self.renamed} if strays else set()
+        entry_of: dict[tuple[str, str | None], tree.Ignored] = {}
+        for entry in (*missed, *strays):
+            entry_of.setdefault((_place(entry.path), entry.hemi), entry)
+        claims = [place for (place, _), entry in entry_of.items() if not entry.quiet]
+        above = {str(parent) for path in (*searched, *claims) for parent in Path(path).parents}
+        listed = [
+            looked_into(entry)
+            for (place, _), entry in entry_of.items()
+            # What holds other entries, or is used by an option, has no row of its own.
+            if not (entry.quiet and place in above)
+            and not (entry.inside is None and place in searched)
+        ]
+        return sorted(listed, key=lambda entry: (entry.path, entry.hemi or "")) + beside
 
 
-def _renaming(folders: Iterable[SubjectFolder]) -> dict[tuple[str, str | None], str]:
+def _renaming(folders: Iterable[tree.SubjectFolder]) -> dict[VisitKey, list[str]]:
     """Write a note for each visit whose folders have names that are not its labels."""
-    names: dict[tuple[str, str | None], list[str]] = {}
+    names: dict[VisitKey, list[str]] = {}
     for folder in folders:
         if folder.renamed:
             names.setdefault((folder.subject, folder.session), []).append(folder.path.name)
-    return {
-        key: f"FreeSurfer's name of sub-{key[0]} is {' and '.join(known)}"
-        for key, known in names.items()
-    }
+    return {key: [f"the folder of sub-{key[0]} is {' and '.join(names[key])}"] for key in names}
 
 
 def _place(path: Path) -> str:
     """Where an entry is, however its folder was reached; the entry itself may be any link."""
     return os.path.join(os.path.realpath(path.parent), path.name)  # noqa: PTH118 (many of them)
-
-
-def ignored_table(ignored: Iterable[Ignored]) -> list[dict[str, str]]:
-    """Describe what was not used, one row per folder."""
-    return [{"not used": str(entry.path), "why": entry.reason} for entry in ignored]
 
 
 def list_subjects(request: InputRequest) -> tuple[str, ...]:
@@ -192,31 +202,12 @@ def list_subjects(request: InputRequest) -> tuple[str, ...]:
         sorted(
             {
                 folder.subject
-                for source in list_sources(request)
-                for folder in sort_folders(source.path, any_name=source.any_name)[0]
+                for source in scan.list_sources(request)
+                for folder in source.folders()[0]
                 if selection.wants_folder(folder)
             }
         )
     )
-
-
-def selection_table(items: Iterable[HemisphereInput]) -> list[dict[str, str]]:
-    """Describe what was found and why, one row per hemisphere and protocol."""
-    return [
-        {
-            "subject": item.subject,
-            "session": item.session or "n/a",
-            "hemisphere": item.hemi,
-            "file": " + ".join(_relative(path, item.source_path) for path in item.files),
-            "scheme": item.protocol.name,
-            "why": "; ".join((f"{item.source}: {item.explanation}", *item.notes))
-            + (f"; NOT USABLE: {item.problem}" if item.problem else ""),
-            "edited": " + ".join(_relative(edit.path, edit.source_path) for edit in item.edits)
-            or "n/a",
-            "passed over": "; ".join(f"{name}: {why}" for name, why in item.passed_over) or "n/a",
-        }
-        for item in items
-    ]
 
 
 def dataset_notes(request: InputRequest, items: Iterable[HemisphereInput]) -> tuple[str, ...]:
@@ -227,7 +218,7 @@ def dataset_notes(request: InputRequest, items: Iterable[HemisphereInput]) -> tu
             f"{request.bids_dir} has no dataset_description.json, which BIDS requires; going on"
         )
     selection = make_selection(request)
-    expected = selection.subjects or list_participants(request)
+    expected = selection.subjects or scan.list_participants(request)
     without = sorted(expected - selection.excluded - {item.subject for item in items})
     if without:
         notes.append(f"no segmentation found for {_count(without, 'participant')}")
@@ -236,44 +227,46 @@ def dataset_notes(request: InputRequest, items: Iterable[HemisphereInput]) -> tu
 
 def _search(source: Source, selection: Selection, option: Protocol | None, results: _Found) -> None:
     """Search one dataset for all kinds of segmentations, and add the edited files beside them."""
-    all_folders, strays = sort_folders(source.path, any_name=source.any_name)
-    refused = same_labels(all_folders)
+    all_folders, strays = source.folders()
+    refused = tree.same_labels(all_folders)
     folders = list(filter(selection.wants_folder, all_folders))
-    results.strays += strays
+    results.unused += strays
     results.renamed += [folder for folder in folders if folder.renamed]
     renaming = _renaming(folders)
-    atlases = AtlasFinder(source.path, option)
-    for visit in filter(selection.wants_visit, list_visits(folders, results.ignored)):
+    context = Context(source=source, selection=selection, atlas=option)
+    context = replace(context, atlases=atlas_finder(context))
+    searched = [layout for layout in LAYOUTS if layout.kind in source.layouts]
+    closed: list[tree.Ignored] = []
+    visits = list(filter(selection.wants_visit, tree.list_visits(folders, closed)))
+    results.unused += closed
+    # Folders that cannot be listed have rows of their own, and the parents of sessions need none.
+    explained = {entry.subject for entry in closed} | {
+        visit.subject for visit in visits if visit.session
+    }
+    for visit in visits:
         results.edited += edits_of_visit(visit, source.path, source.name, beside=True)
-        items = list(_search_visit(visit, source, selection, atlases))
-        results.ignored += without_side(visit) if "named" in source.layouts else ()
-        used_files = [file for item in items for file in item.files]
-        results.ignored += [
-            Ignored(path=path, reason=_NO_LABELS, subject=visit.subject)
-            for path in (without_labels(visit) if "freesurfer" in source.layouts else ())
-            if not any(file.is_relative_to(path) for file in used_files)
+        visit_context = replace(context, visit=visit)
+        items = [item for layout in searched for item in find(layout, visit_context)]
+        results.unused += without_side(visit) if "named" in source.layouts else ()
+        explain = visit.subject not in explained
+        results.unused += unused_of_visit(visit_context, items, explain=explain)
+        notes = renaming.get((visit.subject, visit.session), ())
+        results.items += [
+            replace(
+                item,
+                problem=refused.get(item.subject) or item.problem or _not_fetched(item.files),
+                notes=(*item.notes, *notes),
+            )
+            for item in items
         ]
-        for item in items:
-            problem = item.problem or refused.get(item.subject)
-            note = renaming.get((item.subject, item.session))
-            notes = item.notes if note is None else (*item.notes, note)
-            results.items.append(replace(item, problem=problem, notes=notes))
 
 
-def _search_visit(
-    visit: VisitFolders, source: Source, selection: Selection, atlases: AtlasFinder
-) -> Iterator[HemisphereInput]:
-    """Search the folders of one visit for all kinds of segmentations."""
-    if "freesurfer" in source.layouts:
-        yield from find_freesurfer(visit, source, selection)
-    if "ashs" in source.layouts:
-        yield from find_ashs(visit, source, selection, atlases)
-    if "hippunfold" in source.layouts:
-        yield from find_hippunfold(visit, source, selection)
-    if "tools" in source.layouts:
-        yield from find_tools(visit, source, selection)
-    if "named" in source.layouts:
-        yield from find_named(visit, source, selection)
+def _not_fetched(paths: Sequence[Path]) -> InputError | None:
+    """Tell that the content of a file is elsewhere."""
+    for path in paths:
+        if message := not_fetched(path):
+            return InputError(f"{path}: {message}", reason="not-fetched")
+    return None
 
 
 def _without_clashes(
@@ -281,6 +274,7 @@ def _without_clashes(
 ) -> tuple[HemisphereInput, ...]:
     """Keep one input per hemisphere and protocol."""
     order = {source.path: index for index, source in enumerate(sources)}
+    origin = {source.path: source.origin for source in sources}
     items: dict[tuple[str, str, str, str], HemisphereInput] = {}
     for item in sorted(
         candidates, key=lambda item: (item.problem is not None, order[item.source_path])
@@ -288,10 +282,18 @@ def _without_clashes(
         first = items.setdefault(item.key, item)
         if first is not item:
             reason = f"same hemisphere and protocol as in {first.source}, which comes first"
+            problem = first.problem
             if item.problem is not None and first.problem is None:
                 reason = f"not usable ({item.problem.reason})"
+            elif origin[item.source_path] and origin[item.source_path] == origin[first.source_path]:
+                problem = problem or InputError(
+                    f"{first.source} and {item.source} both have labels of {item.protocol.name};"
+                    f" choose one: -d {first.source}={first.source_path}",
+                    reason="several-pipelines",
+                )
             rejected = (str(item.files[0]), reason)
-            items[item.key] = replace(first, passed_over=(*first.passed_over, rejected))
+            passed_over = (*first.passed_over, rejected)
+            items[item.key] = replace(first, passed_over=passed_over, problem=problem)
     return tuple(items[key] for key in sorted(items))
 
 
@@ -310,20 +312,20 @@ def _check_analysis(items: list[HemisphereInput], request: InputRequest) -> None
 
 
 def _nothing(
-    request: InputRequest, sources: tuple[Source, ...], ignored: tuple[Ignored, ...]
+    request: InputRequest, sources: tuple[Source, ...], ignored: tuple[tree.Ignored, ...]
 ) -> NothingToDoError:
     """Describe what was looked for, and where, and what was not used."""
     searched = ", ".join(str(source.path) for source in sources)
-    restricted = (
-        *(f"--participant-label {label}" for label in request.participant_labels[:_LISTED_NAMES]),
-        *(
-            f"--exclude-participant-label {label}"
-            for label in request.excluded_labels[:_LISTED_NAMES]
-        ),
-        *(f"--session-label {label}" for label in request.session_labels[:_LISTED_NAMES]),
-        *(f"--hemi {hemi}" for hemi in request.hemis if request.hemis != HEMIS),
-        *([f"--bids-filter-file {request.bids_filter_file}"] if request.bids_filter_file else []),
-    )
+    limits: dict[str, Sequence[object]] = {
+        "--participant-label": request.participant_labels,
+        "--exclude-participant-label": request.excluded_labels,
+        "--session-label": request.session_labels,
+        "--hemi": () if request.hemis == HEMIS else request.hemis,
+        "--bids-filter-file": list(filter(None, [request.bids_filter_file])),
+    }
+    restricted = [
+        f"{option} {value}" for option, values in limits.items() for value in values[:_LISTED_NAMES]
+    ]
     missed = [entry for entry in ignored if not entry.template]
     unused = f". Not used: {_unused(missed)}: {missed[0].reason}" if missed else ""
     if not sources:
@@ -332,11 +334,7 @@ def _nothing(
             f"name the dataset with the segmentations: -d NAME=PATH{unused}"
         )
     if restricted:
-        subjects = {
-            folder.subject
-            for source in sources
-            for folder in sort_folders(source.path, any_name=source.any_name)[0]
-        }
+        subjects = {folder.subject for source in sources for folder in source.folders()[0]}
         return NothingToDoError(
             f"no hippocampal segmentation matches {' '.join(restricted)} in {searched} "
             f"(which hold {_count(sorted(subjects), 'subject')}; looked for {_LOOKED_FOR}){unused}"
@@ -347,9 +345,9 @@ def _nothing(
     )
 
 
-def _unused(ignored: Iterable[Ignored]) -> str:
+def _unused(ignored: Iterable[tree.Ignored]) -> str:
     """Count and name what somebody may miss; empty if there is nothing."""
-    missed = [entry for entry in ignored if not entry.template]
+    missed = [entry for entry in ignored if not (entry.template or entry.hemi)]
     kinds = {entry.path.is_file() for entry in missed}
     noun = "name" if len(kinds) > 1 else "file" if kinds == {True} else "folder"
     return _count([entry.name for entry in missed], noun) if missed else ""
@@ -360,10 +358,6 @@ def _count(names: list[str], noun: str) -> str:
     plural = "" if len(names) == 1 else "s"
     listed = f" ({', '.join(names[:_LISTED_NAMES])}{ellipsis})" if names else ""
     return f"{len(names)} {noun}{plural}{listed}"
-
-
-def _relative(path: Path, root: Path) -> str:
-    return str(path.relative_to(root)) if path.is_relative_to(root) else str(path)
 
 
 _FREESURFER = ("norm.mgz", "brain.mgz")
@@ -385,12 +379,12 @@ class Candidate:
 
 def find_anatomy(labels: Path, hemisphere: Hemisphere, bids_dir: Path) -> Iterator[Candidate]:
     """List anatomical images that may lie behind a hemisphere's labels, best first, unopened."""
-    if freesurfer.volume_table(labels) is not None:
+    if volume_table(labels, "freesurfer") is not None:
         for name in _FREESURFER:
             if (path := labels.with_name(name)).is_file():
                 yield Candidate(path=path, proven=True)
         return
-    if ashs.volume_table(labels) is not None:
+    if volume_table(labels, "ashs") is not None:
         folder = labels.parent
         for parent in (folder, folder.parent) if folder.name == "final" else (folder,):
             for name in _names(parent):
@@ -439,6 +433,6 @@ def _named(labels: Path, hemisphere: Hemisphere, folders: tuple[Path, ...]) -> I
 def _names(folder: Path) -> tuple[str, ...]:
     """List the files of a folder by name; none where it cannot be listed."""
     try:
-        return tuple(sorted(list_folder(folder)[1]))
+        return tuple(sorted(tree.list_folder(folder)[1]))
     except InputError:
         return ()

@@ -26,6 +26,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import AfterValidator, Field, ValidationError
 
+from hipsta_bids import opening
 from hipsta_bids.errors import InputError, OutputError
 from hipsta_bids.protocols.toml import Table, first_mistake
 
@@ -223,10 +224,10 @@ def plain(value: Any) -> Any:  # noqa: ANN401  (JSON values have no narrower com
     return str(value)
 
 
-def read_json(path: Path) -> dict[str, Any]:
+def read_json(path: Path, limit: float = opening.TABLE) -> dict[str, Any]:
     """Read a JSON object."""
     try:
-        text = path.read_text(encoding="utf-8")
+        text = opening.read_text(path, limit)
         value = json.loads(text)
         if _HALF_LETTERS in text.lower():  # can be read, but not be written
             json.dumps(value, ensure_ascii=False).encode()
@@ -252,7 +253,7 @@ def write_tsv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[str]])
 def read_tsv(path: Path) -> list[dict[str, str]]:
     """Read a BIDS table as text cells."""
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        text = opening.read_text(path, encoding="utf-8-sig")
     except FileNotFoundError as error:
         raise InputError(f"{path}: no such file; check its name") from error
     except UnicodeDecodeError as error:
@@ -283,7 +284,7 @@ def read_tsv(path: Path) -> list[dict[str, str]]:
 def sha256_of(path: Path) -> str:
     """Hash the content of a file."""
     try:
-        with path.open("rb") as file:
+        with opening.open_regular(path) as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError as error:
         raise InputError(
@@ -344,7 +345,7 @@ def read_foreign(path: Path, kind: type[Table], *, max_bytes: float) -> Table:
     """
     if path.is_file() and path.stat().st_size > max_bytes:
         raise ValueError(f"larger than {max_bytes / 1e6:g} MB")
-    return checked_foreign(read_json(path), kind)
+    return checked_foreign(read_json(path, max_bytes), kind)
 
 
 def checked_foreign(content: object, kind: type[Table]) -> Table:

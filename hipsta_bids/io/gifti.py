@@ -39,6 +39,7 @@ from numpy.typing import ArrayLike, NDArray
 from hipsta_bids.errors import InputError, UsageError
 from hipsta_bids.io import files
 from hipsta_bids.io.files import entities
+from hipsta_bids.opening import open_regular
 from hipsta_bids.types import Coordinates, Float, Int, Mesh, TetMesh
 
 #: Ending of the names of CIFTI files with one number per vertex.
@@ -307,6 +308,7 @@ def _unreadable(path: Path, format_name: str, error: Exception) -> InputError:
 def _load(path: Path, kind: type[Image]) -> Image:
     format_name = "GIFTI" if kind is GiftiImage else "CIFTI"
     try:
+        open_regular(path).close()  # a pipe would be waited for
         image = nib.load(path)
     except _DAMAGE as error:
         raise _unreadable(path, format_name, error) from error
@@ -346,6 +348,7 @@ def read_surface(path: Path) -> Mesh:
     if path.suffix not in ENDINGS:
         return read_mesh(path)
     try:  # meshio.read ends the process where a file is damaged
+        open_regular(path).close()
         mesh = importlib.import_module(f"meshio.{path.suffix[1:]}").read(path)
         points, triangles = mesh.points, mesh.get_cells_type("triangle")
     except Exception as error:  # of any kind: meshio checks little

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from hipsta_bids.errors import InputError
 from hipsta_bids.geometry.digital import Box, box, to_ras
 from hipsta_bids.geometry.sampling import ScalarVolume
+from hipsta_bids.opening import open_regular
 from hipsta_bids.types import BodyMask, Float
 
 #: Voxel edges [mm] of segmentations outside of this range are taken for a wrong header ...
@@ -298,8 +299,7 @@ def read_scalars(path: Path, points: Float) -> ScalarVolume:
 def _opened(path: Path) -> Iterator[Any]:
     """Open an image for as long as its voxels are read; errors meanwhile name the file."""
     try:
-        if path.exists() and not path.is_file():
-            raise OSError("no regular file")  # a pipe would be waited for
+        open_regular(path).close()  # a pipe would be waited for
         # nibabel leaves files open on some of its paths; a stream that is closed here is not.
         with ImageOpener(str(path)) as stream:
             kind = _format(path, stream.read(4))

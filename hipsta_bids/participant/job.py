@@ -151,6 +151,7 @@ def base_record(job: Job) -> dict[str, Any]:
         "scheme": item.protocol.name,
         "region": job.settings.body.region,
         "scheme_title": item.protocol.title,
+        "provenance": item.origin,
         "chosen_because": item.explanation,
         "passed_over": [
             {"file": source_address(Path(path), sources), "reason": why}
@@ -305,6 +306,8 @@ def _measure(job: Job) -> Outcome:
             hashed, entries = hash_inputs(job, record)
             record |= {"input_hash": hashed} | entries
             volume = read_label_volume(job.item, job.settings.body.region)
+            edges = np.linalg.norm(volume.affine[:3, :3], axis=0)
+            record["provenance"]["voxel_size"] = " x ".join(f"{edge:.3g}" for edge in edges)
         maps = measure_hemisphere(volume, job.item.hemi, job.settings, clock)
         mapped: list[Mapped] = []
         regions = None

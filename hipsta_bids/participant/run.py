@@ -5,7 +5,7 @@ import logging
 import math
 import time
 from collections import Counter
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from os import getpid
@@ -27,7 +27,7 @@ from hipsta_bids.derivatives.dataset import (
     update_status,
     write_sidecar,
 )
-from hipsta_bids.derivatives.hemisphere import ResultPlace
+from hipsta_bids.derivatives.hemisphere import ResultPlace, read_record
 from hipsta_bids.derivatives.names import DATASET_FILES, HemisphereName, write_shared
 from hipsta_bids.errors import ExitCode, HipstaError, InputError, OutputError, ProtocolError
 from hipsta_bids.inputs.scan import HemisphereInput
@@ -221,6 +221,10 @@ class RunOptions:
     """The command line, for the log."""
     notes: tuple[str, ...] = ()
     """What the search for inputs had to say, for the log."""
+    inputs: tuple[Mapping[str, str], ...] = ()
+    """Rows of ``inputs.tsv``."""
+    is_whole: bool = True
+    """Whether these are about all participants."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -334,6 +338,7 @@ def _run(
         for note in options.notes:
             _LOGGER.info("note: %s", note)
         table = StatusTable(out_dir, shard)
+        _write_inputs(out_dir, options, ())
         plan = PagePlan(
             root=out_dir,
             n_workers=n_workers(options, len(visits)),
@@ -358,6 +363,7 @@ def _run(
                     break  # the next one would fail just so
                 if options.stop_on_first_crash and outcome.status == Status.FAILED:
                     break
+            _write_inputs(out_dir, options, outcomes)
             if pages.enabled and shard is None:
                 table.close()
                 copies += _find_copies(jobs, out_dir)
@@ -370,6 +376,25 @@ def _run(
         )
         _LOGGER.info("done: %s, exit code %d", dict(result.counts), result.exit_code)
     return result
+
+
+def _write_inputs(out_dir: Path, options: RunOptions, outcomes: Sequence[Outcome]) -> None:
+    """Write what became of all that was found."""
+    if not options.inputs:
+        return
+    endings: dict[tuple[str, ...], dict[str, str]] = {}
+    for outcome in outcomes:
+        with contextlib.suppress(InputError):
+            ending = dataset.provenance_of(read_record(outcome.job.result))
+            if outcome.status == Status.FAILED:
+                ending |= {"status": "failed", "reason": outcome.message or ""}
+            endings[row_key(identity(outcome.job.result.name))[:-1]] = ending
+    rows = []
+    for row in options.inputs:
+        key = tuple(row.get(name, files.MISSING) for name in dataset.KEY)
+        rows.append({**row, **endings.get(key, {})} if row["status"] == "used" else row)
+    is_whole = options.is_whole and options.shard is None
+    dataset.write_inputs(out_dir, rows, is_whole=is_whole)
 
 
 def _find_copies(jobs: Sequence[Job], out_dir: Path) -> Iterator[str]:

@@ -11,6 +11,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from hipsta_bids import opening
 from hipsta_bids.errors import ProtocolError
 from hipsta_bids.protocols import EXPERIMENTAL
 from hipsta_bids.protocols.protocol import (
@@ -130,7 +131,7 @@ def _load_bundled(name: str) -> Protocol:
 
 def _load_file(path: Path) -> Protocol:
     try:
-        table = tomllib.loads(path.read_text("utf-8"))
+        table = tomllib.loads(opening.read_text(path, opening.SETTINGS))
     except OSError as error:
         raise ProtocolError(
             f"{path}: cannot read the protocol ({error.strerror}); check the path"

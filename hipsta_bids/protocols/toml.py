@@ -21,6 +21,7 @@ from pydantic import (
     ValidationError,
 )
 
+from hipsta_bids import opening
 from hipsta_bids.errors import SettingsError
 
 _LINE = 96
@@ -136,8 +137,7 @@ def read_settings(path: Path | None, kind: type[Table]) -> Table:
     if path is None:
         return kind()
     try:
-        with path.open("rb") as file:
-            values = tomllib.load(file)
+        values = tomllib.loads(opening.read_text(path, opening.SETTINGS))
     except OSError as error:
         raise SettingsError(
             f"{path}: settings cannot be read ({error.strerror}); check the path"

@@ -344,7 +344,7 @@ def test_killed_in_the_middle_then_rerun_completes(bids_dir, tmp_path, capsys):
     out = tmp_path / "out"
     command = [*COMMAND, *arguments(bids_dir, out, "--n-procs", "1")]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        _opening, first = process.stdout.readline(), process.stdout.readline()
+        _opening, _counts, first = (process.stdout.readline() for _ in range(3))
         process.send_signal(signal.SIGKILL)
     assert first.startswith("sub-good_hemi-L")
     assert process.returncode == -signal.SIGKILL

@@ -3,6 +3,7 @@ import os
 import subprocess
 import sys
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -126,7 +127,8 @@ def test_defaults(seen, tmp_path):
     assert seen["settings"] == Settings()
     n_procs = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     command = f"hipsta-bids in {tmp_path} participant"
-    assert seen["options"] == RunOptions(
+    assert [row["status"] for row in seen["options"].inputs] == ["used", "not used"]
+    assert replace(seen["options"], inputs=()) == RunOptions(
         n_procs=n_procs, reports=True, anatomy=Path("in"), command=command
     )
     assert seen["out"] == tmp_path
@@ -163,7 +165,8 @@ def test_everything_reaches_its_place(seen, tmp_path):
         bids_filter_file=Path("j"),
         bids_database_dir=Path("db"),
     )
-    assert seen["options"] == RunOptions(
+    assert replace(seen["options"], inputs=()) == RunOptions(
+        is_whole=False,
         n_procs=3,
         mem_gb=4.0,
         work_dir=tmp_path / "work",
@@ -338,6 +341,7 @@ def test_run_says_what_happened(stand_in_run, tmp_path, capsys):
     start, *lines = said.out.splitlines()
     assert start == opening(stand_in_run[0])
     assert lines[0] == "note: no description"
+    assert lines.pop(1) == "inputs: 4 used, 0 failed, 4 not used, 0 not a segmentation"
     assert lines[1].startswith("sub-01_hemi-L_seg-demo  ok  mean thickness 1.500 mm (by area)  ")
     assert lines[2].startswith("sub-03_hemi-L_seg-demo  flagged  mean thickness 1.500 mm")
     assert lines[2].endswith("[odd-shape] look at it")

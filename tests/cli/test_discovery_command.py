@@ -102,14 +102,14 @@ def test_freesurfer_folders_of_any_name(dataset, tmp_path, capsys):
     bids, out = tmp_path / "bids", tmp_path / "out"
     options = ("--freesurfer-dir", dataset, "--no-reports")
     said = call(capsys, bids, out, "participant", *options).out
-    renamed = "renamed: 2 FreeSurfer folders (bert as sub-bert, sub-AD_05 as sub-AD05)"
+    renamed = "renamed: 2 folders (bert as sub-bert, sub-AD_05 as sub-AD05)"
     assert f"note: {renamed}" in said
     assert f"note: {renamed}" in the_log(out)
-    assert "sub-AD05_hemi-L_seg-freesurfer: note: FreeSurfer's name of sub-AD05 is sub-AD_05" in (
+    assert "sub-AD05_hemi-L_seg-freesurfer: note: the folder of sub-AD05 is sub-AD_05" in (
         the_log(out)
     )
     (record,) = (out / "sub-AD05" / "anat").glob("*hemi-L*_desc-qc_metrics.json")
-    assert files.read_json(record)["notes"] == ["FreeSurfer's name of sub-AD05 is sub-AD_05"]
+    assert files.read_json(record)["notes"] == ["the folder of sub-AD05 is sub-AD_05"]
     assert {row["subject"] for row in read_status(out)} == {"sub-01", "sub-AD05", "sub-bert"}
 
 

@@ -195,19 +195,19 @@ def test_folders_of_any_name_with_their_option(tmp_path, place):
         ("AD05", None),
         ("MCI7", "2"),
         ("X1", None),
+        ("base", "tp1a"),
         ("bert", None),
-        ("tp1a", None),
     ]
     assert all(item.problem is None for item in found.items)
     notes = {item.subject: item.notes for item in found.items}
     assert notes["01"] == ()
-    assert notes["AD05"] == ("FreeSurfer's name of sub-AD05 is AD_05",)
-    assert notes["bert"] == ("FreeSurfer's name of sub-bert is bert",)
-    assert "renamed: 6 FreeSurfer folders (AD_05 as sub-AD05, " in found.notes[0]
+    assert notes["AD05"] == ("the folder of sub-AD05 is AD_05",)
+    assert notes["bert"] == ("the folder of sub-bert is bert",)
+    assert "renamed: 6 folders (AD_05 as sub-AD05, " in found.notes[0]
     assert [entry.path.name for entry in found.ignored if not entry.template] == ["__", "empty_1"]
     assert len(found.ignored) == 7
     request = InputRequest(bids_dir=tmp_path, freesurfer_dir=fs)
-    assert list_subjects(request) == ("01", "AD05", "MCI7", "X1", "bert", "empty1", "tp1a")
+    assert list_subjects(request) == ("01", "AD05", "MCI7", "X1", "base", "bert", "empty1")
 
 
 def test_what_one_option_uses_is_not_listed_for_another_place(tmp_path):

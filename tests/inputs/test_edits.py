@@ -4,8 +4,9 @@ import pytest
 from input_cases import by_key, describe, touch
 
 from hipsta_bids.errors import InputError
+from hipsta_bids.inputs.account import selection_table
 from hipsta_bids.inputs.generic import is_edited
-from hipsta_bids.inputs.search import InputRequest, find_inputs, selection_table
+from hipsta_bids.inputs.search import InputRequest, find_inputs
 from hipsta_bids.protocols.protocol import Tissue
 
 FS = "derivatives/freesurfer"
@@ -82,7 +83,7 @@ def test_sessions(tmp_path):
     edits = tmp_path / "edits"
     touch(edits, "sub-01/ses-b/anat/sub-01_ses-b_hemi-L_desc-edited_dseg.nii.gz")
     touch(edits, "sub-01/anat/sub-01_hemi-L_desc-edited_dseg.nii.gz")
-    items, (note,) = search(tmp_path, edited_dir=edits)
+    items, (note,) = search(tmp_path, edited_dir=edits, hemis=("L",))
     assert {key[1]: len(item.edits) for key, item in items.items()} == {"a": 0, "b": 1}
     assert "no labels of sub-01 hemi-L are processed" in note
 
@@ -158,7 +159,7 @@ def test_edited_labels_are_no_segmentation_of_their_own(tmp_path):
     touch(lab, "sub-01/anat/sub-01_hemi-L_dseg.nii.gz")
     touch(lab, "sub-01/anat/sub-01_hemi-L_desc-edited_dseg.nii.gz")
     (lab / "dseg.tsv").write_text("index\tname\n1\tsubiculum\n2\tCA1\n")
-    items, notes = search(tmp_path, derivatives={"lab": lab})
+    items, notes = search(tmp_path, derivatives={"lab": lab}, hemis=("L",))
     (item,) = items.values()
     assert item.files[0].name == "sub-01_hemi-L_dseg.nii.gz"
     assert len(item.edits) == 1

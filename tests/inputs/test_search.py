@@ -9,14 +9,14 @@ import pytest
 from input_cases import by_key, describe, find, save_values, touch
 
 from hipsta_bids.errors import InputError, NothingToDoError, ProtocolError, UsageError
-from hipsta_bids.inputs import scan
+from hipsta_bids.inputs import tree
+from hipsta_bids.inputs.account import selection_table
 from hipsta_bids.inputs.labels import read_label_volume
 from hipsta_bids.inputs.search import (
     HemisphereInput,
     InputRequest,
     dataset_notes,
     find_hemispheres,
-    selection_table,
 )
 
 LEFT, RIGHT = (f"mri/{side}h.hippoAmygLabels-T1.v22.mgz" for side in "lr")
@@ -135,14 +135,14 @@ def test_a_folder_that_cannot_be_listed(tmp_path, monkeypatch):
     freesurfer(tmp_path / "derivatives" / "fs", "sub-01")
     closed = tmp_path / "sourcedata"
     closed.mkdir()
-    real = scan.os.scandir
+    real = tree.os.scandir
 
     def scandir(path):
         if Path(path) == closed:
             raise PermissionError(13, "Permission denied")
         return real(path)
 
-    monkeypatch.setattr(scan.os, "scandir", scandir)
+    monkeypatch.setattr(tree.os, "scandir", scandir)
     # By default nobody asked for it; named by the user, it has to be readable.
     assert len(find(tmp_path)) == 2
     with pytest.raises(InputError, match=r"cannot list the folder.*Permission denied"):
@@ -260,9 +260,89 @@ def test_a_filter_file_selects_as_in_fmriprep(tmp_path, query, expected):
     assert names == [f"{name}_desc-subfields_dseg.nii.gz" for name in expected]
 
 
-def test_a_filter_file_about_other_images_filters_nothing(tmp_path):
+@pytest.mark.parametrize("query", [{"t1w": {"run": 1}}, {"dseg": {}}, {}])
+def test_a_filter_file_that_restricts_nothing_is_refused(tmp_path, query):
     freesurfer(tmp_path / "derivatives" / "fs", "sub-01")
-    assert len(filtered(tmp_path, {"t1w": {"run": 1}})) == 2
+    with pytest.raises(UsageError, match=r"restricts nothing: segmentations are under 'dseg'"):
+        filtered(tmp_path, query)
+
+
+@pytest.mark.parametrize(
+    ("run", "expected"), [(1, ["1", "01"]), ("01", ["1", "01"]), ([2, 3], ["2"]), ("*", None)]
+)
+def test_numbers_in_a_filter_file_are_numbers(tmp_path, run, expected):
+    folder = tmp_path / "derivatives" / "hippunfold" / "sub-01" / "anat"
+    names = {
+        f"sub-01_run-{label}_hemi-{hemi}_space-cropT1w_desc-subfields_dseg.nii.gz": label
+        for label, hemi in (("1", "L"), ("01", "R"), ("2", "L"))
+    }
+    touch(folder, *names)
+    found = filtered(tmp_path, {"dseg": {"run": run}})
+    if expected is None:  # two runs of one hemisphere are a question
+        assert [item.problem and item.problem.reason for item in found] == ["several-files", None]
+        assert "--bids-filter-file" in str(found[0].problem)
+    else:
+        assert [names[item.files[0].name] for item in found] == expected
+        assert all(item.problem is None for item in found)
+
+
+def test_two_pipelines_of_one_protocol_are_a_question(tmp_path):
+    for dataset in ("a", "b"):
+        freesurfer(tmp_path / "derivatives" / dataset, "sub-01")
+    freesurfer(tmp_path / "derivatives" / "b", "sub-02")
+    found = by_key(find(tmp_path))
+    problem = found["01", "", "L", "freesurfer"].problem
+    assert problem.reason == "several-pipelines"
+    path = tmp_path / "derivatives" / "a"
+    assert str(problem) == (f"a and b both have labels of freesurfer; choose one: -d a={path}")
+    assert found["02", "", "L", "freesurfer"].problem is None
+    for name in "ab":
+        chosen = find(tmp_path, derivatives={name: tmp_path / "derivatives" / name})
+        assert all(item.problem is None for item in chosen)
+        assert chosen[0].source == name
+
+
+@pytest.mark.parametrize(
+    "content", [None, "/annex/objects/x\n", "version https://git-lfs.github.com/"]
+)
+def test_labels_that_were_not_fetched(tmp_path, content):
+    root = freesurfer(tmp_path / "derivatives" / "fs", "sub-01")
+    path = root / "sub-01" / LEFT
+    path.unlink()
+    if content is None:
+        path.symlink_to("../../.git/annex/objects/aa/bb/x/x.mgz")
+    else:
+        path.write_text(content, encoding="utf-8")
+    left, right = find(tmp_path)
+    assert right.problem is None
+    assert (left.problem.reason, str(left.problem)) == (
+        "not-fetched",
+        f"{path}: its content was not fetched; run `datalad get {path}`",
+    )
+
+
+@pytest.mark.parametrize("name", ["100307", "sub-100307"])
+def test_folders_of_the_human_connectome_project(tmp_path, name):
+    (tmp_path / "bids").mkdir()
+    study = tmp_path / "study"
+    inner = f"{name}/T1w/HippUnfold/T1w/hippunfold/sub-100307/anat/sub-100307"
+    touch(study, *(f"{inner}_{CROP.replace('hemi-L', f'hemi-{hemi}')}" for hemi in "LR"))
+    touch(study, f"{name}/MNINonLinear/x", f"{name}/T1w/T1w_acpc_dc_restore.nii.gz")
+    touch(study / name / "T1w" / name, LEFT, RIGHT)
+    items = find(tmp_path / "bids", hippunfold_dir=study)
+    assert [(i.subject, i.hemi, i.problem) for i in items] == [("100307", h, None) for h in "LR"]
+    items = find(tmp_path / "bids", freesurfer_dir=study)
+    assert [(i.subject, i.protocol.name) for i in items] == [("100307", "freesurfer")] * 2
+    # Other contrasts beside it are a question, which the table of people answers.
+    touch(study, f"{inner.replace('/T1w/hipp', '/T1wT2w/hipp')}_{CROP}")
+    (left, _) = find(tmp_path / "bids", hippunfold_dir=study)
+    assert "--participants-map" in str(left.problem)
+    people = tmp_path / "people.tsv"
+    folder = f"{name}/T1w/HippUnfold/T1wT2w/hippunfold/sub-100307"
+    people.write_text(f"folder\tparticipant_id\n{folder}\t100307\n", encoding="utf-8")
+    (left,) = find(tmp_path / "bids", hippunfold_dir=study, participants_map=people)
+    assert left.problem is None
+    assert "T1wT2w" in str(left.files[0])
 
 
 def test_subjects_to_leave_out(tmp_path):
@@ -438,8 +518,8 @@ def test_large_trees_are_listed_once_per_folder(tmp_path, monkeypatch):
     for index in range(50):
         touch(tmp_path / "derivatives" / "fs" / f"sub-{index:03d}", "surf/lh.white", "label/x/y")
     listed = []
-    real = scan.os.scandir
-    monkeypatch.setattr(scan.os, "scandir", lambda path: listed.append(str(path)) or real(path))
+    real = tree.os.scandir
+    monkeypatch.setattr(tree.os, "scandir", lambda path: listed.append(str(path)) or real(path))
     assert len(find(tmp_path)) == 100
     folders = [path for path in listed if "sub-" in path]
     assert len(folders) == len(set(folders)) == 100  # each subject and its mri

@@ -167,9 +167,13 @@ def test_a_side_that_is_misspelled_is_noted(tmp_path):
     (item,) = found.items
     assert (item.hemi, item.problem) == ("L", None)
     assert found.notes == (
+        "no labels of one hemisphere: 1 visit (sub-01 R)",
         "not used: 1 file (sub-01_hemi-r_dseg.nii.gz); --dry-run and the log say why",
     )
-    assert [entry.reason for entry in found.ignored] == ["hemi-r is neither hemi-L nor hemi-R"]
+    assert [entry.reason for entry in found.ignored] == [
+        "no labels of this hemisphere, but of the other",
+        "hemi-r is neither hemi-L nor hemi-R",
+    ]
 
 
 def test_a_name_of_somebody_else_is_noted(tmp_path):

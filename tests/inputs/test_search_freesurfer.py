@@ -2,7 +2,8 @@ import pytest
 from input_cases import by_key, find, touch
 
 from hipsta_bids.errors import UsageError
-from hipsta_bids.inputs.freesurfer import parse_analysis, volume_table
+from hipsta_bids.inputs.freesurfer import parse_analysis
+from hipsta_bids.inputs.layouts import volume_table
 
 FULL = "hippoAmygLabels-T1.v22"
 
@@ -180,7 +181,7 @@ def test_what_segment_subregions_writes(tmp_path):
     left, right = find(tmp_path)
     assert (names(left), names(right)) == (["lh.hippoAmygLabels.mgz"], ["rh.hippoAmygLabels.mgz"])
     assert len(left.passed_over) == len(stems) - 1
-    table = volume_table(left.files[0])
+    table = volume_table(left.files[0], "freesurfer")
     assert table is not None
     assert table.exists()
 

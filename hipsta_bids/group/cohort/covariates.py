@@ -15,6 +15,7 @@ from hipsta_bids.group.design.formula import as_factor, check_numbers, level_nam
 from hipsta_bids.group.design.model import FIRST_AGE, VisitTime
 from hipsta_bids.group.design.settings import GroupSettings
 from hipsta_bids.io import files
+from hipsta_bids.opening import SETTINGS, read_bounded
 from hipsta_bids.types import PARTICIPANT, SESSION
 
 #: Number of rows that a message lists.
@@ -214,12 +215,12 @@ def read_icv(sources: Sequence[str], roots: Sequence[Path]) -> list[float | None
 def _icv_beside(path: Path) -> float | None:
     stats = path.parent.parent / "stats" / "aseg.stats"
     if stats.is_file():
-        for line in stats.read_text(encoding="utf-8", errors="replace").splitlines():
+        for line in read_bounded(stats, SETTINGS).decode(errors="replace").splitlines():
             if line.startswith("# Measure EstimatedTotalIntraCranialVol,"):
                 return _number(line.split(",")[-2])
     for folder in (path.parent, path.parent.parent, path.parent.parent / "final"):
         for found in sorted(folder.glob("*icv.txt")):
-            words = found.read_text(encoding="utf-8", errors="replace").split()
+            words = read_bounded(found, SETTINGS).decode(errors="replace").split()
             if words:  # subject and volume, or the volume alone
                 return _number(words[-1])
     return None

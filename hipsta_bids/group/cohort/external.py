@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from hipsta_bids import opening
 from hipsta_bids.errors import InputError, NothingToDoError, UsageError
 from hipsta_bids.geometry.catalog import why_impossible
 from hipsta_bids.group.cohort.collect import SheetRecord
@@ -17,7 +18,7 @@ from hipsta_bids.group.cohort.covariates import locate_sources
 from hipsta_bids.group.cohort.data import Cohort
 from hipsta_bids.group.cohort.read import CURVATURE, THICKNESS, VOLUME, Measured, visit_name
 from hipsta_bids.group.stats.arrays import SideMaps
-from hipsta_bids.inputs import ashs, freesurfer
+from hipsta_bids.inputs.layouts import volume_table
 from hipsta_bids.inputs.maps import Found, check_pattern, fields_of, fill, find, scan
 from hipsta_bids.io import files
 from hipsta_bids.io.files import entities
@@ -359,8 +360,8 @@ def _hippunfold(segmentation: Path) -> Path | None:
 
 
 _BESIDE: Mapping[str, Callable[[Path], Path | None]] = {
-    "freesurfer": freesurfer.volume_table,
-    "ashs": ashs.volume_table,
+    "freesurfer": lambda path: volume_table(path, "freesurfer"),
+    "ashs": lambda path: volume_table(path, "ashs"),
     "hippunfold": _hippunfold,
 }
 
@@ -368,7 +369,7 @@ _BESIDE: Mapping[str, Callable[[Path], Path | None]] = {
 def read_volumes(path: Path) -> Volumes:
     """Read one table of any program."""
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        text = opening.read_text(path, opening.SETTINGS, encoding="utf-8-sig")
         volumes: dict[str, dict[str, float]] = {}
         for hemi, structure, volume in _entries(path, text):
             volumes.setdefault(hemi, {})[re.sub(r"\W+", "_", structure)] = volume
