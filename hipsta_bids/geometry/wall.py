@@ -53,10 +53,10 @@ class _Mesh(TriaMesh):  # type: ignore[misc]  # LaPy is untyped
 
 
 class Wall:
-    """The surface without its caps, with vertices of its own numbering."""
+    """The surface without its caps, in one piece, with vertices of its own numbering."""
 
     def __init__(self, surface: Surface, settings: BoundarySettings) -> None:
-        triangles = surface.triangles[mesh.lateral_triangles(surface)]
+        triangles = _one_piece(surface.triangles[mesh.lateral_triangles(surface)])
         used = np.bincount(triangles.ravel(), minlength=len(surface.vertices)) > 0
         self.index = np.flatnonzero(used).astype(np.int32)
         number = np.full(len(surface.vertices), -1, dtype=np.int32)
@@ -163,6 +163,19 @@ class Wall:
         sides = (~strips & (piece == first), ~strips & (piece == second))
         ends = all((side & end).any() for side in sides for end in (self.posterior, self.anterior))
         return sides if ends else None
+
+
+def _one_piece(triangles: Int) -> Int:
+    """Keep the triangles (T, 3) of the largest piece.
+
+    Others are specks between a cap and its rim. On these a second function is constant, too, and
+    would be the first eigenfunction.
+    """
+    count = int(triangles.max()) + 1
+    edges = mesh.unique_edges(triangles)
+    links = sparse.csr_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(count,) * 2)
+    piece = sparse.csgraph.connected_components(links, directed=False)[1][triangles[:, 0]]
+    return np.asarray(triangles[piece == np.bincount(piece).argmax()])
 
 
 def vertex_normals(vertices: Float, triangles: Int) -> Float:

@@ -128,7 +128,7 @@ class HemisphereInput(Hemisphere):
     """Found, but not usable: this hemisphere fails, the others go on."""
     notes: tuple[str, ...] = ()
     """What a reader should know about this choice."""
-    provenance: Mapping[str, str] = field(default_factory=dict)
+    provenance: Mapping[str, str] = field(default_factory=dict, hash=False)
     """Tool, version and so on, as far as names tell (``PROVENANCE`` of ``derivatives``)."""
     edits: tuple[Edit, ...] = ()
     """Corrections by a person that take the place of what the files say."""

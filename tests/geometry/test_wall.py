@@ -1,5 +1,7 @@
 """The wall without its caps, curvature of known cylinders, and zero lines."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from geometry_cases import cylinder
@@ -25,6 +27,20 @@ def place(slab, wall):
     axes = np.stack([x - o, y - o, z - o], axis=1)  # the slab is flat: an affine map
     u, v, n = np.linalg.solve(axes, (wall.vertices - o).T)
     return 0.5 + 0.1 * u, 0.5 + 0.1 * v, 0.1 * n
+
+
+def test_a_speck_beside_a_cap_is_no_part_of_the_wall(slab, wall):
+    """The cap lacks a vertex amid it: the triangles round that one hang together by themselves."""
+    cap = slab.surface.anterior_cap.copy()
+    rim = np.unique(slab.surface.triangles[lateral_triangles(slab.surface)])
+    amid = np.setdiff1d(np.flatnonzero(cap), rim)
+    points = slab.surface.vertices[amid]
+    cap[amid[np.linalg.norm(points - points.mean(axis=0), axis=1).argmin()]] = False
+    surface = replace(slab.surface, anterior_cap=cap)
+    assert len(np.unique(surface.triangles[lateral_triangles(surface)])) > len(wall.index)
+    specked = Wall(surface, SETTINGS)
+    np.testing.assert_array_equal(specked.triangles, wall.triangles)
+    assert end_to_end(specked, specked.operator(SETTINGS).eigenfunctions(1)[1][:, 0]) is not None
 
 
 def lapy_curvature(radius, edge, *, outward=True):

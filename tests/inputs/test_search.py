@@ -33,6 +33,14 @@ def subjects(items):
     return [item.subject for item in items]
 
 
+def test_inputs_are_equal_and_hashable_as_values(tmp_path):
+    """Caches take them as keys."""
+    freesurfer(tmp_path / "derivatives" / "freesurfer", "sub-01")
+    first, second = (find(tmp_path)[0] for _ in range(2))
+    assert first == second
+    assert hash(first) == hash(second)
+
+
 # Which datasets
 
 
