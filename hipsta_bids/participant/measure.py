@@ -333,7 +333,7 @@ def unfold(
         whole = sample_sheet(mesh, coordinates, whole_body(settings.sheet))
         subfield = label_sheet(sheet, body)
         folded = folded_fraction(mesh, coordinates)
-    with clock("second choices"):
+    with clock("alternatives"):
         rival_maps = {}
         if rivals and boundaries.rival is not None:
             rival = sample_sheet(mesh, lay_out(boundaries.rival), settings.sheet)
