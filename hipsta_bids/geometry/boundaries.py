@@ -232,7 +232,6 @@ class LocalMean:
                     self._shape
                 ),
                 1 / self._STEP,
-                output=np.float32,
                 truncate=3.0,
             )
             for part in self._laplace.gradient(values).T

@@ -175,7 +175,7 @@ def continued_nodes(grid: WedgeGrid, body: Body, depth: float) -> Float:
         missing = depth + (points - plane.point) @ plane.normal * np.sign(slope)
         short = missing > 0
         depths, inward = missing[short], -outward / abs(slope)
-        center, across, change = _motion(body, end, inward)
+        center, across, change = _motion(body, end, inward, grid.across)
         flat = points[short] + depths[:, None] * inward
         first, second = ((flat - center) @ across.T).T
         # Solve (1 - depth change) x = moved on the plane.
@@ -187,11 +187,12 @@ def continued_nodes(grid: WedgeGrid, body: Body, depth: float) -> Float:
     return points
 
 
-def _motion(body: Body, end: End, inward: Float) -> tuple[Float, Float, Float]:
+def _motion(body: Body, end: End, inward: Float, directions: Float) -> tuple[Float, Float, Float]:
     """Fit how a cross-section changes behind an end plane.
 
-    Returns its center (3,), directions across (2, 3), and the change (2, 2) per mm of depth: a
-    point at x from the center, along these directions, moves by ``inward`` (3,) and by change @ x.
+    Returns its center (3,), the given directions (2, 3) turned into the plane, and the change
+    (2, 2) per mm of depth: a point at x from the center, along these directions, moves by
+    ``inward`` (3,) and by change @ x.
     Along such motions the smoothed mask stays as it is, in the sense of least squares (optical
     flow; Lucas and Kanade 1981, Proc. IJCAI, 674-679).
     """
@@ -216,7 +217,12 @@ def _motion(body: Body, end: End, inward: Float) -> tuple[Float, Float, Float]:
     weight = reach - depth
     flat = places - depth[:, None] * inward  # moved back to the plane
     center = np.average(flat, axis=0, weights=weight * np.linalg.norm(slopes, axis=1))
-    across = np.linalg.svd(normal[None])[2][1:]
+    # A mirror image has mirrored directions, and the same numbers along them.
+    first = directions[0] - (directions[0] @ normal) * normal
+    first /= np.linalg.norm(first)
+    second = directions[1] - (directions[1] @ normal) * normal
+    second -= (second @ first) * first
+    across = np.stack([first, second / np.linalg.norm(second)])
     step, offset = slopes @ across.T, (flat - center) @ across.T
     columns = np.column_stack([step, (step[:, :, None] * offset[:, None]).reshape(-1, 4)])
     matrix = columns.T @ (weight[:, None] * columns)

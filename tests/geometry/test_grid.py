@@ -218,7 +218,7 @@ def test_cross_sections_go_on_changing_beyond_an_end_as_they_do_behind_it(growth
     mask = (inside & between).reshape(body.inside.shape)
     wedge = replace(body, tissue=mask.astype(np.uint8), inside=mask)
     nodes = np.array([[x, 1.2, 10.5] for x in np.arange(-1.0, 3.0, 0.05)])
-    grid = SimpleNamespace(node_points=nodes.copy)
+    grid = SimpleNamespace(node_points=nodes.copy, across=np.eye(3)[:2])
     read = continued_nodes(grid, wedge, 0.0)
     np.testing.assert_allclose(read[:, 2], 9.0, atol=1e-9)
     expected = 3.0 + (nodes[:, 0] - 3.0) / (1 + 1.5 * growth)
@@ -236,6 +236,6 @@ def test_cross_sections_of_thick_slices_go_on_wherever_the_plane_lies(offset):
     ends = replace(body.ends, half_slice=1.0)
     thick = replace(body, tissue=tissue, inside=tissue > 0, affine=affine, ends=ends)
     nodes = np.array([[x, 1.2, z] for x in (0.5, 5.5) for z in (-1.0, 13.0)])
-    grid = SimpleNamespace(node_points=nodes.copy)
+    grid = SimpleNamespace(node_points=nodes.copy, across=np.eye(3)[:2])
     read = continued_nodes(grid, thick, 0.0)
     np.testing.assert_allclose(read[:, :2], nodes[:, :2], atol=0.02)  # the box does not change
