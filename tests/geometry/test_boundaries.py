@@ -169,7 +169,9 @@ def test_the_mirror_image_has_the_same_boundaries():
     left, right = solve_volume(volume, "L"), solve_volume(image, "R")
     for name in ("medial_curve", "lateral_curve"):
         mirrored = getattr(right, name) * [-1.0, 1.0, 1.0]
-        np.testing.assert_allclose(mirrored, getattr(left, name), atol=1e-6)
+        # mm; the eigenfunction is solved to 1e-6, and a point of its zero line is known the less
+        # well the flatter it is there. The strips, which decide about the map, are the same.
+        np.testing.assert_allclose(mirrored, getattr(left, name), atol=1e-5)
     for name in ("medial", "lateral", "interior", "exterior"):
         np.testing.assert_array_equal(getattr(right, name), getattr(left, name))
 
