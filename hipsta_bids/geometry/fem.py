@@ -53,13 +53,6 @@ class Laplace:
             (symmetric.data, symmetric.indices, symmetric.indptr), shape=symmetric.shape
         )
 
-    def directed(self, first: Float, second: Float, speeds: Float) -> "Laplace":
-        """Return the operator whose diffusion has speeds (T, 2) across two directions (T, 3).
-
-        Anisotropic diffusion as in Andreux et al. 2014 (ECCV workshops, LNCS 8928:299-312).
-        """
-        return Directed(self, first, second)(speeds)
-
     def solve(
         self, fixed: NDArray[np.integer], values: Float, residual: float = _RESIDUAL
     ) -> Float:
@@ -208,7 +201,8 @@ class Directed:
     """Operators on the same triangles, with two speeds of diffusion in each of them.
 
     What does not depend on the speeds is made once. LaPy's constructor knows no other speeds than
-    exponentials of curvature.
+    exponentials of curvature. Anisotropic diffusion as in Andreux et al. 2014 (ECCV workshops,
+    LNCS 8928:299-312).
     """
 
     def __init__(self, laplace: Laplace, first: Float, second: Float) -> None:

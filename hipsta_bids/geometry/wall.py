@@ -173,7 +173,7 @@ def _one_piece(triangles: Int) -> Int:
     """
     count = int(triangles.max()) + 1
     edges = mesh.unique_edges(triangles)
-    links = sparse.csr_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(count,) * 2)
+    links = mesh.edge_graph(edges, np.ones(len(edges)), count)
     piece = sparse.csgraph.connected_components(links, directed=False)[1][triangles[:, 0]]
     return np.asarray(triangles[piece == np.bincount(piece).argmax()])
 

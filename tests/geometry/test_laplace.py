@@ -12,7 +12,7 @@ from skimage.measure import marching_cubes
 
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry import fem
-from hipsta_bids.geometry.fem import Laplace, volume_laplace
+from hipsta_bids.geometry.fem import Directed, Laplace, volume_laplace
 from hipsta_bids.types import TetMesh
 
 EXACT = 1e-10  # rounding in a sparse solve
@@ -75,7 +75,7 @@ def test_diffusion_is_slowed_along_the_direction_only(angle):
     share, slope = 0.3, np.array([0.7, -1.1, 0.0])
     directions = (np.tile(vector, (len(triangles), 1)) for vector in (first, second))
     speeds = np.tile([1.0, share], (len(triangles), 1))
-    laplace = Laplace(lapy.TriaMesh(vertices, triangles)).directed(*directions, speeds)
+    laplace = Directed(Laplace(lapy.TriaMesh(vertices, triangles)), *directions)(speeds)
     along = slope @ first
     wanted = (slope @ slope - along**2 + share * along**2) * 12  # area of 4 x 3
     values = vertices @ slope
@@ -91,7 +91,7 @@ def test_directed_diffusion_is_that_of_lapy(strength):
     theirs = lapy.Solver(egg, lump=True, aniso=strength, aniso_smooth=2)
     across, along, least, most = egg.curvature_tria(2)
     speeds = np.exp(-strength * np.abs(np.column_stack([most, least])))
-    ours = Laplace(egg).directed(across, along, speeds)
+    ours = Directed(Laplace(egg), across, along)(speeds)
     scale = abs(theirs.stiffness).max()
     assert abs(ours.stiffness - theirs.stiffness).max() <= 1e-12 * scale  # rounding
 
