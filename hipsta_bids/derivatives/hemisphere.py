@@ -136,6 +136,8 @@ def _write_sheet(result: ResultPlace, maps: HemisphereMaps, protocol: Protocol) 
     definitions["subfield"]["Levels"] = {
         label.abbreviation: label.name for label in labels.values()
     }
+    if "x_coordinate" in maps.qc:
+        definitions["x"]["Coordinate"] = maps.qc["x_coordinate"]
     _write_table(result, "sheet", columns, definitions)
 
 

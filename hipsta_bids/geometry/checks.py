@@ -20,7 +20,7 @@ from hipsta_bids import types
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry import digital
 from hipsta_bids.geometry.body import Body
-from hipsta_bids.geometry.grid import Field, continued_nodes, cut_across, in_plane_voxel
+from hipsta_bids.geometry.grid import Field, cut_across, in_plane_voxel
 from hipsta_bids.geometry.measures import column_area, measure_thickness
 from hipsta_bids.geometry.mesh import mean_wall_thickness
 from hipsta_bids.geometry.slices import points_of_ends
@@ -318,7 +318,7 @@ def check_labels(body: Body, settings: CheckSettings) -> list[Finding]:
 
 
 def check_cross_sections(
-    field: Field, body: Body, settings: CheckSettings, cuts: Bool | None = None
+    field: Field, settings: CheckSettings, cuts: Bool | None = None
 ) -> list[Finding]:
     """Flag a body of which a part is missing between cross-sections that have it, or added.
 
@@ -327,7 +327,8 @@ def check_cross_sections(
     moves sideways everywhere, a leak is in one position. ``cuts`` are nodes of bridges that were
     cut, whose stumps do not count, nor do cavities that were filled.
     """
-    solid, interior = field.values > 0, _interior_nodes(field, body)
+    solid = field.values > 0
+    interior = np.zeros_like(solid) if field.interior is None else field.interior
     counted = np.ones_like(solid)
     if cuts is not None and cuts.any():
         counted = ndimage.distance_transform_edt(~cuts) > STUB_NODES
@@ -378,17 +379,6 @@ def check_cross_sections(
         )
         for reason, outlier, what, remedy in rows
     ]
-
-
-def _interior_nodes(field: Field, body: Body) -> Bool:
-    """Nodes whose nearest voxel has an interior label and is not of the sheet.
-
-    Beyond the end planes they go on as the sheet does.
-    """
-    points = continued_nodes(field.grid, body, body.ends.half_slice)
-    voxels = np.rint(body.to_voxels(points)).astype(np.intp)
-    voxels = np.clip(voxels, 0, np.array(body.interior.shape) - 1)
-    return np.asarray((body.interior & (body.tissue == 0))[tuple(np.moveaxis(voxels, -1, 0))])
 
 
 class _Outlier:

@@ -122,6 +122,8 @@ class Field:
     """(A, B, W) nodes in slits of the labels that were filled, if any."""
     cavities: Bool | None = None
     """(A, B, W) nodes in cavities of the labels that became a part of the sheet, if any."""
+    interior: Bool | None = None
+    """(A, B, W) nodes in interior labels outside the sheet, if any."""
 
 
 def resample_body(body: Body, hemi: str, settings: GridSettings, slices: SliceSettings) -> Field:
@@ -151,6 +153,9 @@ def resample_body(body: Body, hemi: str, settings: GridSettings, slices: SliceSe
         separated=separated,
         slits=_nodes_in(body.filled, body, points, grid.shape),
         cavities=_nodes_in(cavities, body, points, grid.shape),
+        interior=_nodes_in(
+            digital.positions(body.interior & (body.tissue == 0)), body, points, grid.shape
+        ),
     )
 
 

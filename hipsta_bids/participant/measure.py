@@ -208,7 +208,7 @@ def find_all(evidence: Evidence) -> list[Finding]:
         *check_image(body),
         *check_cavities(body, checks),
         *check_labels(body, checks),
-        *check_cross_sections(solid.field, body, checks, solid.touched & (solid.field.values < 0)),
+        *check_cross_sections(solid.field, checks, solid.touched & (solid.field.values < 0)),
         *sheet_checks.check_rows(sheet, checks),
         *sheet_checks.check_edges(evidence.whole, checks),
         *sheet_checks.check_subfields(sheet, evidence.subfield, checks),
@@ -246,6 +246,7 @@ def quality_metrics(evidence: Evidence) -> dict[str, Any]:
     quality = tetra_quality(evidence.mesh)
     return {
         "region": body.region,
+        "x_coordinate": evidence.settings.sheet.x_coordinate,
         "voxel_size_mm": np.linalg.norm(body.affine[:3, :3], axis=0).round(4).tolist(),
         "body_voxels": int(np.count_nonzero(body.inside)),
         "layer_voxels": body.layer_voxels,
