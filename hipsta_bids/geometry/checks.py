@@ -48,7 +48,8 @@ BEYOND_SHARE = 0.7
 NOTCH_REACH = (1.0, 2.0, 3.0)
 #: Cross-sections are compared without nodes this near to a bridge that was cut, grid nodes.
 STUB_NODES = 6.0
-#: Share of the area by which cross-sections usually differ, per mm (interior: in all).
+#: Share of the area by which cross-sections usually differ, per mm (interior: in all); and so many
+#: times more as a slice is thicker than a millimeter, since a person draws each slice anew.
 SECTION_NOISE = 0.02
 
 
@@ -318,14 +319,15 @@ def check_labels(body: Body, settings: CheckSettings) -> list[Finding]:
 
 
 def check_cross_sections(
-    field: Field, settings: CheckSettings, cuts: Bool | None = None
+    field: Field, slice_step: float, settings: CheckSettings, cuts: Bool | None = None
 ) -> list[Finding]:
     """Flag a body of which a part is missing between cross-sections that have it, or added.
 
     Each cross-section is compared with those at a distance on both sides. What both lack, or where
     both have interior labels, is compared with the same body's other cross-sections: a bent ribbon
-    moves sideways everywhere, a leak is in one position. ``cuts`` are nodes of bridges that were
-    cut, whose stumps do not count, nor do cavities that were filled.
+    moves sideways everywhere, a leak is in one position. ``slice_step`` is the distance of slices,
+    mm; ``cuts`` are nodes of bridges that were cut, whose stumps do not count, nor do cavities
+    that were filled.
     """
     solid = field.values > 0
     interior = np.zeros_like(solid) if field.interior is None else field.interior
@@ -350,7 +352,7 @@ def check_cross_sections(
         unexplained = current & counted[:, :, k:-k]
         enclosed = unexplained & interior[:, :, : -2 * k] & interior[:, :, 2 * k :]
         added = unexplained & ~before & ~after
-        noise = SECTION_NOISE
+        noise = SECTION_NOISE * max(slice_step, 1.0)
         for outlier, part, least, contrast in (
             (bump, added, noise * reach, settings.bump_contrast),
             (intrusion, enclosed, noise, settings.intrusion_contrast),

@@ -208,7 +208,9 @@ def find_all(evidence: Evidence) -> list[Finding]:
         *check_image(body),
         *check_cavities(body, checks),
         *check_labels(body, checks),
-        *check_cross_sections(solid.field, checks, solid.touched & (solid.field.values < 0)),
+        *check_cross_sections(
+            solid.field, 2 * ends.half_slice, checks, solid.touched & (solid.field.values < 0)
+        ),
         *sheet_checks.check_rows(sheet, checks),
         *sheet_checks.check_edges(evidence.whole, checks),
         *sheet_checks.check_subfields(sheet, evidence.subfield, checks),

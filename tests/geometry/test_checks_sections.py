@@ -68,13 +68,13 @@ def wall(case, u, n):
 
 
 def test_sound_bodies_have_no_flags(ribbon):
-    assert raised(check_cross_sections(ribbon.field, CHECKS)) == []
+    assert raised(check_cross_sections(ribbon.field, 0.4, CHECKS)) == []
 
 
 def test_a_leak_is_flagged_where_it_is(ribbon):
     middle = wall(ribbon, 0.5, 1.5)
     leak = changed(ribbon.field, ball(ribbon.field, middle, 1.4), 0.5)
-    (flag,) = raised(check_cross_sections(leak, CHECKS))
+    (flag,) = raised(check_cross_sections(leak, 0.4, CHECKS))
     assert flag.reason == "section-bump"
     assert np.linalg.norm(place_of(flag) - middle) < 1.0  # mm, the ball's part outside the wall
 
@@ -82,7 +82,7 @@ def test_a_leak_is_flagged_where_it_is(ribbon):
 def test_a_notch_is_flagged_where_it_is(ribbon):
     middle = wall(ribbon, 0.85, 0.0)
     notch = changed(ribbon.field, ball(ribbon.field, middle, 2.0), -0.5)
-    (flag,) = raised(check_cross_sections(notch, CHECKS))
+    (flag,) = raised(check_cross_sections(notch, 0.4, CHECKS))
     assert flag.reason == "section-notch"
     assert np.linalg.norm(place_of(flag) - middle) < 1.0  # mm, the ball's part inside the wall
 
@@ -91,9 +91,9 @@ def test_a_bar_through_the_interior_is_flagged_where_it_is(ribbon):
     """Behind the interior wall lies the dentate gyrus, before and after the bar."""
     middle = wall(ribbon, 0.75, -1.6)
     bar = changed(ribbon.field, ball(ribbon.field, middle, 1.1), 0.5)
-    flags = {f.reason: f for f in raised(check_cross_sections(bar, CHECKS))}
+    flags = {f.reason: f for f in raised(check_cross_sections(bar, 0.4, CHECKS))}
     assert np.linalg.norm(place_of(flags["section-intrusion"]) - middle) < 1.0  # mm, its radius
-    found = raised(check_cross_sections(replace(bar, interior=None), CHECKS))
+    found = raised(check_cross_sections(replace(bar, interior=None), 0.4, CHECKS))
     assert "section-intrusion" not in {f.reason for f in found}
 
 
@@ -102,8 +102,8 @@ def test_stubs_of_a_cut_bridge_are_known(ribbon):
     where = ball(ribbon.field, middle, 1.1)
     cuts = ball(ribbon.field, middle, 0.4)
     stubs = changed(changed(ribbon.field, where, 0.5), cuts, -0.1)
-    assert raised(check_cross_sections(stubs, CHECKS, cuts)) == []
-    assert raised(check_cross_sections(stubs, CHECKS)) != []
+    assert raised(check_cross_sections(stubs, 0.4, CHECKS, cuts)) == []
+    assert raised(check_cross_sections(stubs, 0.4, CHECKS)) != []
 
 
 def test_what_is_odd_depends_on_the_body_s_other_cross_sections(ribbon):
@@ -112,9 +112,10 @@ def test_what_is_odd_depends_on_the_body_s_other_cross_sections(ribbon):
     rough = np.random.default_rng(2).random(leak.values.shape) < 0.1
     shell = np.abs(ribbon.field.values) < 0.45  # noise near the surface only
     noisy = replace(leak, values=np.where(rough & shell, -leak.values, leak.values))
-    found = raised(check_cross_sections(leak, CHECKS))
+    found = raised(check_cross_sections(leak, 0.4, CHECKS))
     assert [f.reason for f in found] == ["section-bump"]
-    assert raised(check_cross_sections(noisy, CHECKS)) == []
+    assert raised(check_cross_sections(leak, 2.0, CHECKS)) == []  # slices of 2 mm vary as much
+    assert raised(check_cross_sections(noisy, 0.4, CHECKS)) == []
 
 
 def rows_of(widths, spacing=0.8):
