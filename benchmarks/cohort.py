@@ -60,7 +60,7 @@ def run(data: Path, n_procs: int) -> Run:
             subprocess.run(command, check=False, stdout=subprocess.DEVNULL)  # noqa: S603
             seconds.append(time.perf_counter() - start)
         status = pd.read_csv(out / "status.tsv", sep="\t", na_values="n/a")
-    measured = status[status["status"] != "failed"]
+    measured = status[status["decision"] != "failed"]
     return Run(
         hemispheres=len(measured),
         wall=seconds[0] - seconds[1],

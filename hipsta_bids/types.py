@@ -218,12 +218,11 @@ class Sheet:
         return int(self.points.shape[2] // 2)
 
 
-class Status(StrEnum):
-    """How a hemisphere ended."""
+class Decision(StrEnum):
+    """What is to be done with a hemisphere; it rests on its flags."""
 
-    OK = "ok"
-    REPAIRED = "repaired"
-    FLAGGED = "flagged"
+    USE = "use"
+    LOOK = "look"
     FAILED = "failed"
 
 
@@ -286,6 +285,11 @@ class Flag:
     change: float = float("nan")
     """By how much the mean thickness is larger than if these were as those around them, mm."""
 
+    @property
+    def consequence(self) -> tuple[float, float]:
+        """Size of the change, mm, and share of the columns, as flags are ordered; 0 if unknown."""
+        return abs(float(np.nan_to_num(self.change))), float(np.nan_to_num(self.share))
+
 
 def position_text(point: Float | tuple[float, float, float], subfields: str = "") -> str:
     """Write a point (3,), RAS mm, and perhaps the subfields there, as messages do."""
@@ -320,7 +324,7 @@ class HemisphereMaps:
     repairs: tuple[str, ...] = ()
     """Changes of the body's topology, one line each."""
     flags: tuple[Flag, ...] = ()
-    """Reasons to look at the maps before trusting them."""
+    """Reasons to look at the maps before trusting them, that with the largest consequence first."""
     mesh: TetMesh
     """Tetrahedra of the body."""
     coordinates: Coordinates
@@ -333,6 +337,8 @@ class HemisphereMaps:
             raise ValueError(f"HemisphereMaps.maps: {wrong[0]} has not the sheet's shape {shape}")
         _set(self, "subfield", np.uint8, shape)
         _set(self, "repaired", np.bool_, shape)
+        ordered = sorted(self.flags, key=lambda flag: flag.consequence, reverse=True)
+        object.__setattr__(self, "flags", tuple(ordered))
 
     @property
     def thickness(self) -> Float:
@@ -340,11 +346,9 @@ class HemisphereMaps:
         return self.maps["thickness"]
 
     @property
-    def status(self) -> Status:
-        """``flagged`` outranks ``repaired``; ``failed`` hemispheres have no maps."""
-        if self.flags:
-            return Status.FLAGGED
-        return Status.REPAIRED if self.repairs else Status.OK
+    def decision(self) -> Decision:
+        """Whether a person should look before use; ``failed`` hemispheres have no maps."""
+        return Decision.LOOK if self.flags else Decision.USE
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

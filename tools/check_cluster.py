@@ -103,7 +103,7 @@ def check_failure(work: Path, data: Path) -> None:
     hipsta(broken, out, "collect", code=1)
     demand_equal(out, outputs(local), "array with a failed hemisphere")
     rows = status(out)
-    failed = [row for row in rows if row["status"] == "failed"]
+    failed = [row for row in rows if row["decision"] == "failed"]
     demand(len(failed) == 1, f"status.tsv: {len(rows)} rows, 1 failed ({failed[0]['reason']})")
     array = submit(work, broken, out, f"--array=1-{PARTS}", "measure.sbatch")
     after = (f"--dependency=afterok:{array}", "--kill-on-invalid-dep=yes", "group.sbatch")

@@ -55,7 +55,7 @@ def demand_whole(out: Path, reference: dict[str, bytes], what: str) -> None:
     """Say that each hemisphere with a record that it is done has all files, as they should be."""
     wrong = []
     for record in out.rglob("*_desc-qc_metrics.json"):
-        if json.loads(record.read_text(encoding="utf-8"))["status"] == "failed":
+        if json.loads(record.read_text(encoding="utf-8"))["decision"] == "failed":
             continue
         prefix = str(record.relative_to(out).parent / record.name.partition("_seg-")[0])
         wrong += [
@@ -87,9 +87,9 @@ def check_kills(work: Path, data: Path, reference: dict[str, bytes], n_kills: in
         main.communicate()
         demand_whole(out, reference, f"kill {number} ({victim})")
         if (out / "status.tsv").exists():
-            known = {"n/a", "repaired", "not-finished", "worker-died"}
+            known = {"n/a", "not-finished", "worker-died"}
             rows = status(out)
-            unknown = {row["reason"] for row in rows if row["status"] == "failed"} - known
+            unknown = {row["reason"] for row in rows if row["decision"] == "failed"} - known
             demand(not unknown, f"kill {number} ({victim}): {len(rows)} rows in status.tsv")
         hipsta(data, out, "participant", "--n-procs", 2)
         demand_equal(out, reference, f"kill {number} ({victim}), then run again")
@@ -140,8 +140,8 @@ def check_lost_input(work: Path, data: Path, reference: dict[str, bytes]) -> Non
     away.rename(data)
     demand(main.returncode == 1, "input vanishes: exit code 1")
     rows = status(out)
-    lost = [row for row in rows if row["status"] == "failed"]
-    done = [row for row in rows if row["status"] != "failed"]
+    lost = [row for row in rows if row["decision"] == "failed"]
+    done = [row for row in rows if row["decision"] != "failed"]
     whys = sorted({row["reason"] for row in lost})
     demand(bool(lost and done), f"input vanishes: {len(done)} done, {len(lost)} failed ({whys})")
     demand("internal-error" not in whys, "input vanishes: no internal error")

@@ -167,7 +167,7 @@ _ROOT = "[OUTPUT_DIR]"
 #: Files of the output dataset: name, description. A part of the subjects (``shard``) has a table
 #: and a log of its own, without pages and maybe without hemispheres; ``dry_run`` writes nothing.
 _DATASET = {
-    "status": ("status.tsv", "one row per hemisphere: status, reason, message, time, memory"),
+    "status": ("status.tsv", "one row per hemisphere: decision, reason, message, time, memory"),
     "inputs": ("inputs.tsv", "what was found: used, failed, not used, or no segmentation"),
     "settings": ("desc-settings.json", "all settings of these results, and their hash"),
     "description": ("dataset_description.json", "the dataset's description, as BIDS asks for"),

@@ -112,7 +112,7 @@ def main() -> None:
     mpl.rcParams.update({"font.size": 10})
     codes, affine = draw_labels(options.templates, SIDE)
     maps = hb.measure(codes, SIDE, "hippunfold", affine=affine, region=options.region)
-    print(maps.status, maps.message, maps.summary["thickness_mean"])  # noqa: T201
+    print(maps.decision, maps.message, maps.summary["thickness_mean"])  # noqa: T201
     whole = options.region != "body"
     figure = Figure(figsize=(7.5, 4.6) if whole else (11, 3.6))
     if not whole:

@@ -100,7 +100,7 @@ _DATASET_FILES = {
     "ignore": "which files are [not in the standard](#names-that-bids-does-not-have)",
     "settings": "all settings of these results, and their hash",
     "citation": "a methods paragraph with references, for your article",
-    "status": "one row per hemisphere: status, reason, message, time per stage, peak memory",
+    "status": "one row per hemisphere: decision, reason, message, time per stage, peak memory",
     "status_sidecar": "its columns",
     "inputs": "each hemisphere, file and folder of the inputs: used or not, and why",
     "inputs_sidecar": "its columns",

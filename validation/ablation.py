@@ -12,7 +12,7 @@ from hipsta_bids.inputs.labels import read_label_volume
 from hipsta_bids.inputs.search import HemisphereInput
 from hipsta_bids.phantom import Phantom, PhantomSpec
 from hipsta_bids.settings import PUBLISHED, Settings
-from hipsta_bids.types import Status
+from hipsta_bids.types import Decision
 from validation import cases, continuity
 from validation.report import Cell, Cells, Content, suite, table
 
@@ -70,14 +70,14 @@ def measure_error(drawing: Drawing) -> tuple[float, float]:
 
 
 def compare_revision(revision: Revision) -> tuple[float, float, bool]:
-    """Compare maps of two sets of labels: r, RMS, mm, and whether their status agrees."""
+    """Compare maps of two sets of labels: r, RMS, mm, and whether both need a look."""
     first, second = (
         cases.measure_body(read_label_volume(item), item.hemi, revision.settings)
         for item in (revision.first, revision.second)
     )
     pair = first.thickness, second.thickness
     known = np.isfinite(pair[0]) & np.isfinite(pair[1])
-    flagged = [maps.status is Status.FLAGGED for maps in (first, second)]
+    flagged = [maps.decision is Decision.LOOK for maps in (first, second)]
     return (
         float(np.corrcoef(pair[0][known], pair[1][known])[0, 1]),
         cases.rms(pair[0] - pair[1]),

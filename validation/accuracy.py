@@ -394,7 +394,7 @@ def _limits_table(
             bias = float(np.nanmean(result.error))
             met = bool(result.flags) or abs(bias) <= MAX_SILENT_ERROR
             cells |= {
-                "outcome": ", ".join([result.status, *result.flags]),
+                "outcome": ", ".join([result.decision, *result.flags]),
                 "bias": f"{bias:+.3f}",
                 "SD": float(np.nanstd(result.error)),
             }

@@ -73,7 +73,7 @@ class Measured:
     true_curvature: Mapping[str, Float]
     summary: Mapping[str, float]
     true_summary: Mapping[str, float]
-    status: str
+    decision: str
     flags: tuple[str, ...]
 
     @property
@@ -125,7 +125,7 @@ def compare(phantom: Phantom, case: Case, maps: HemisphereMaps) -> Measured:
         true_curvature={name: np.where(inside, getattr(truth, name), np.nan) for name in names},
         summary=dict(maps.summary),
         true_summary=dict(truth.summary),
-        status=str(maps.status),
+        decision=str(maps.decision),
         flags=tuple(flag.reason for flag in maps.flags),
     )
 

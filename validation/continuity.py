@@ -15,7 +15,7 @@ from hipsta_bids.inputs.search import HemisphereInput
 from hipsta_bids.phantom import PhantomSpec
 from hipsta_bids.protocols.protocol import Part
 from hipsta_bids.settings import Settings
-from hipsta_bids.types import End, Float, GivenEnd, HemisphereMaps, LabelVolume, Status
+from hipsta_bids.types import Decision, End, Float, GivenEnd, HemisphereMaps, LabelVolume
 from validation import cases
 from validation.damage import Site, make_defect
 from validation.report import Cell, Cells, Content, suite, table
@@ -86,7 +86,7 @@ class Movement:
     far_off: float
     """Share of the columns beyond ``FAR`` of the change that are off."""
     accepted: bool
-    """Whether both maps have the status ``ok`` or ``repaired``."""
+    """Whether nobody need look at either map."""
     reasons: tuple[str, ...]
     """Flags of the perturbed map."""
     choices: tuple[str, ...]
@@ -281,7 +281,7 @@ def compare(maps: HemisphereMaps, perturbed: HemisphereMaps, changed: Float) -> 
         correlation=float(np.corrcoef(*pair)[0, 1]),
         mean=float(np.nanmean(difference)),
         far_off=float(off[far].mean()) if far.any() else 0.0,
-        accepted=all(m.status in (Status.OK, Status.REPAIRED) for m in (maps, perturbed)),
+        accepted=all(m.decision is Decision.USE for m in (maps, perturbed)),
         reasons=tuple(dict.fromkeys(flag.reason for flag in perturbed.flags)),
         choices=_choices(maps, perturbed),
     )

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from hipsta_bids.phantom import PhantomSpec
-from hipsta_bids.types import Float, HemisphereMaps, Status
+from hipsta_bids.types import Decision, Float, HemisphereMaps
 from validation import cases
 from validation.cases import Refusal, ValidationBody
 from validation.damage import Injury, Position, Site, make_defect
@@ -30,15 +30,9 @@ MAX_CHANGED = 0.05
 PLACELESS = frozenset({"sheet-too-thin", "body-too-short", "no-body"})
 """Reasons of refusals that concern the whole body, and need not say where."""
 
-#: How a case ends: the status of its map, or a crash. Flagged and refused ones name the defect.
 CRASH = "crash"
-OUTCOMES = {
-    Status.OK: "unnoticed",
-    Status.REPAIRED: "repaired",
-    Status.FLAGGED: "flagged",
-    Status.FAILED: "refused",
-    CRASH: "crash",
-}
+#: How a case ends. Flagged and refused ones name the defect.
+OUTCOMES = ("unnoticed", "repaired", "flagged", "refused", CRASH)
 
 SPECS = (
     PhantomSpec(kind="spiral", thickness=2.0, length=12.0),
@@ -103,7 +97,8 @@ class Trial:
 class Damage:
     """What a defect did to a map."""
 
-    status: str
+    decision: str
+    """On the map, or a crash."""
     reasons: tuple[str, ...]
     """Of flags, or why it was refused."""
     message: str = ""
@@ -124,19 +119,26 @@ class Damage:
     """Columns that are not near the defect."""
     margins: Mapping[str, float] = field(default_factory=dict)
     """Statistic over limit by reason of a flag."""
+    repairs: int = 0
+
+    @property
+    def outcome(self) -> str:
+        """How the case ended."""
+        words = {Decision.LOOK: "flagged", Decision.FAILED: "refused", CRASH: CRASH}
+        return words.get(self.decision, "repaired" if self.repairs else "unnoticed")
 
     @property
     def missed(self) -> tuple[str, ...]:
         """Rules that are broken; see the notes below the table."""
         wrong = (self.near_wrong + self.far_wrong) / self.columns
-        accepted = self.status in (Status.OK, Status.REPAIRED)
+        accepted = self.decision == Decision.USE
         named = self.reasons[:1] and self.reasons[0] in PLACELESS
         rules = (
-            ("crash", self.status == CRASH),
+            ("crash", self.decision == CRASH),
             ("wrong", accepted and wrong > MAX_WRONG),
             ("moved", accepted and self.shift > MAX_SHIFT),
             ("big", accepted and self.changed > MAX_CHANGED),
-            ("placeless", self.status == Status.FAILED and not named and "RAS" not in self.message),
+            ("placeless", self.outcome == "refused" and not named and "RAS" not in self.message),
         )
         return tuple(rule for rule, broken in rules if broken)
 
@@ -183,7 +185,7 @@ def compare(maps: HemisphereMaps, reference: HemisphereMaps, changed: Float) -> 
     change = maps.thickness - reference.thickness
     off = ~(np.abs(change) <= WRONG)  # a missing column is off too
     return Damage(
-        status=maps.status,
+        decision=maps.decision,
         reasons=tuple(dict.fromkeys(flag.reason for flag in maps.flags)),
         near_wrong=int(np.count_nonzero(off & near)),
         far_wrong=int(np.count_nonzero(off & ~near)),
@@ -193,13 +195,14 @@ def compare(maps: HemisphereMaps, reference: HemisphereMaps, changed: Float) -> 
         changed=float(maps.qc["changed_fraction"]),
         far=int(np.count_nonzero(~near)),
         margins=maps.qc["flag_margins"],
+        repairs=len(maps.repairs),
     )
 
 
 def refused(refusal: Refusal) -> Damage:
     """Enter a refusal among the results."""
-    status = CRASH if refusal.is_bug else Status.FAILED
-    return Damage(status=status, reasons=(refusal.reason,), message=refusal.message)
+    decision = CRASH if refusal.is_bug else Decision.FAILED
+    return Damage(decision=decision, reasons=(refusal.reason,), message=refusal.message)
 
 
 @table("defects.defects")
@@ -211,10 +214,10 @@ def _cases(trials: list[Trial], results: list[Damage]) -> Iterator[Cells]:
             "defect": kind,
             "size": f"{size:g}",
             "position (u, v)": "{:g}, {:g}".format(*position),
-            "outcome": OUTCOMES[result.status],
+            "outcome": result.outcome,
             "reason": ", ".join(result.reasons) or "-",
         }
-        if result.status not in (Status.FAILED, CRASH):
+        if result.outcome not in ("refused", CRASH):
             cells |= {
                 f"columns off by > {WRONG:g} mm within {NEAR:g} mm": result.near_wrong,
                 "the same elsewhere": result.far_wrong,
@@ -227,7 +230,7 @@ def _cases(trials: list[Trial], results: list[Damage]) -> Iterator[Cells]:
 
 @table("defects.ends")
 def _totals(results: list[Damage]) -> Iterator[Cells]:
-    for status, word in OUTCOMES.items():
-        group = [result for result in results if result.status == status]
+    for word in OUTCOMES:
+        group = [result for result in results if result.outcome == word]
         kept = sum(not result.missed for result in group)
         yield {"outcome": word, "cases": len(group), "of them within the rules": kept}

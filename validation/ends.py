@@ -177,13 +177,13 @@ def cut_obliquely(phantom: Phantom, volume: LabelVolume, degrees: float, about: 
 
 
 def measure_oblique(case: Oblique) -> tuple[str, Float]:
-    """Measure a phantom between oblique planes: status, and error of thickness (Nx, Ny), mm."""
+    """Measure a phantom between oblique planes: decision, and error of thickness (Nx, Ny), mm."""
     spec, degrees, about = case
     phantom = Phantom(spec)
     volume = phantom.label_volume(load_protocol("freesurfer"))
     maps = cases.measure_body(cut_obliquely(phantom, volume, degrees, about), "L")
     truth, inside = cases.truth_at(phantom, maps.sheet.points[:, :, maps.sheet.middle])
-    return maps.status, np.where(inside, maps.thickness - truth.thickness, np.nan)
+    return maps.decision, np.where(inside, maps.thickness - truth.thickness, np.nan)
 
 
 @table("ends.copies")
@@ -272,12 +272,12 @@ def _oblique_table(
         cells: dict[str, Cell] = {"planes": name}
         met = False
         if not isinstance(result, Refusal):
-            status, error = result
+            decision, error = result
             of_rows = np.nanmean(error, axis=0)
             ends = of_rows[[0, 1, -2, -1]]
-            met = bool(np.abs(ends).max() <= MAX_ROW) and status in ("ok", "repaired")
+            met = bool(np.abs(ends).max() <= MAX_ROW) and decision == "use"
             cells |= {
-                "status": status,
+                "decision": decision,
                 **{row: f"{value:+.3f}" for row, value in zip(_ROWS, ends, strict=True)},
                 "all rows": f"{of_rows.mean():+.3f}",
                 "largest of a column": float(np.nanmax(np.abs(error))),

@@ -10,7 +10,7 @@ import numpy as np
 
 from hipsta_bids.phantom import Phantom, PhantomSpec
 from hipsta_bids.protocols.protocol import CORE, Tissue
-from hipsta_bids.types import GivenEnd, HemisphereMaps, LabelVolume, Status
+from hipsta_bids.types import GivenEnd, HemisphereMaps, LabelVolume
 from validation import cases
 from validation.cases import Refusal, ValidationBody
 from validation.damage import Injury, make_defect
@@ -166,18 +166,18 @@ def _cavities(
         cells, met = _name(trial), False
         if isinstance(mended, Outcome):
             met = mended.off <= MAX_WRONG and abs(mended.damage.mean) <= MAX_MEAN
-            met &= mended.damage.status == Status.REPAIRED
+            met &= mended.damage.outcome == "repaired"
             cells |= {
                 "volume, mm3": f"{mended.planted:.1f}",
                 "of it interior": f"{mended.interior:.1f}",
                 "found": f"{mended.found:.1f}",
-                "status": mended.damage.status,
+                "outcome": mended.damage.outcome,
                 "off": f"{mended.off:.1%}",
                 "mean": f"{mended.damage.mean:+.3f}",
             }
         if isinstance(hollow, Outcome):
             cells |= {
-                "not mended: status": hollow.damage.status,
+                "not mended: outcome": hollow.damage.outcome,
                 "not mended: off": f"{hollow.off:.1%}",
                 "not mended: mean": f"{hollow.damage.mean:+.3f}",
             }
@@ -194,7 +194,7 @@ def _ragged(trials: Sequence[Trial], results: Sequence[Outcome | Refusal]) -> It
             cells |= {
                 "volume, mm3": f"{result.planted:.1f}",
                 "handed over": f"{result.found:.1f}",
-                "status": result.damage.status,
+                "outcome": result.damage.outcome,
                 "end moved": "{:.2f} mm, {:.1f}°".format(*result.moved),
                 "off": f"{result.off:.1%}",
                 "off, same plane": f"{result.same_plane:.1%}",
@@ -210,13 +210,13 @@ def _uncus(trials: Sequence[Trial], results: Sequence[Outcome | Refusal]) -> Ite
         cells, met = _name(trial), False
         if isinstance(result, Outcome):
             damage = result.damage
-            met = result.found > 0 and damage.status == Status.REPAIRED and not damage.changed
+            met = result.found > 0 and damage.outcome == "repaired" and not damage.changed
             met &= not result.off and damage.shift <= MAX_SHIFT
             met &= result.warned == (trial.injury[1] > FAR)
             cells |= {
                 "volume, mm3": f"{result.planted:.1f}",
                 "left out": f"{result.found:.1f}",
-                "status": damage.status,
+                "outcome": damage.outcome,
                 "warned": "yes, it begins far behind" if result.warned else "-",
                 "off": f"{result.off:.1%}",
                 "largest change, mm": damage.shift,

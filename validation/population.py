@@ -21,7 +21,7 @@ from hipsta_bids.geometry.body import extract_body
 from hipsta_bids.geometry.digital import to_ras, voxel_points
 from hipsta_bids.phantom import PhantomSpec
 from hipsta_bids.settings import Settings
-from hipsta_bids.types import Float, LabelVolume, Status
+from hipsta_bids.types import Float, LabelVolume
 from validation import cases, defects
 from validation.cases import MIRROR, Refusal, ValidationBody
 from validation.damage import Injury, Site, make_defect
@@ -359,8 +359,8 @@ def _counts(members: Sequence[Member]) -> Iterator[Cells]:
             "undamaged, flagged": _percent(flagged),
             "of these, off by > 0.1 mm": int(np.sum(np.array(off) & flagged)),
             "accepted, off by > 0.1 mm": int(np.sum(np.array(off) > flagged)),
-            "damaged, refused": _percent([d.status == Status.FAILED for d in damages]),
-            "damaged, flagged": _percent([d.status == Status.FLAGGED for d in damages]),
+            "damaged, refused": _percent([d.outcome == "refused" for d in damages]),
+            "damaged, flagged": _percent([d.outcome == "flagged" for d in damages]),
             "accepted, wrong far away": _percent(silent),
         }
 

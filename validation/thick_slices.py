@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from hipsta_bids.geometry.body import extract_body
 from hipsta_bids.phantom import PhantomSpec
 from hipsta_bids.settings import Settings
-from hipsta_bids.types import Float, HemisphereMaps, LabelVolume, Status
+from hipsta_bids.types import Decision, Float, HemisphereMaps, LabelVolume
 from validation import cases
 from validation.cases import Refusal, ValidationBody
 from validation.report import Cell, Cells, Content, suite, table
@@ -74,7 +74,7 @@ class Trial:
 class Outcome:
     """A map from slices beside the one at full resolution."""
 
-    status: str
+    decision: str
     change: float
     """Of the mean thickness, mm."""
     correlation: float
@@ -91,7 +91,7 @@ class Outcome:
     @property
     def accepted(self) -> bool:
         """Whether the map was handed out as sound."""
-        return self.status in (Status.OK, Status.REPAIRED)
+        return self.decision == Decision.USE
 
 
 @suite("slices")
@@ -134,7 +134,7 @@ def compare(maps: HemisphereMaps, reference: HemisphereMaps, step: float) -> Out
     both = np.isfinite(maps.thickness) & np.isfinite(reference.thickness)
     pair = maps.thickness[both], reference.thickness[both]
     return Outcome(
-        status=str(maps.status),
+        decision=str(maps.decision),
         change=float(pair[0].mean() - pair[1].mean()),
         correlation=float(np.corrcoef(*pair)[0, 1]),
         thickness=maps.thickness,

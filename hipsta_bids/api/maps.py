@@ -71,18 +71,18 @@ class Measurement:
         return {row.name: row.unit for row in MAPS}
 
     @property
-    def status(self) -> str:
-        """``ok``, ``repaired`` or ``flagged``."""
-        return self.hemisphere.status.value
+    def decision(self) -> str:
+        """``use``, or ``look``: a person should look before use."""
+        return self.hemisphere.decision.value
 
     @property
     def flags(self) -> tuple[Flag, ...]:
-        """What to look at before use; empty unless the status is ``flagged``."""
+        """What to look at before use; empty unless the decision is ``look``."""
         return self.hemisphere.flags
 
     @property
     def message(self) -> str:
-        """Why it was flagged or repaired; empty if it was not."""
+        """Why a person should look; empty if nobody need."""
         return verdict(self.hemisphere)[2] or ""
 
     @cached_property
@@ -171,7 +171,7 @@ class Measurement:
             "layer": (["layer"], np.linspace(0, 1, nz), {"long_name": "interior to exterior"}),
             "ras": (["ras"], list(POSITION), {}),
         }
-        about = {"side": self.side, "protocol": self.protocol.name, "status": self.status}
+        about = {"side": self.side, "protocol": self.protocol.name, "decision": self.decision}
         return make_dataset(variables, coordinates, about)
 
 
@@ -250,8 +250,8 @@ def measure(
     >>> volume = phantom.label_volume(load_protocol("freesurfer"), voxel_size=(0.5, 0.5, 0.5))
     >>> codes = encode(volume)
     >>> left = hb.measure(codes, side="L", protocol="freesurfer", affine=volume.affine)
-    >>> left.status
-    'ok'
+    >>> left.decision
+    'use'
     >>> left.maps["thickness"].shape
     (41, 21)
     >>> print(f"{left.summary['thickness_mean']:.1f} {left.units['thickness']}")
@@ -405,7 +405,7 @@ def _row(side: Hemisphere) -> dict[str, object]:
         "hemi": entities["hemi"],
         "protocol": entities["seg"],
         "region": entities["region"],
-        "status": side.status.value,
+        "decision": side.decision.value,
         "reason": side.record.get("reason") or "",
         "message": side.message,
         **provenance_of(side.record),
@@ -426,9 +426,9 @@ def _lazy_dataset(root: Path, hemispheres: list[Hemisphere], table: pd.DataFrame
         tuple(names.index(cell) for names, cell in zip(labels, cells, strict=True))
         for cells in table[["participant_id", "session_id", "hemi"]].itertuples(index=False)
     ]
-    status = np.full(outer, "", dtype="<U8")
-    for at, word in zip(index, table["status"], strict=True):
-        status[at] = word
+    decision = np.full(outer, "", dtype="<U8")
+    for at, word in zip(index, table["decision"], strict=True):
+        decision[at] = word
     measured = {at: side for at, side in zip(index, hemispheres, strict=True) if side.measured}
 
     extras = _beside_sheets(list(measured.values()))
@@ -455,7 +455,7 @@ def _lazy_dataset(root: Path, hemispheres: list[Hemisphere], table: pd.DataFrame
 
     names = (*(row.name for row in MAPS), *STATE, "position", *extras)
     variables: dict[str, Any] = {name: variable(name) for name in names}
-    variables["status"] = (axes, status, {"long_name": "how the hemisphere ended; empty: none"})
+    variables["decision"] = (axes, decision, {"long_name": "use, look or failed; empty: none"})
     coordinates = {
         **{name: ([name], values, {}) for name, values in zip(axes, labels, strict=True)},
         **axes_of_nodes,

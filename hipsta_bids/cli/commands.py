@@ -137,17 +137,17 @@ def compare_with_truth(data: Path, out: Path) -> Iterator[str]:
         subject = row["subject"].removeprefix("sub-")
         name = HemisphereName(subject=subject, session=None, hemi=row["hemi"], seg=_DEMO_PROTOCOL)
         title = f"{row['subject']} {row['hemi']} ({row['kind']})"
-        status = ended.get(row_key(identity(name)), {}).get("status", "not run")
+        decision = ended.get(row_key(identity(name)), {}).get("decision", "not run")
         true = float(row["thickness_mean"])
         summary = out / output_path(name, "summary")
         if not summary.exists():
-            yield f"{title}: true mean thickness {true:.3f} mm, not measured ({status})"
+            yield f"{title}: true mean thickness {true:.3f} mm, not measured ({decision})"
             continue
         (values,) = files.read_tsv(summary)
         measured = float(values["thickness_mean"])
         yield (
             f"{title}: true mean thickness {true:.3f} mm, measured {measured:.3f} mm,"
-            f" difference {measured - true:+.3f} mm ({status})"
+            f" difference {measured - true:+.3f} mm ({decision})"
         )
 
 

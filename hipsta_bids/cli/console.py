@@ -25,9 +25,8 @@ _LISTED_ROWS = 3
 
 #: Escape codes by what they mark: statuses, and the beginnings of lines.
 _COLORS = {
-    "ok": "32",
-    "repaired": "36",
-    "flagged": "33",
+    "use": "32",
+    "look": "33",
     "failed": "1;31",
     "hipsta-bids:": "1;31",
     "warning:": "33",
@@ -35,9 +34,7 @@ _COLORS = {
 }
 #: What names of files may do to a terminal: move its cursor, or change its title.
 _CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
-_WORD = re.compile(
-    r"^(hipsta-bids:|warning:|note:)|(?<![^\s(])(ok|repaired|flagged|failed)(?=[,\s)]|$)"
-)
+_WORD = re.compile(r"^(hipsta-bids:|warning:|note:)|(?<![^\s(])(use|look|failed)(?=[,\s)]|$)")
 
 #: Bars of stages with parts, and of those without.
 _PARTS = "{desc}: {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}]"
@@ -123,7 +120,7 @@ class Progress:
         """Show one outcome."""
         if self._bar is not None:
             self._bar.clear()
-        if outcome.status == "failed":
+        if outcome.decision == "failed":
             warn(summary_line(outcome))
             if outcome.trace and self._verbosity > 0:
                 sys.stderr.write(outcome.trace)
@@ -152,7 +149,7 @@ def _bar(stage: str, total: int) -> Any:  # noqa: ANN401  (tqdm's)
 def summary_line(outcome: "Outcome") -> str:
     """Summarize one hemisphere: name, status, mean thickness, time, and remarks."""
     name = outcome.job.result.name
-    parts = [name.title, str(outcome.status)]
+    parts = [name.title, str(outcome.decision)]
     if outcome.thickness is not None:
         parts.append(f"mean thickness {outcome.thickness:.3f} mm (by area)")
     if outcome.seconds is not None:
@@ -161,16 +158,16 @@ def summary_line(outcome: "Outcome") -> str:
         parts.append(f"edited {' and '.join(outcome.job.item.edited)}")
     if outcome.skipped:
         parts.append("unchanged, skipped")
-    if outcome.status == "repaired" and outcome.message:
-        parts.append(f"{outcome.message.count('; ') + 1} repairs, see its quality metrics")
-    elif outcome.reason:
-        parts.append(f"[{outcome.reason}] {outcome.message}")
+    if outcome.repairs:
+        parts.append(f"{outcome.repairs} repair{'s' if outcome.repairs > 1 else ''}")
+    if outcome.reason:
+        parts.append(f"[{outcome.reason}] {outcome.headline}")
     return "  ".join(parts)
 
 
 def echo_result(result: "RunResult", out_dir: Path) -> None:
-    """Print where the outputs are and how many hemispheres ended with which status."""
-    counts = ", ".join(f"{n} {status}" for status, n in sorted(result.counts.items()))
+    """Print where the outputs are and what is to be done with how many hemispheres."""
+    counts = ", ".join(f"{n} {decision}" for decision, n in sorted(result.counts.items()))
     missing = result.n_requested - len(result.outcomes)
     counts += f", {missing} not run" if missing else ""
     skipped = sum(outcome.skipped for outcome in result.outcomes)

@@ -122,7 +122,11 @@ def _add_sheets(parser: Parser) -> None:
         "leave out these, with or without prefix",
         type=bids_label("sub-"),
     )
-    add("--exclude-flagged", "", "leave out hemispheres that the participant level flagged")
+    add(
+        "--exclude-look --exclude-flagged",
+        "",
+        "leave out hemispheres to look at first, unless --ratings says use",
+    )
     add(
         "--exclude-qc",
         "CONDITION...",

@@ -11,9 +11,7 @@ from hipsta_bids.derivatives.names import HemisphereName
 from hipsta_bids.errors import InputError
 from hipsta_bids.io import files
 
-#: Begins what the message of a row says of labels that another hemisphere has, too.
-_COPY = "the labels are the same, byte for byte, as those of "
-
+_COLUMN = "same_labels"
 _LISTED_NAMES = 6  # names in a message
 
 
@@ -53,7 +51,7 @@ def _list(names: Sequence[HemisphereName]) -> str:
 
 
 def mark_copies(root: Path) -> list[tuple[HemisphereName, ...]]:
-    """Write into the messages of ``status.tsv`` which hemispheres have the same labels.
+    """Write into ``status.tsv`` which hemispheres have the same labels.
 
     Rows that do not agree with their quality record are left as they are: another run is at them.
     Returns the groups, see :func:`same_labels`.
@@ -66,17 +64,13 @@ def mark_copies(root: Path) -> list[tuple[HemisphereName, ...]]:
             if agrees(row, record):
                 rows[name], records[name] = row, record
     groups = same_labels(records.items())
-    copies_of = {name: [n for n in group if n != name] for group in groups for name in group}
-    marked = []
-    for name, row in rows.items():
-        before = row.get("message", files.MISSING)
-        words = [text for text in (before.partition(_COPY)[0].removesuffix("; "),) if text]
-        if name in copies_of:
-            words = [text for text in words if text != files.MISSING]
-            words.append(f"{_COPY}{_list(copies_of[name])}; check that no file was copied")
-        after = "; ".join(words) or files.MISSING
-        if after != before:
-            marked.append({**row, "message": after})
-    if marked:
-        update_status(root, marked)
+    copies_of = {name: _list([n for n in group if n != name]) for group in groups for name in group}
+    cells = {name: copies_of.get(name, files.MISSING) for name in rows}
+    changed = [
+        row | {_COLUMN: cells[name]}
+        for name, row in rows.items()
+        if row.get(_COLUMN, files.MISSING) != cells[name]
+    ]
+    if changed:
+        update_status(root, changed)
     return groups

@@ -349,7 +349,7 @@ NOT_FINISHED = "not-finished"
 KEY = ("subject", "session", "hemi", "seg")
 
 #: Cells that the quality record has too.
-RECORDED = ("status", "reason", "version", "settings_hash", "input_hash")
+RECORDED = ("decision", "reason", "version", "settings_hash", "input_hash")
 
 _SHARD_TABLE = "status_shard-*.tsv"
 

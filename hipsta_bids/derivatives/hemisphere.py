@@ -34,7 +34,7 @@ from hipsta_bids.io.volumes import mask_bytes
 from hipsta_bids.opening import open_regular
 from hipsta_bids.protocols import EXPERIMENTAL
 from hipsta_bids.protocols.protocol import Label, Part, Protocol, Tissue
-from hipsta_bids.types import BodyMask, Bool, Flag, Float, HemisphereMaps, Sheet, Status
+from hipsta_bids.types import BodyMask, Bool, Decision, Flag, Float, HemisphereMaps, Sheet
 
 _REDO = "run the participant level again with --force"
 
@@ -54,6 +54,9 @@ _MEASURED_REGION = (
 )
 _WHOLE_REGION = "the hippocampal sheet with head, and tail where it has subfields; experimental"
 _MILLIMETER_DIGITS = 4
+
+#: Most words of a message in a table.
+_HEADLINE = 25
 
 #: Names of surfaces in Workbench, where there is one that fits.
 _SECONDARY = {"interior": None, "midthickness": "MidThickness", "exterior": None}
@@ -263,11 +266,11 @@ def write_results(
     write_more()
     _write_sources(result, record)
     undefined = int(np.isnan(maps.sheet.points[:, :, [0, -1]]).any(axis=(2, 3)).sum())
-    status, reason, message = verdict(maps)
+    decision, reason, message = verdict(maps)
     files.write_json(
         result.path("qc"),
         {
-            "status": status,
+            "decision": decision,
             "reason": reason,
             "message": message,
             **record,
@@ -348,17 +351,27 @@ def write_failure(
     if body is not None:
         files.write_bytes(result.path("body_mask"), mask_bytes(body))
         _write_sources(result, record)
-    verdict = {"status": Status.FAILED, "reason": error.reason, "message": str(error)}
-    files.write_json(result.path("qc"), verdict | dict(record))
+    ending = {"decision": Decision.FAILED, "reason": error.reason, "message": str(error)}
+    files.write_json(result.path("qc"), ending | dict(record))
 
 
-def verdict(maps: HemisphereMaps) -> tuple[Status, str | None, str | None]:
-    """Sum up how a measured hemisphere ended."""
-    notes = [flag.message for flag in maps.flags] or list(maps.repairs)
-    reasons = list(dict.fromkeys(flag.reason for flag in maps.flags))
-    if maps.repairs:
-        reasons.append("repaired")
-    return maps.status, "+".join(reasons) or None, "; ".join(notes) or None
+def verdict(maps: HemisphereMaps) -> tuple[Decision, str | None, str | None]:
+    """Return the decision on a measured hemisphere, its reasons, and the message of the first."""
+    reasons = dict.fromkeys(flag.reason for flag in maps.flags)
+    message = maps.flags[0].message if maps.flags else None
+    return maps.decision, "+".join(reasons) or None, message
+
+
+def headline(message: str) -> str:
+    """Shorten a message to 25 words at most, at the end of a clause where one is near."""
+    words = message.split()
+    if len(words) <= _HEADLINE:
+        return " ".join(words)
+    head = words[:_HEADLINE]
+    clauses = [n for n, word in enumerate(head, 1) if word[-1] in ".;:," and n > _HEADLINE // 3]
+    if clauses:
+        return " ".join(head[: clauses[-1]]).rstrip(".;:,")
+    return f"{' '.join(head)}..."
 
 
 def _gifti_files(

@@ -452,13 +452,20 @@ def add_consequence(finding: Finding, sheet: Sheet) -> Finding:
     if not len(finding.points) or not np.isnan(finding.share):
         return finding
     near = columns_near(sheet, finding.points, FLAG_REACH)
+    return replace(finding, share=float(near.mean()), change=change_of_mean(sheet, near))
+
+
+def change_of_mean(sheet: Sheet, concerned: Bool) -> float:
+    """Compute how much larger the mean thickness is than with columns (Nx, Ny) as those around.
+
+    In mm, weighted by area; NaN if all columns are concerned.
+    """
     thickness, area = measure_thickness(sheet), column_area(sheet)
     valid = np.isfinite(thickness) & np.isfinite(area)
-    change = float("nan")
-    if (valid & ~near).any():
-        step = np.where(near, thickness - spread_over(thickness, near | ~valid), 0.0)[valid]
-        change = float((step * area[valid]).sum() / area[valid].sum())
-    return replace(finding, share=float(near.mean()), change=change)
+    if not (valid & ~concerned).any():
+        return float("nan")
+    step = np.where(concerned, thickness - spread_over(thickness, concerned | ~valid), 0.0)[valid]
+    return float((step * area[valid]).sum() / area[valid].sum())
 
 
 def columns_near(sheet: Sheet, points: Float, reach: float) -> Bool:

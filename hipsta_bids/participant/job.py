@@ -32,7 +32,7 @@ from hipsta_bids.participant.maps import (
 )
 from hipsta_bids.protocols.load import for_region
 from hipsta_bids.settings import Settings
-from hipsta_bids.types import BodyMask, HemisphereMaps, Status
+from hipsta_bids.types import BodyMask, Decision, HemisphereMaps
 
 if TYPE_CHECKING:
     from hipsta_bids.participant.uncertainty import Uncertainty
@@ -72,9 +72,11 @@ class Outcome:
     """How one hemisphere ended."""
 
     job: Job
-    status: Status
+    decision: Decision
     reason: str | None = None
     message: str | None = None
+    repairs: int = 0
+    """How many repairs of the labels there were."""
     error: HipstaError | None = None
     """Set if it failed for a foreseen reason."""
     trace: str | None = None
@@ -90,18 +92,23 @@ class Outcome:
     cpu_seconds: float | None = None
     peak_memory_mb: float | None = None
 
+    @property
+    def headline(self) -> str:
+        """The message in 25 words at most; empty without one."""
+        return hemisphere.headline(self.message or "")
+
 
 def recorded(job: Job) -> Outcome | None:
     """Read how a hemisphere ended, if it did with the same settings and version."""
     try:
         record = read_record(job.result)
-        status = Status(record.get("status", ""))
+        decision = Decision(record.get("decision", ""))
     except (InputError, ValueError):
         return None
     is_current = (
         record.get("version") == __version__ and record.get("settings_hash") == job.settings_hash
     )
-    whole = status == Status.FAILED or (
+    whole = decision == Decision.FAILED or (
         all(path.exists() for path in job.result.paths(optional=job.write_meshes))
         and is_complete(job.result, record)
         and has_spread(job.result, record, job.copies)
@@ -110,9 +117,10 @@ def recorded(job: Job) -> Outcome | None:
         return None
     return Outcome(
         job=job,
-        status=status,
+        decision=decision,
         reason=record.get("reason"),
         message=record.get("message"),
+        repairs=len(record.get("repairs") or ()),
         input_hash=record.get("input_hash"),
         skipped=True,
     )
@@ -121,7 +129,7 @@ def recorded(job: Job) -> Outcome | None:
 def finished(job: Job) -> Outcome | None:
     """Return the outcome of a hemisphere that an earlier run has done with the same inputs."""
     outcome = None if job.force else recorded(job)
-    if outcome is None or outcome.status == Status.FAILED:
+    if outcome is None or outcome.decision == Decision.FAILED:
         return None
     try:
         digest, _ = hash_inputs(job, base_record(job))
@@ -343,12 +351,13 @@ def _measure(job: Job) -> Outcome:
         if volume is not None and isinstance(error, GeometryError):
             body = find_body(volume, job.settings)
         return fail(job, explained, trace=trace, record=record, body=body, **clock.spent())
-    status, reason, message = hemisphere.verdict(maps)
+    decision, reason, message = hemisphere.verdict(maps)
     return Outcome(
         job=job,
-        status=status,
+        decision=decision,
         reason=reason,
         message=message,
+        repairs=len(maps.repairs),
         input_hash=hashed,
         thickness=maps.summary.get("thickness_mean"),
         **clock.spent(),
@@ -405,7 +414,7 @@ def fail(
             error = worse
     return Outcome(
         job=job,
-        status=Status.FAILED,
+        decision=Decision.FAILED,
         reason=error.reason,
         message=str(error),
         error=None if trace else error,

@@ -25,6 +25,7 @@ from hipsta_bids.geometry.catalog import (
 )
 from hipsta_bids.geometry.checks import (
     add_consequence,
+    change_of_mean,
     check_cavities,
     check_cross_sections,
     check_end_labels,
@@ -293,6 +294,7 @@ def quality_metrics(evidence: Evidence) -> dict[str, Any]:
         "thickness_expected_mm": boundaries.sheet_thickness,
         "regions_outside": "head and tail (as in Diers et al. 2023)",
         "repaired_fraction": float(evidence.repaired.mean()),
+        "repaired_change_mm": change_of_mean(evidence.sheet, evidence.repaired),
         **({"mask_change": asdict(body.mask_change)} if body.mask_change else {}),
     }
 

@@ -46,7 +46,7 @@ from hipsta_bids.participant.job import (
 from hipsta_bids.participant.pages import PagePlan, reports_after
 from hipsta_bids.participant.pool import WorkerLost, WorkerPlan, run_jobs
 from hipsta_bids.settings import Settings
-from hipsta_bids.types import Status
+from hipsta_bids.types import Decision
 
 WORKER_GB = 0.6
 """Memory that one worker may need, GB: 500 MB for a hemisphere, and its helper process."""
@@ -113,13 +113,15 @@ def not_finished(job: Job) -> Outcome:
     """Outcome of a hemisphere that no run has finished."""
     message = "the run ended before this hemisphere; run the same command again"
     error = HipstaError(message, reason=NOT_FINISHED)
-    return Outcome(job=job, status=Status.FAILED, reason=error.reason, message=message, error=error)
+    return Outcome(
+        job=job, decision=Decision.FAILED, reason=error.reason, message=message, error=error
+    )
 
 
 def _log(outcome: Outcome) -> None:
     title = outcome.job.title
     if outcome.skipped:
-        _LOGGER.info("%s: unchanged, skipped (%s)", title, outcome.status)
+        _LOGGER.info("%s: unchanged, skipped (%s)", title, outcome.decision)
         return
     for note in outcome.job.item.notes:
         _LOGGER.info("%s: note: %s", title, note)
@@ -127,7 +129,8 @@ def _log(outcome: Outcome) -> None:
         _LOGGER.info("%s: edited %s: %s", title, edit.kind, edit.path)
     for stage, seconds in outcome.stages.items():
         _LOGGER.info("%s: %s %.3f s", title, stage, seconds)
-    _LOGGER.info("%s: %s %s %s", title, outcome.status, outcome.reason or "", outcome.message or "")
+    reason, message = outcome.reason or "", outcome.message or ""
+    _LOGGER.info("%s: %s %s %s", title, outcome.decision, reason, message)
     if outcome.trace:
         _LOGGER.error("%s: %s", title, outcome.trace)
 
@@ -142,9 +145,10 @@ def status_row(outcome: Outcome) -> dict[str, str]:
     }
     return {
         **identity(outcome.job.result.name),
-        "status": str(outcome.status),
+        "decision": str(outcome.decision),
         "reason": outcome.reason or files.MISSING,
-        "message": outcome.message or files.MISSING,
+        "message": outcome.headline or files.MISSING,
+        "repairs": str(outcome.repairs),
         "edited": "+".join(outcome.job.item.edited) or files.MISSING,
         "version": __version__,
         "settings_hash": outcome.job.settings_hash,
@@ -242,8 +246,8 @@ class RunResult:
 
     @property
     def counts(self) -> Counter[str]:
-        """Hemispheres per status, skipped ones under the status that they have."""
-        return Counter(str(outcome.status) for outcome in self.outcomes)
+        """Hemispheres per decision, skipped ones included."""
+        return Counter(str(outcome.decision) for outcome in self.outcomes)
 
     @property
     def exit_code(self) -> ExitCode:
@@ -251,7 +255,7 @@ class RunResult:
 
         The data are to blame if every hemisphere failed because of its input.
         """
-        failed = [outcome for outcome in self.outcomes if outcome.status == Status.FAILED]
+        failed = [outcome for outcome in self.outcomes if outcome.decision == Decision.FAILED]
         if any(isinstance(outcome.error, OutputError) for outcome in failed):
             return ExitCode.NOT_WRITABLE
         if any(outcome.reason == INTERNAL for outcome in failed):
@@ -361,7 +365,7 @@ def _run(
                 if isinstance(outcome.error, OutputError):
                     pages.enabled = False
                     break  # the next one would fail just so
-                if options.stop_on_first_crash and outcome.status == Status.FAILED:
+                if options.stop_on_first_crash and outcome.decision == Decision.FAILED:
                     break
             _write_inputs(out_dir, options, outcomes)
             if pages.enabled and shard is None:
@@ -386,7 +390,7 @@ def _write_inputs(out_dir: Path, options: RunOptions, outcomes: Sequence[Outcome
     for outcome in outcomes:
         with contextlib.suppress(InputError):
             ending = dataset.provenance_of(read_record(outcome.job.result))
-            if outcome.status == Status.FAILED:
+            if outcome.decision == Decision.FAILED:
                 ending |= {"status": "failed", "reason": outcome.message or ""}
             endings[row_key(identity(outcome.job.result.name))[:-1]] = ending
     rows = []

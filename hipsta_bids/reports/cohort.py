@@ -27,7 +27,7 @@ from hipsta_bids.reports.maps import make_sprites, read_maps
 from hipsta_bids.reports.page import number, render
 from hipsta_bids.reports.results import SURFACES, Hemisphere, Views, find_results, input_path
 from hipsta_bids.reports.verdict import RATINGS, Verdict, verdict_of
-from hipsta_bids.types import Float, Status
+from hipsta_bids.types import Decision, Float
 
 #: Least number of hemispheres whose range is shown.
 SMALLEST_COHORT = 5
@@ -50,7 +50,7 @@ _SUMMARY = {
 }
 _QUALITY = {
     "voxels_across": "Voxels across",
-    "changed_fraction": "Repaired",
+    "repaired_fraction": "Repaired",
     "filled_fraction": "Filled",
 }
 
@@ -76,7 +76,7 @@ MEASURES: dict[str, dict[str, Any]] = {
 
 _RUN = re.compile(r"^(?P<time>\d{4}-\d\d-\d\d \d\d:\d\d):\d\d,\d+ INFO (?P<text>.*)$")
 _COMMAND = "command: "
-_OUTCOME = re.compile(r"(?P<title>sub-\S+_hemi-\S+): (?:ok|repaired|flagged|failed)\b")
+_OUTCOME = re.compile(r"(?P<title>sub-\S+_hemi-\S+): (?:use|look|failed)\b")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -101,9 +101,8 @@ class Cohort:
 
     @cached_property
     def ranking(self) -> list[Hemisphere]:
-        """All hemispheres, the most severe first; of equal ones by name."""
-        severity = {title: verdict.severity for title, verdict in self.verdicts.items()}
-        return sorted(self.hemispheres, key=lambda h: -severity[h.result.name.title])
+        """All hemispheres: failed ones, then those to look at, the largest consequence first."""
+        return sorted(self.hemispheres, key=lambda h: self.verdicts[h.result.name.title].rank)
 
     def profiles(self, name: HemisphereName, column: str) -> Float:
         """(N, Nx) means over y of a map, of all hemispheres of the same kind."""
@@ -217,7 +216,7 @@ def cohort_page(cohort: Cohort) -> str | None:
     }
     outliers = distances(cohort, thickness)
     sprites, columns, tiles = make_sprites(maps)
-    counts = Counter(str(h.status) for h in hemispheres)
+    counts = Counter(h.decision for h in hemispheres)
     rows = [
         _row(h, cohort, outliers.get(h.result.name.title), tiles.get(n))
         for n, h in enumerate(hemispheres)
@@ -227,7 +226,7 @@ def cohort_page(cohort: Cohort) -> str | None:
         title="All hemispheres",
         n=len(hemispheres),
         n_participants=len({h.result.name.subject for h in hemispheres}),
-        counts=[(str(status), counts[str(status)]) for status in Status if counts[str(status)]],
+        counts=[(str(word), counts[word]) for word in Decision if counts[word]],
         copies=[
             describe_copies(names)
             for names in same_labels((h.result.name, h.record) for h in hemispheres)
@@ -264,17 +263,23 @@ def _columns(hemispheres: Sequence[Hemisphere], *, compared: bool) -> list[Mappi
     if any(name.region != "body" for name in names):
         columns.append({"key": "region", "title": "Region"})
     columns += [
-        {
-            "key": "severity",
-            "title": "Severity",
-            "digits": 1,
-            "help": "mm by which the mean thickness could be off times % of the map that could be"
-            " wrong; from 1 on look before use; 100 is not measured",
-        },
-        {"key": "verdict", "title": "Verdict"},
+        {"key": "decision", "title": "Decision"},
         {"key": "rating", "title": "Rating"},
-        {"key": "status", "title": "Status"},
         {"key": "reason", "title": "Reason"},
+        {
+            "key": "change",
+            "title": "Mean off by",
+            "unit": "mm",
+            "digits": 2,
+            "help": "what the mean thickness could be off by, for the reason",
+        },
+        {
+            "key": "share",
+            "title": "Of the map",
+            "digits": 0,
+            "percent": True,
+            "help": "share of the map that could be wrong, for the reason",
+        },
     ]
     if compared:
         score = {"title": "Outlier score", "digits": 1, "help": "largest robust z-score"}
@@ -295,6 +300,7 @@ def _row(
     verdict = cohort.verdicts[name.title]
     numbers = {key: hemisphere.summary.get(key, np.nan) for key in _SUMMARY}
     numbers |= {key: number(hemisphere.metrics, key) for key in _QUALITY}
+    numbers |= {"change": abs(verdict.change), "share": verdict.share}
     return {
         "key": name.title,
         "page": participant_report(name.subject, name.session),
@@ -304,11 +310,9 @@ def _row(
         "hemi": name.hemi,
         "seg": name.seg,
         "region": name.region,
-        "severity": verdict.severity,
+        "decision": str(verdict.decision),
         "verdict": verdict.title,
-        "kind": verdict.kind,
         "because": f"{verdict.reason} {verdict.consequence}",
-        "status": str(hemisphere.status),
         "reason": record.get("reason") or "",
         "message": hemisphere.message,
         "distance": round(distance[0], 2) if distance else None,
@@ -347,7 +351,6 @@ def card_of(hemisphere: Hemisphere, cohort: Cohort, views: Views | None) -> Mapp
         "key": key,
         "hash": record.get("input_hash") or "",
         "side": hemisphere.side,
-        "status": str(hemisphere.status),
         "verdict": cohort.verdicts.get(key) or verdict_of(hemisphere),
         "findings": hemisphere.findings,
         "notes": record.get("notes") or [],

@@ -41,7 +41,7 @@ from hipsta_bids.reports.results import (
 )
 from hipsta_bids.reports.slices import point_panels, section_panels, slice_panels, stack_of
 from hipsta_bids.reports.verdict import RATINGS
-from hipsta_bids.types import Float, Status
+from hipsta_bids.types import Decision, Float
 
 #: Finer masks of failed hemispheres are thinned to about this edge before they are drawn, mm.
 _EDGE = 0.6
@@ -447,7 +447,7 @@ def _cohort_profiles(series: Series, column: str) -> dict[str, Float]:
 
 def _correct(series: Series) -> Mapping[str, Any] | None:
     """How to correct what was measured; nothing if all is well."""
-    doubtful = [h for h in series.hemispheres if h.status != Status.OK]
+    doubtful = [h for h in series.hemispheres if h.decision != Decision.USE]
     return correction_of(doubtful) if doubtful else None
 
 

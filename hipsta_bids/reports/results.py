@@ -31,7 +31,7 @@ from hipsta_bids.protocols.load import load_protocol, protocol_names
 from hipsta_bids.protocols.protocol import Protocol
 from hipsta_bids.reports.display import palette
 from hipsta_bids.reports.page import number
-from hipsta_bids.types import Bool, Float, Status
+from hipsta_bids.types import Bool, Decision, Float
 
 SURFACES = ("interior", "midthickness", "exterior")
 SIDES = {"L": "left", "R": "right"}
@@ -128,14 +128,14 @@ class Hemisphere:
     """The quality record."""
 
     @property
-    def status(self) -> Status:
-        """How it ended."""
-        return Status(self.record["status"])
+    def decision(self) -> Decision:
+        """What is to be done with it."""
+        return Decision(self.record["decision"])
 
     @property
     def measured(self) -> bool:
         """Whether there are maps."""
-        return self.status != Status.FAILED
+        return self.decision != Decision.FAILED
 
     @property
     def side(self) -> str:
@@ -225,7 +225,7 @@ def find_results(
     for result in list_results(root, subject, session):
         try:
             record = read_record(result)
-            Status(record.get("status", ""))
+            Decision(record.get("decision", ""))
         except (InputError, ValueError):
             continue
         yield Hemisphere(result, record)

@@ -1,30 +1,17 @@
-"""Whether a hemisphere can be used: the finding that decides, and what it may do to the map.
+"""What a person is told about a hemisphere first: the decision of its record, and what it rests on.
 
-The severity of a hemisphere is one number, by which the pages sort:
-
-- 0: nothing was found;
-- above 0: the consequence of the finding that decides, millimeters by which the mean thickness
-  could be off times percent of the map that could be wrong, 99 at most;
-- at least 1 where there are flags, whatever is known of their consequence;
-- 100: not measured.
-
-Of several findings that with the largest consequence decides; all repairs together count as one
-finding, and among equals the first flag goes first. Below 1, as with 0.1 mm and a tenth of the
-map, a hemisphere is for use, from 1 on a person should look at it, and 100 is for no use.
+A hemisphere with a flag is one to look at, whatever was repaired. Its headline is the flag with the
+largest consequence: by how much the mean thickness could be off, then the share of the map. What
+repairs touch does not count: it does not go along with errors (docs/running.md).
 """
 
-import re
 from dataclasses import dataclass
 
 import numpy as np
 
-from hipsta_bids.derivatives.hemisphere import read_sheet
-from hipsta_bids.errors import InputError
-from hipsta_bids.geometry.checks import FLAG_REACH, spread_over
-from hipsta_bids.geometry.measures import layer_area, node_shares
-from hipsta_bids.reports.page import read_table
+from hipsta_bids.reports.page import number, read_table
 from hipsta_bids.reports.results import Finding, Hemisphere
-from hipsta_bids.types import Float, Status
+from hipsta_bids.types import Decision
 
 #: How a person rates a hemisphere, in the order of the keys 1, 2, 3; the last leaves it out.
 RATINGS = ("use", "unsure", "exclude")
@@ -32,188 +19,115 @@ RATINGS = ("use", "unsure", "exclude")
 #: Flags about volumes that were sampled besides.
 _BESIDES = ("map-outside", "map-unusable", "roi-unusable")
 
-#: Least severity at which a person should look.
-LOOK = 1.0
-#: Severity of what was not measured, and the largest of what was.
-REFUSED, LARGEST = 100.0, 99.0
-
 _ROUNDING = 0.005
 """mm; means that differ by less read the same."""
 
-
-@dataclass(frozen=True, kw_only=True)
-class Consequence:
-    """What one finding may do to the map of thickness."""
-
-    share: float = float("nan")
-    """Of the map that could be wrong."""
-    mean: float = float("nan")
-    """Mean thickness as measured, mm."""
-    smoothed: float = float("nan")
-    """Mean thickness if the columns concerned were as those around them, mm."""
-    without: float = float("nan")
-    """Mean thickness of the other columns alone, mm."""
-    harmless: bool = False
-    """Whether it is about something else than thickness and shape."""
-
-    @property
-    def weight(self) -> float:
-        """Millimeters times percent of the map; 0 where one of these is not known."""
-        weight = abs(self.mean - self.smoothed) * 100 * self.share
-        return float(weight) if np.isfinite(weight) else 0.0
-
-    @property
-    def text(self) -> str:
-        """Both figures, for people."""
-        extent = "the whole map" if self.share == 1 else f"{self.share:.1%} of the map"
-        if self.harmless:
-            return "Thickness and shape do not depend on it."
-        if np.isnan(self.share):
-            return "What it does to the mean thickness is not known."
-        if self.share == 0:
-            return f"No measured column lies there: the mean thickness stays {self.mean:.2f} mm."
-        if np.isnan(self.smoothed):
-            return f"It concerns {extent}; what it does to the mean thickness is not known."
-        off = self.mean - self.smoothed
-        compared = "expected" if self.share == 1 else "with these columns as those around them"
-        means = f"{self.mean:.2f} mm as measured"
-        suffix = f", {self.without:.2f} mm without them" if self.without > 0 else ""
-        if abs(off) < _ROUNDING:
-            return (
-                f"It concerns {extent}; the mean thickness hardly depends on it: {means}, the same"
-                f" {compared}{suffix}."
-            )
-        return (
-            f"The mean thickness could be {abs(off):.2f} mm too {'large' if off > 0 else 'small'},"
-            f" and {extent} wrong: {means}, {self.smoothed:.2f} mm {compared}{suffix}."
-        )
+_TITLES = {
+    Decision.USE: "Use",
+    Decision.LOOK: "Look before use",
+    Decision.FAILED: "Do not use",
+}
+#: By which pages sort.
+_ORDER = (Decision.FAILED, Decision.LOOK, Decision.USE)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Verdict:
     """What a person is told about a hemisphere first."""
 
-    title: str
-    kind: str
-    """``use``, ``look`` or ``refuse``."""
+    decision: Decision
     reason: str
     """The finding that decides."""
     consequence: str
     advice: str
-    severity: float
+    change: float = float("nan")
+    """What the mean thickness could be off by, mm."""
+    share: float = float("nan")
+    """Of the map that could be wrong."""
+
+    @property
+    def title(self) -> str:
+        """The decision, for people."""
+        return _TITLES[self.decision]
+
+    @property
+    def rank(self) -> tuple[int, float, float]:
+        """By which pages sort: decision, then the largest change of the mean and share."""
+        change, share = (float(np.nan_to_num(value)) for value in (self.change, self.share))
+        return _ORDER.index(self.decision), -abs(change), -share
 
 
-def verdict_of(hemisphere: Hemisphere, reach: float = FLAG_REACH) -> Verdict:
-    """Decide from the quality record, and from the tables where it lacks a consequence.
-
-    Columns within ``reach`` of a point, mm, are concerned.
-    """
-    if not hemisphere.measured:
+def verdict_of(hemisphere: Hemisphere) -> Verdict:
+    """Take the decision from the quality record, and write what it rests on."""
+    decision = hemisphere.decision
+    if decision == Decision.FAILED:
         return Verdict(
-            title="Do not use",
-            kind="refuse",
+            decision=decision,
             reason=_sentence(hemisphere.message or "no message"),
             consequence="There are no maps and no numbers.",
             advice="What to do: " + _remedy(str(hemisphere.record.get("reason"))),
-            severity=REFUSED,
         )
-    if hemisphere.status == Status.OK:
+    if decision == Decision.LOOK:
+        finding = hemisphere.findings[0]
         return Verdict(
-            title="Use",
-            kind="use",
-            reason="Nothing stood out.",
-            consequence="No finding puts the mean thickness or the map in doubt.",
-            advice="",
-            severity=0.0,
+            decision=decision,
+            reason=_sentence(finding.message.split("; it concerns")[0]),
+            consequence=_of_flag(hemisphere, finding),
+            advice="Look at the places below; then use it, correct the labels, or leave it out.",
+            change=finding.change,
+            share=finding.share,
         )
-    rows = consequences(hemisphere, reach)
-    reason, consequence = max(rows, key=lambda row: row[1].weight)
-    least = LOOK if hemisphere.status == Status.FLAGGED else 0.0
-    severity = min(max(consequence.weight, least), LARGEST)
-    look = severity >= LOOK
     return Verdict(
-        title="Look before use" if look else "Use",
-        kind="look" if look else "use",
-        reason=reason,
-        consequence=consequence.text,
-        advice="Look at the places below; then use it, correct the labels, or leave it out."
-        if look
-        else "Repairs of this size hardly change the map.",
-        severity=round(severity, 2),
+        decision=decision,
+        reason="Nothing to look at first.",
+        consequence=_of_repairs(hemisphere),
+        advice="",
     )
 
 
-def consequences(hemisphere: Hemisphere, reach: float) -> list[tuple[str, Consequence]]:
-    """List what flags, and all repairs together, may do to the map."""
-    rows = [
-        (_sentence(finding.message.split("; it concerns")[0]), _of_flag(hemisphere, finding, reach))
-        for finding in hemisphere.findings
-        if finding.kind == "flag"
-    ]
-    repairs = [str(repair) for repair in hemisphere.record.get("repairs") or []]
-    if repairs:
-        largest = max(repairs, key=_nodes).split(";")[0]
-        summary = f"{len(repairs)} repairs of the labels, the largest: {largest}"
-        title = _sentence(largest if len(repairs) == 1 else summary)
-        rows.append((title, _of_columns(hemisphere, None, reach)))
-    return rows or [(_sentence(hemisphere.message or "no message"), Consequence())]
+def _of_repairs(hemisphere: Hemisphere) -> str:
+    """Write how much of the map repairs touch; that they do is no sign that it is wrong."""
+    count = len(hemisphere.record.get("repairs") or [])
+    if not count:
+        return "No label was repaired."
+    share, change = (
+        number(hemisphere.metrics, key) for key in ("repaired_fraction", "repaired_change_mm")
+    )
+    mean = hemisphere.summary.get("thickness_mean", np.nan) - change
+    return (
+        f"{count} repair{'s' if count > 1 else ''} of the labels, {share:.1%} of the map; with"
+        f" these columns as those around them the mean would be {mean:.2f} mm."
+    )
 
 
-def _nodes(repair: str) -> int:
-    """Size of a repair, nodes of the grid, as its message says."""
-    size = re.search(r"(\d+) grid nodes", repair)
-    return int(size[1]) if size else 0
+def _of_flag(hemisphere: Hemisphere, finding: Finding) -> str:
+    """Write what a flag may do to the map."""
+    if finding.reason in _BESIDES:
+        return "Thickness and shape do not depend on it."
+    return _consequence(hemisphere, finding.share, finding.change)
+
+
+def _consequence(hemisphere: Hemisphere, share: float, change: float) -> str:
+    """Write which share of the map could be wrong, and what the mean could be off by, mm."""
+    if np.isnan(share):
+        return "What it does to the mean thickness is not known."
+    mean = hemisphere.summary.get("thickness_mean", np.nan)
+    if share == 0:
+        return f"No measured column lies there: the mean thickness stays {mean:.2f} mm."
+    extent = "the whole map" if share == 1 else f"{share:.1%} of the map"
+    if np.isnan(change):
+        return f"It concerns {extent}; what it does to the mean thickness is not known."
+    if abs(change) < _ROUNDING:
+        return f"It concerns {extent}; the mean thickness hardly depends on it: {mean:.2f} mm."
+    compared = "expected" if share == 1 else "with these columns as those around them"
+    return (
+        f"The mean thickness could be {abs(change):.2f} mm too {'large' if change > 0 else 'small'}"
+        f", and {extent} wrong: {mean:.2f} mm as measured, {mean - change:.2f} mm {compared}."
+    )
 
 
 def _sentence(text: str) -> str:
     return f"{text[:1].upper()}{text[1:].rstrip('.')}."
-
-
-def _of_flag(hemisphere: Hemisphere, finding: Finding, reach: float) -> Consequence:
-    """Take the consequence of a flag from the record, or else from the columns round its point."""
-    if finding.reason in _BESIDES:
-        return Consequence(harmless=True)
-    if np.isnan(finding.share) and finding.point is not None:
-        return _of_columns(hemisphere, finding.point, reach)
-    mean = hemisphere.summary.get("thickness_mean", np.nan)
-    return Consequence(share=finding.share, mean=mean, smoothed=mean - finding.change)
-
-
-def _of_columns(
-    hemisphere: Hemisphere, point: tuple[float, float, float] | None, reach: float
-) -> Consequence:
-    """Compare means over the area with and without some columns: those repaired, or near a point.
-
-    Shares are of the area of the mid-surface, of the columns that were measured directly.
-    """
-    try:
-        table = read_sheet(
-            hemisphere.result.path("sheet"), ["r", "a", "s", "thickness"], ["valid", "repaired"]
-        )
-    except InputError:
-        return Consequence()
-    thickness = table["thickness"]
-    middle = np.stack([table[axis] for axis in "ras"], axis=-1)
-    if point is None:
-        concerned = table["repaired"] == "true"
-    else:
-        gap = np.linalg.norm(middle - np.array(point), axis=-1)
-        concerned = gap <= reach + thickness / 2
-    area = np.where(table["valid"] == "true", node_shares(np.nan_to_num(layer_area(middle))), 0.0)
-    area[~np.isfinite(thickness)] = 0.0
-    if not area[~concerned].sum() > 0:
-        return Consequence(share=1.0, mean=_mean(thickness, area))
-    smooth = spread_over(thickness, concerned | ~np.isfinite(thickness))
-    return Consequence(
-        share=float(area[concerned].sum() / area.sum()),
-        mean=_mean(thickness, area),
-        smoothed=_mean(np.where(concerned, smooth, thickness), area),
-        without=_mean(thickness, np.where(concerned, 0.0, area)),
-    )
-
-
-def _mean(values: Float, weights: Float) -> float:
-    return float(np.average(np.nan_to_num(values), weights=weights)) if weights.any() else np.nan
 
 
 def _remedy(reason: str) -> str:

@@ -26,6 +26,7 @@ from hipsta_bids.participant.maps import write_map
 from hipsta_bids.phantom import encode
 from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.settings import Settings
+from hipsta_bids.types import Flag
 
 SECOND = HemisphereName(subject="02", session=None, hemi="L", seg="freesurfer")
 
@@ -45,7 +46,7 @@ class TestMeasure:
         for name, values in phantom().maps.maps.items():
             np.testing.assert_array_equal(left.maps[name], values)
         assert left.summary["volume"] == phantom().maps.summary["volume"]
-        assert left.status == phantom().maps.status
+        assert left.decision == phantom().maps.decision
         assert left.message == ""
 
     @pytest.mark.parametrize("kind", ["array", "image", "file"])
@@ -113,7 +114,7 @@ class TestMeasurement:
         assert found.y.to_numpy()[[0, -1]].tolist() == [-1.0, 1.0]
         assert found.layer.to_numpy()[[0, -1]].tolist() == [0.0, 1.0]
         assert {name: found[name].attrs["units"] for name in left.units} == left.units
-        assert found.attrs == {"side": "L", "protocol": "freesurfer", "status": "ok"}
+        assert found.attrs == {"side": "L", "protocol": "freesurfer", "decision": "use"}
         np.testing.assert_array_equal(found.thickness, left.maps["thickness"])
         # The way from wall to wall is the thickness.
         np.testing.assert_allclose(found.depth.sel(layer=1.0), found.thickness, rtol=1e-6)
@@ -204,14 +205,14 @@ class TestLoad:
     def test_what_failed_or_is_not_there_is_missing(self, out):
         maps, table = hb.load(out)
         failed = maps.sel(participant="sub-02", side="R", session="n/a")
-        assert failed.status.item() == "failed"
+        assert failed.decision.item() == "failed"
         assert np.isnan(failed.thickness).all()
         absent = maps.sel(participant="sub-03", side="L", session="n/a")
-        assert absent.status.item() == ""
+        assert absent.decision.item() == ""
         assert np.isnan(absent.thickness).all()
         assert not absent.valid.any()
         assert (absent.subfield == "").all()
-        row = table[table.status == "failed"]
+        row = table[table.decision == "failed"]
         assert row[["participant_id", "reason", "message"]].to_numpy().tolist() == [
             ["sub-02", "body-interrupted", "there is a gap"]
         ]
@@ -263,8 +264,9 @@ class TestLoad:
 
 
 def test_flags_are_handed_on():
-    maps = replace(phantom().maps, repairs=("a tunnel was closed",))
+    flag = Flag(reason="folded", message="it folds", share=0.1)
+    maps = replace(phantom().maps, repairs=("a tunnel was closed",), flags=(flag,))
     found = api_maps.Measurement(
         side="L", protocol=phantom().volume.protocol, settings=Settings(), hemisphere=maps
     )
-    assert (found.status, found.message) == ("repaired", "a tunnel was closed")
+    assert (found.decision, found.message) == ("look", "it folds")

@@ -27,10 +27,10 @@ def _measured(monkeypatch):
 def study(tmp_path):
     """ASHS's folders as laboratories call them; the files say what the stand-in does."""
     for name, act in (
-        ("P001", "ok"),
-        ("AD_05", "ok"),
+        ("P001", "use"),
+        ("AD_05", "use"),
         ("20230117_1203", "bad-input"),
-        ("sub-04", "ok"),
+        ("sub-04", "use"),
     ):
         for side in ("left", "right"):
             path = tmp_path / "ashs" / name / "final" / f"x_{side}_lfseg_corr_usegray.nii.gz"
@@ -177,7 +177,7 @@ def test_what_a_name_must_not_decide_is_a_question(tmp_path, capsys):
         f"[several-pipelines] a and b both have labels of freesurfer; choose one: -d a={first}"
         in said
     )
-    assert "1 ok" in said_of(capsys, *command, "-d", f"a={first}")
+    assert "1 use" in said_of(capsys, *command, "-d", f"a={first}")
     unfolded = tmp_path / "bids/derivatives/h/sub-02/anat"
     unfolded.mkdir(parents=True)
     for run in ("01", "02"):

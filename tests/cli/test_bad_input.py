@@ -149,12 +149,12 @@ def test_bad_hemispheres_fail_alone(good, tmp_path, capsys):
     expected = {name: reason for name, (_, reason) in FAULTS.items()} | {"short": "body-too-short"}
     assert {subject: found[f"sub-{subject}", "L"]["reason"] for subject in expected} == expected
     for subject in expected:
-        assert found[f"sub-{subject}", "L"]["status"] == "failed"
+        assert found[f"sub-{subject}", "L"]["decision"] == "failed"
         # Where the labels tell, the body is left for a person to look at.
         body = {"body_mask", "body_sources"} if subject == "swapped" else set()
         assert outputs(out, subject, "L") == {"qc"} | body
     for hemi in ("L", "R"):
-        assert found["sub-good", hemi]["status"] != "failed"
+        assert found["sub-good", hemi]["decision"] != "failed"
         assert outputs(out, "good", hemi) == COMPLETE
     *lines, warning = said.err.splitlines()
     assert len(lines) == len(expected)
@@ -195,7 +195,7 @@ def test_memory_decides_what_is_read(good, tmp_path, capsys):
     assert "is 300 MB; raise --mem" in said
     rows = {row["hemi"]: row for row in read_status(out)}
     assert rows["R"]["reason"] == "image-too-large"
-    assert rows["L"]["status"] != "failed"
+    assert rows["L"]["decision"] != "failed"
     assert outputs(out, "good", "L") == COMPLETE
     assert float(rows["L"]["peak_memory_mb"]) < 600  # which is --mem
     # With more of it, the voxels are looked for, and are not there.
@@ -209,7 +209,7 @@ def test_all_inputs_unusable_is_bad_data(good, tmp_path, capsys):
     code = main.main(arguments(bids_dir, tmp_path / "out", *wanted))
     assert code == ExitCode.BAD_DATA
     assert len(capsys.readouterr().err.splitlines()) == 2
-    assert {row["status"] for row in read_status(tmp_path / "out")} == {"failed"}
+    assert {row["decision"] for row in read_status(tmp_path / "out")} == {"failed"}
 
 
 def a_file(path):
@@ -349,7 +349,7 @@ def test_killed_in_the_middle_then_rerun_completes(bids_dir, tmp_path, capsys):
     assert first.startswith("sub-good_hemi-L")
     assert process.returncode == -signal.SIGKILL
     assert outputs(out, "good", "L") == COMPLETE
-    status = {row["hemi"]: row["status"] for row in read_status(out)}
+    status = {row["hemi"]: row["decision"] for row in read_status(out)}
     assert status["L"] != "failed"
     assert status["R"] == "failed"
     record = output_path(

@@ -342,10 +342,10 @@ def test_run_says_what_happened(stand_in_run, tmp_path, capsys):
     assert start == opening(stand_in_run[0])
     assert lines[0] == "note: no description"
     assert lines.pop(1) == "inputs: 4 used, 0 failed, 4 not used, 0 not a segmentation"
-    assert lines[1].startswith("sub-01_hemi-L_seg-demo  ok  mean thickness 1.500 mm (by area)  ")
-    assert lines[2].startswith("sub-03_hemi-L_seg-demo  flagged  mean thickness 1.500 mm")
+    assert lines[1].startswith("sub-01_hemi-L_seg-demo  use  mean thickness 1.500 mm (by area)  ")
+    assert lines[2].startswith("sub-03_hemi-L_seg-demo  look  mean thickness 1.500 mm")
     assert lines[2].endswith("[odd-shape] look at it")
-    assert lines[3] == "4 hemispheres: 2 failed, 1 flagged, 1 ok"
+    assert lines[3] == "4 hemispheres: 2 failed, 1 look, 1 use"
     assert lines[4] == f"maps: {tmp_path / 'out'}"
     assert lines[5] == f"table of all hemispheres: {tmp_path / 'out' / 'status.tsv'}"
     assert lines[6].startswith(f"log: {tmp_path / 'out' / 'logs'}")
@@ -380,8 +380,8 @@ def test_second_run_says_that_it_skipped(stand_in_run, capsys):
     capsys.readouterr()
     main.main([*stand_in_run, "-v"])
     said = capsys.readouterr()
-    assert "sub-01_hemi-L_seg-demo  ok  unchanged, skipped" in said.out
-    assert "4 hemispheres: 2 failed, 1 flagged, 1 ok (2 unchanged, skipped)" in said.out
+    assert "sub-01_hemi-L_seg-demo  use  unchanged, skipped" in said.out
+    assert "4 hemispheres: 2 failed, 1 look, 1 use (2 unchanged, skipped)" in said.out
     assert "Traceback" in said.err  # of the bug, since -v asks for more
 
 
@@ -390,7 +390,7 @@ def test_terminal_gets_a_bar(stand_in_run, monkeypatch, capsys):
     main.main(stand_in_run)
     said = capsys.readouterr()
     assert "| 0/4 [" in said.err  # later counts come at most ten times a second
-    assert "sub-01_hemi-L_seg-demo  ok" in said.out
+    assert "sub-01_hemi-L_seg-demo  use" in said.out
 
 
 def test_settings_print_as_toml(capsys, tmp_path):

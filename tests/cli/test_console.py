@@ -108,13 +108,13 @@ def test_long_paths_lose_their_middle_on_a_terminal(monkeypatch, capsys):
     assert " ".join(" ".join(line[30:] for line in lines).split()).endswith("was found there")
 
 
-def test_counts_of_statuses_have_colors(monkeypatch, capsys):
+def test_counts_of_decisions_have_colors(monkeypatch, capsys):
     monkeypatch.setenv("FORCE_COLOR", "1")
     monkeypatch.delenv("NO_COLOR", raising=False)
-    echo("4 hemispheres: 2 failed, 1 flagged, 1 ok (2 unchanged, skipped)")
+    echo("4 hemispheres: 2 failed, 1 look, 1 use (2 unchanged, skipped)")
     said = capsys.readouterr().out
-    assert "2 \x1b[1;31mfailed\x1b[0m, 1 \x1b[33mflagged\x1b[0m, 1 \x1b[32mok\x1b[0m (2" in said
-    echo("token /data/ok/failed.txt bookkeeping")
+    assert "2 \x1b[1;31mfailed\x1b[0m, 1 \x1b[33mlook\x1b[0m, 1 \x1b[32muse\x1b[0m (2" in said
+    echo("token /data/use/failed.txt userlook")
     assert "\x1b" not in capsys.readouterr().out
 
 

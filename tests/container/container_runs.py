@@ -131,4 +131,6 @@ def differences(one, other):
 def statuses(out):
     """Side and status of each hemisphere."""
     with (out / "status.tsv").open(encoding="utf-8", newline="") as table:
-        return sorted((row["hemi"], row["status"]) for row in csv.DictReader(table, delimiter="\t"))
+        return sorted(
+            (row["hemi"], row["decision"]) for row in csv.DictReader(table, delimiter="\t")
+        )

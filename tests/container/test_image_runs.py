@@ -117,7 +117,7 @@ def test_failing_hemisphere(damaged, out):
     done = on_data(damaged, out, "participant")
     assert ended(done, ExitCode.SOME_FAILED), done
     assert done.stderr.count("\n") == 1
-    assert statuses(out) == [("L", "ok"), ("R", "failed")]
+    assert statuses(out) == [("L", "use"), ("R", "failed")]
 
 
 def test_no_input(damaged, out):
@@ -161,7 +161,7 @@ def test_stopped_by_docker_then_completed(damaged, out):
         process.communicate()
     assert process.returncode == SIGTERM
     done = on_data(damaged, out, "participant")
-    assert statuses(out) == [("L", "ok"), ("R", "failed")], done
+    assert statuses(out) == [("L", "use"), ("R", "failed")], done
 
 
 @pytest.mark.skipif(not COBRALAB.is_dir(), reason="no shared test data beside the clone")

@@ -221,14 +221,17 @@ def test_citation_says_whose_molecular_layer_was_left_out():
 
 def row(subject, hemi="L", **more):
     identity = {"subject": subject, "session": "n/a", "hemi": hemi, "seg": "x"}
-    return identity | {"status": "ok"} | more
+    return identity | {"decision": "use"} | more
 
 
 def test_status_rows_of_other_hemispheres_stay(tmp_path):
     update_status(tmp_path, [row("sub-02", seconds_read="1.0"), row("sub-01")])
-    update_status(tmp_path, [row("sub-02", status="failed", seconds_mesh="2.0")])
+    update_status(tmp_path, [row("sub-02", decision="failed", seconds_mesh="2.0")])
     rows = read_status(tmp_path)
-    assert [(r["subject"], r["status"]) for r in rows] == [("sub-01", "ok"), ("sub-02", "failed")]
+    assert [(r["subject"], r["decision"]) for r in rows] == [
+        ("sub-01", "use"),
+        ("sub-02", "failed"),
+    ]
     assert list(rows[0]) == [*COLUMNS, "seconds_read", "seconds_mesh"]
     assert rows[0]["reason"] == "n/a"
 

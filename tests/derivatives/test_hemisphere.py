@@ -14,6 +14,7 @@ from hipsta_bids.derivatives.hemisphere import (
     ResultPlace,
     fill_from_nearest,
     format_column,
+    headline,
     read_sheet,
     remove_results,
     verdict,
@@ -194,7 +195,7 @@ def test_summary_table(written):
 def test_quality_record(written):
     place, _ = written
     record = json.loads(place.path("qc").read_text())
-    assert record["status"] == "ok"
+    assert record["decision"] == "use"
     assert record["reason"] is None
     assert record["version"] == "x"
     assert record["undefined_columns"] == 1
@@ -306,7 +307,7 @@ def test_failure_leaves_only_its_record(tmp_path):
     assert left == [place.path("qc")]
     record = json.loads(place.path("qc").read_text())
     assert record == {
-        "status": "failed",
+        "decision": "failed",
         "reason": "body-too-short",
         "message": "too short",
         "version": "x",
@@ -332,15 +333,31 @@ def test_removal_of_nothing_is_fine(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_verdict_names_flags_before_repairs():
-    flags = (Flag(reason="a", message="one"), Flag(reason="a", message="two"))
-    assert verdict(make_maps()) == ("ok", None, None)
-    assert verdict(make_maps(repairs=("x",))) == ("repaired", "repaired", "x")
-    assert verdict(make_maps(flags=flags, repairs=("x",))) == (
-        "flagged",
-        "a+repaired",
-        "one; two",
+def test_the_flag_with_the_largest_consequence_decides():
+    flags = (
+        Flag(reason="a", message="one"),
+        Flag(reason="b", message="two", share=0.5, change=0.01),
+        Flag(reason="c", message="three", share=0.1, change=-0.2),
+        Flag(reason="a", message="four", share=1.0),
     )
+    assert verdict(make_maps()) == ("use", None, None)
+    assert verdict(make_maps(repairs=("x",))) == ("use", None, None)
+    assert verdict(make_maps(flags=flags, repairs=("x",))) == ("look", "c+b+a", "three")
+    assert [f.message for f in make_maps(flags=flags).flags] == ["three", "two", "four", "one"]
+
+
+@pytest.mark.parametrize(
+    ("message", "short"),
+    [
+        ("two  words", "two words"),
+        (" ".join(25 * ["a"]), " ".join(25 * ["a"])),
+        (" ".join(26 * ["a"]), " ".join(25 * ["a"]) + "..."),
+        (f"{' '.join(20 * ['a'])}: {' '.join(20 * ['b'])}", " ".join(20 * ["a"])),
+        (f"a: {' '.join(30 * ['b'])}", f"a: {' '.join(24 * ['b'])}..."),
+    ],
+)
+def test_headlines_have_25_words_at_most(message, short):
+    assert headline(message) == short
 
 
 def test_the_record_says_what_a_flag_means_for_the_map(tmp_path):

@@ -46,11 +46,11 @@ def test_leftovers_of_other_regions_stay(tmp_path):
 
 def test_rows_of_regions_are_apart(tmp_path):
     for name in (BODY, LONGER, BODY):
-        update_status(tmp_path, [{**identity(name), "status": "ok"}])
+        update_status(tmp_path, [{**identity(name), "decision": "use"}])
     assert [row["region"] for row in read_status(tmp_path)] == ["body", "extended"]
     earlier = {key: value for key, value in identity(BODY).items() if key != "region"}
-    update_status(tmp_path, [{**earlier, "status": "failed"}])
-    assert [row["status"] for row in read_status(tmp_path)] == ["failed", "ok"]
+    update_status(tmp_path, [{**earlier, "decision": "failed"}])
+    assert [row["decision"] for row in read_status(tmp_path)] == ["failed", "use"]
 
 
 def test_regions_share_settings(tmp_path):

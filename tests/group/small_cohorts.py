@@ -53,7 +53,7 @@ def write_hemisphere(place, thickness, curvature, *, volume=500.0, **record):
     files.write_json(place.path("summary_sidecar"), {"volume": {"Units": "mm^3"}})
     digest = json.loads((place.root / "desc-settings.json").read_text())["hash"]
     content = {
-        "status": "ok",
+        "decision": "use",
         "settings_hash": digest,
         "version": "0.1.0",
         "inputs": [{"file": f"bids:fs:sub-{place.name.subject}/mri/labels.mgz"}],

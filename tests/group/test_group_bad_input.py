@@ -197,7 +197,7 @@ def no_sheet(study):
 
 def unfinished(study):
     row = identity(place_of(study.out, "99", "L").name)
-    update_status(study.out, [row | {"status": "failed", "reason": "not-finished"}])
+    update_status(study.out, [row | {"decision": "failed", "reason": "not-finished"}])
 
 
 def second_protocol(study):
@@ -207,7 +207,7 @@ def second_protocol(study):
 
 def all_failed(study):
     for path in study.out.glob("sub-*/anat/*_metrics.json"):
-        files.write_json(path, {"status": "failed", "reason": "too-thin"})
+        files.write_json(path, {"decision": "failed", "reason": "too-thin"})
 
 
 def no_values(study):

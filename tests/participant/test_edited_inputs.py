@@ -61,16 +61,16 @@ def thickness(out, subject):
 
 def statuses(out):
     rows = files.read_tsv(out / "status.tsv")
-    return {row["subject"]: (row["status"], row["edited"]) for row in rows}
+    return {row["subject"]: (row["decision"], row["edited"]) for row in rows}
 
 
 def test_an_edit_heals_the_map_and_its_removal_brings_the_damage_back(data, tmp_path, case, capsys):
     out, edits = tmp_path / "out", tmp_path / "edits"
     code = run(data, out)
     broken = statuses(out)
-    assert broken["sub-01"] == ("ok", "n/a")
+    assert broken["sub-01"] == ("use", "n/a")
     assert broken["sub-02"] == broken["sub-03"]
-    assert broken["sub-02"][0] != "ok"
+    assert broken["sub-02"][0] != "use"
     # The body is there to be corrected, even if it was refused.
     body = nib.load(results(out, "02", "L", SEG).path("body_mask"))
     whole = nib.load(results(out, "01", "L", SEG).path("body_mask"))
@@ -91,9 +91,9 @@ def test_an_edit_heals_the_map_and_its_removal_brings_the_damage_back(data, tmp_
     assert note.endswith("edited file not used: no labels of sub-04 hemi-L are processed")
     assert "1 unchanged, skipped" in said
     assert statuses(out) == {
-        "sub-01": ("ok", "n/a"),
-        "sub-02": ("ok", "labels"),
-        "sub-03": ("ok", "mask"),
+        "sub-01": ("use", "n/a"),
+        "sub-02": ("use", "labels"),
+        "sub-03": ("use", "mask"),
     }
     # The same labels give the same map.
     np.testing.assert_array_equal(thickness(out, "02"), thickness(out, "01"))
@@ -134,5 +134,5 @@ def test_a_mask_on_a_turned_and_finer_grid_gives_the_same_body(data, tmp_path):
     fine = fine[::-1].transpose(2, 1, 0)
     save(folder_of(data, "01") / "sub-01_hemi-L_desc-edited_mask.nii.gz", fine, affine)
     assert run(data, out, "--participant-label", "01") == ExitCode.OK
-    assert statuses(out)["sub-01"] == ("ok", "mask")
+    assert statuses(out)["sub-01"] == ("use", "mask")
     np.testing.assert_array_equal(thickness(out, "01"), before)

@@ -95,10 +95,10 @@ def test_a_bad_row_fails_its_hemisphere_alone(data, tmp_path, row, what, capsys)
     ends = table(tmp_path / "ends.tsv", row)
     assert run(data, out, "--ends", ends) == ExitCode.SOME_FAILED
     rows = {row["hemi"]: row for row in files.read_tsv(out / "status.tsv")}
-    assert (rows["L"]["status"], rows["L"]["reason"]) == ("failed", "unreadable-table")
+    assert (rows["L"]["decision"], rows["L"]["reason"]) == ("failed", "unreadable-table")
     assert what in rows["L"]["message"]
     assert f"{ends}, line" in rows["L"]["message"]
-    assert rows["R"]["status"] == "ok"
+    assert rows["R"]["decision"] == "use"
     assert capsys.readouterr().err.count(what) <= 1
 
 

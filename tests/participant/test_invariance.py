@@ -131,7 +131,7 @@ def assert_near(maps, reference, *, points):
     difference = maps.thickness - reference.thickness
     assert abs(difference.mean()) <= PROMISE
     assert middle(difference).std() <= points
-    assert maps.status == reference.status
+    assert maps.decision == reference.decision
     assert maps.qc["posterior_end_rule"] == reference.qc["posterior_end_rule"]
 
 

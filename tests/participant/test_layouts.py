@@ -199,7 +199,7 @@ def out(tmp_path_factory):
 def test_thickness_and_ends_in_every_layout(out, expected):
     subject, hemi, protocol, posterior, anterior = expected
     found = results(out, subject, hemi, protocol)
-    assert found.row["status"] == "ok", found.row["message"]
+    assert found.row["decision"] == "use", found.row["message"]
     # An eighth of the 0.4 mm voxels, as promised for the demonstration.
     truth = PHANTOM.truth(0.5, 0.5).summary
     assert float(found.summary["thickness_mean"]) == pytest.approx(
@@ -233,7 +233,7 @@ def test_hsf_in_the_mode_that_is_named(tmp_path, mode):
     arguments = [str(tmp_path / "bids"), str(tmp_path / "out"), "participant", "-d", f"hsf={data}"]
     assert main.main(arguments) == ExitCode.BAD_DATA
     refused = results(tmp_path / "out", "h", "R", "hsf").row
-    assert (refused["status"], refused["reason"]) == ("failed", "ambiguous-scheme")
+    assert (refused["decision"], refused["reason"]) == ("failed", "ambiguous-scheme")
     assert main.main([*arguments, "--protocol", mode]) == ExitCode.OK
     found = results(tmp_path / "out", "h", "R", mode)
     assert float(found.summary["thickness_mean"]) == pytest.approx(1.8, abs=0.05)  # as above
@@ -253,6 +253,6 @@ def test_a_users_protocol(tmp_path):
     options = ["-d", f"mine={tmp_path / 'labels'}", "--scheme", str(protocol)]
     assert main.main([*arguments, *options]) == ExitCode.OK
     found = results(tmp_path / "out", "lab", "L", "inhouse")
-    assert found.row["status"] == "ok"
+    assert found.row["decision"] == "use"
     assert float(found.summary["thickness_mean"]) == pytest.approx(1.8, abs=0.05)  # as above
     assert set(found.sheet.subfield) == {"a", "b", "c"}

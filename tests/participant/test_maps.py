@@ -142,7 +142,7 @@ def ras(sheet):
 def test_nothing_fails(done):
     out, code = done
     assert code == ExitCode.OK
-    assert {row["status"] for row in read_status(out)} == {"flagged"}
+    assert {row["decision"] for row in read_status(out)} == {"look"}
 
 
 def test_a_linear_field_comes_back(done, sheet):
@@ -320,7 +320,7 @@ def test_bad_regions_harm_nothing_else(bids_dir, tmp_path):
     out = tmp_path / "out"
     assert run(bids_dir, out, "--roi", str(roi), "--map", f"T1w={pattern('T1w')}") == ExitCode.OK
     (row,) = read_status(out)
-    assert (row["status"], row["reason"]) == ("flagged", "roi-unusable")
+    assert (row["decision"], row["reason"]) == ("look", "roi-unusable")
     assert not path_of(out, "roi").exists()
     assert path_of(out, "map_table", "T1w").exists()
     assert path_of(out, "thickness").exists()

@@ -17,7 +17,7 @@ from hipsta_bids.phantom import Phantom, PhantomSpec
 from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.protocols.protocol import Part, Tissue
 from hipsta_bids.settings import BodySettings, CheckSettings, Settings, SheetSettings
-from hipsta_bids.types import Status
+from hipsta_bids.types import Decision
 
 SHAPES = [
     PhantomSpec(kind=kind, thickness=thickness, length=LENGTH)
@@ -59,7 +59,7 @@ def test_thickness_is_that_of_the_phantom(case):
 def test_a_clean_phantom_needs_no_repair(case):
     assert case.maps.repairs == ()
     assert case.maps.flags == ()
-    assert case.maps.status == Status.OK
+    assert case.maps.decision == Decision.USE
     assert case.maps.sheet.valid.all()
     assert case.maps.qc["euler_before"] == 1
     assert case.maps.qc["posterior_end_rule"] == case.maps.qc["anterior_end_rule"] == "labels"
@@ -161,7 +161,7 @@ def test_thickness_follows_a_known_pattern():
     error = middle(case.maps.thickness) - expected
     assert abs(error.mean()) < 0.03  # mm, as for constant thickness
     assert error.std() < 0.08  # mm, a little smoothing on top of the voxels' roughness
-    assert case.maps.status == Status.OK
+    assert case.maps.decision == Decision.USE
 
 
 def test_left_and_right_are_mirror_images(plain):
@@ -185,7 +185,7 @@ def test_the_molecular_layer_goes_where_the_setting_says():
     nearest_label = measured(spiral(layer_thickness=0.6), settings=settings)
     # All of the layer belongs to the phantom's sheet.
     assert nearest_sheet.maps.thickness.mean() == pytest.approx(2.0, abs=0.03)
-    assert nearest_sheet.maps.status == nearest_label.maps.status == Status.OK
+    assert nearest_sheet.maps.decision == nearest_label.maps.decision == Decision.USE
     assert nearest_label.maps.qc["layer_voxels"] < nearest_sheet.maps.qc["layer_voxels"]
     # Where dentate gyrus lies beneath the 0.6 mm, about half of them are nearer to it.
     loss = nearest_sheet.maps.thickness - nearest_label.maps.thickness
@@ -252,7 +252,7 @@ def test_a_hole_is_filled_and_reported(plain, damage):
     where = damage.shaft(0.5, 0.5, 0.8)  # narrower ones are pits
     assert where.sum() > 10
     maps = measure(damage.erase(where))
-    assert maps.status == Status.REPAIRED
+    assert maps.decision == Decision.USE
     # Beside the dentate gyrus it is a cavity, where the sheet goes round it.
     (repair,) = [text for text in maps.repairs if not text.startswith("filled a cavity")]
     assert repair.startswith("filled a hole")
@@ -266,7 +266,7 @@ def test_a_hole_is_filled_and_reported(plain, damage):
 def test_a_bridge_is_cut_and_reported(plain, damage):
     where = damage.bar((0.2, 0.5, -0.8), (0.8, 0.5, -0.8), 0.5)
     maps = measure(damage.relabel(where, Tissue.CA1))
-    assert maps.status == Status.REPAIRED
+    assert maps.decision == Decision.USE
     (repair,) = maps.repairs
     assert repair.startswith("cut a bridge")
     assert maps.qc["euler_before"] == 0
@@ -276,7 +276,7 @@ def test_a_bridge_is_cut_and_reported(plain, damage):
 def test_an_island_is_removed_and_reported(plain, damage):
     where = damage.ball((0.4, 0.5, 4.0), 0.8)
     maps = measure(damage.relabel(where, Tissue.CA1))
-    assert maps.status == Status.REPAIRED
+    assert maps.decision == Decision.USE
     (repair,) = maps.repairs
     assert repair.startswith("removed a separate piece")
     assert_only_local_change(plain, maps, points=0)
@@ -303,7 +303,7 @@ def test_a_large_repair_is_flagged(damage, kind):
         where = damage.bar((0.2, 0.5, -0.8), (0.8, 0.5, -0.8), 1.0)
         volume = damage.relabel(where, Tissue.CA1)
     maps = measure(volume)
-    assert maps.status == Status.FLAGGED
+    assert maps.decision == Decision.LOOK
     assert "large-repair" in {flag.reason for flag in maps.flags}
 
 

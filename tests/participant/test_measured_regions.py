@@ -69,7 +69,7 @@ def out(bids):
 def test_size_of_every_region(out, region, hemi):
     truth = Phantom(HEMISPHERES[hemi]).region_summary(region)
     result = found(out, hemi, region)
-    assert result.row["status"] == "ok"
+    assert result.row["decision"] == "use"
     # What is promised for the regions: 2 %.
     for column in ("thickness_mean", "extent_x", "extent_y", "extent_z"):
         assert float(result.summary[column]) == pytest.approx(truth[column], rel=0.02), column
@@ -130,7 +130,7 @@ def test_maps_and_drawn_regions_on_other_regions(bids, tmp_path):
     for region in ("extended", "entorhinal"):
         assert run(bids, tmp_path / "out", "--hemi", "L", "--region", region, *options) == 0
         done = found(tmp_path / "out", "L", region)
-        assert done.row["status"] == "ok"
+        assert done.row["decision"] == "use"
         sheet = done.sheet
         values = {
             name: pd.read_csv(done.out / output_path(done.name, "map_table", name), sep="\t")[name]

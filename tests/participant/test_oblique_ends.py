@@ -12,7 +12,7 @@ from hipsta_bids.participant.measure import measure_hemisphere
 from hipsta_bids.phantom import Phantom, PhantomSpec
 from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.settings import BodySettings, Settings
-from hipsta_bids.types import Status
+from hipsta_bids.types import Decision
 from validation.damage import Site, make_defect
 from validation.ends import cut_obliquely
 
@@ -37,7 +37,7 @@ def measure(volume):
 def test_rows_at_oblique_planes_are_as_thick_as_others(volume, degrees, about):
     """The last rows read up to .28 mm too thick where the mesh ended at the planes."""
     maps = measure(cut(volume, degrees, about))
-    assert maps.status == Status.OK
+    assert maps.decision == Decision.USE
     error = maps.thickness.mean(axis=0) - 2.0
     assert np.abs(error[[0, 1, -2, -1]]).max() < 0.08
     assert np.abs(error).mean() < 0.04
@@ -69,7 +69,7 @@ def with_uncus(whole, plain, kind="uncus"):
 
 def test_an_uncus_is_left_out_and_named(volume, plain):
     maps = measure(with_uncus(cut(volume, 0, "width"), plain))
-    assert maps.status == Status.REPAIRED
+    assert maps.decision == Decision.USE
     (repair,) = maps.repairs
     assert repair.startswith("left out the uncus")
     assert np.abs(maps.thickness - plain.thickness).max() < 0.1

@@ -19,7 +19,7 @@ from hipsta_bids.io import files
 from hipsta_bids.participant import run as runner
 from hipsta_bids.participant.run import RunOptions, n_workers, run_participants
 from hipsta_bids.settings import BodySettings, Settings
-from hipsta_bids.types import Status
+from hipsta_bids.types import Decision
 
 
 @pytest.fixture(autouse=True)
@@ -40,7 +40,7 @@ def run(items, out, **options):
 
 def status_of(out):
     return {
-        (row["subject"], row["hemi"]): (row["status"], row["reason"]) for row in read_status(out)
+        (row["subject"], row["hemi"]): (row["decision"], row["reason"]) for row in read_status(out)
     }
 
 
@@ -67,7 +67,7 @@ def test_one_good_hemisphere_gives_a_complete_dataset(tmp_path):
     (row,) = read_status(out)
     assert list(row)[: len(COLUMNS)] == list(COLUMNS)
     assert list(row)[len(COLUMNS) :] == ["seconds_read", "seconds_surface", "seconds_write"]
-    assert row["status"] == "ok"
+    assert row["decision"] == "use"
     assert row["reason"] == "n/a"
     assert float(row["seconds"]) >= float(row["seconds_write"]) > 0
     assert 10 < float(row["peak_memory_mb"]) < 2000  # numpy alone is above, the test host below
@@ -119,18 +119,18 @@ def test_every_kind_of_failure_stays_alone(tmp_path):
     items.append(make_input(tmp_path / "in", "10", problem=problem))
     result = run(items, out, n_procs=2, timeout=4.0)
     assert status_of(out) == {
-        ("sub-01", "L"): ("ok", "n/a"),
+        ("sub-01", "L"): ("use", "n/a"),
         ("sub-02", "L"): ("failed", "worker-died"),
         ("sub-03", "L"): ("failed", "internal-error"),
         ("sub-04", "L"): ("failed", "empty-labels"),
         ("sub-05", "L"): ("failed", "timeout"),
-        ("sub-06", "L"): ("flagged", "odd-shape"),
-        ("sub-07", "L"): ("repaired", "repaired"),
+        ("sub-06", "L"): ("look", "odd-shape"),
+        ("sub-07", "L"): ("use", "n/a"),
         ("sub-08", "L"): ("failed", "body-too-short"),
-        ("sub-09", "L"): ("ok", "n/a"),
+        ("sub-09", "L"): ("use", "n/a"),
         ("sub-10", "L"): ("failed", "ambiguous-atlas"),
     }
-    assert result.counts == {"ok": 2, "failed": 6, "flagged": 1, "repaired": 1}
+    assert result.counts == {"use": 3, "failed": 6, "look": 1}
     assert result.exit_code == ExitCode.INTERNAL
     log = result.log.read_text()
     assert "ZeroDivisionError: tests divide by zero" in log
@@ -141,9 +141,9 @@ def test_every_kind_of_failure_stays_alone(tmp_path):
         place = outcome.job.result
         there = {row.key for row in OUTPUTS if place.path(row.key).exists()}
         full = {row.key for row in OUTPUTS if not row.optional}
-        assert there == ({"qc"} if outcome.status == Status.FAILED else full)
+        assert there == ({"qc"} if outcome.decision == Decision.FAILED else full)
         record = json.loads(place.path("qc").read_text())
-        assert (record["status"], record["reason"]) == (outcome.status, outcome.reason)
+        assert (record["decision"], record["reason"]) == (outcome.decision, outcome.reason)
 
 
 def test_exit_codes_of_failures(tmp_path):
@@ -164,7 +164,7 @@ def test_second_run_skips_what_is_unchanged(tmp_path):
     result = run(items, out)
     assert [outcome.skipped for outcome in result.outcomes] == [True, True]
     assert result.exit_code == ExitCode.OK
-    assert result.counts == {"ok": 1, "flagged": 1}
+    assert result.counts == {"use": 1, "look": 1}
     assert (out / "status.tsv").read_bytes() == before
     assert {path: path.stat().st_mtime_ns for path in times} == times
 
@@ -208,7 +208,7 @@ def test_an_edit_that_cannot_be_read_fails_and_is_named(tmp_path):
     item.edits[0].path.unlink()
     result = run([item], tmp_path / "out")
     (row,) = read_status(tmp_path / "out")
-    assert (row["status"], row["edited"]) == ("failed", "mask")
+    assert (row["decision"], row["edited"]) == ("failed", "mask")
     assert "desc-edited_mask.nii.gz" in row["message"]
     record = json.loads(result.outcomes[0].job.result.path("qc").read_text())
     assert [edit["what"] for edit in record["edited"]] == ["mask"]
@@ -235,7 +235,8 @@ def test_what_changed_is_redone(tmp_path, change):
         options["force"] = True
     (outcome,) = run([item], out, **options).outcomes
     assert not outcome.skipped
-    assert outcome.status == ("repaired" if change == "input" else "ok")
+    assert outcome.decision == "use"
+    assert outcome.repairs == (change == "input")
     assert place.path("mesh").exists() == (change == "mesh")
 
 
@@ -262,7 +263,7 @@ def test_lost_status_table_is_rebuilt_from_records(tmp_path):
     run(items, out)
     (out / "status.tsv").unlink()
     run(items, out)
-    assert status_of(out) == {("sub-01", "L"): ("flagged", "odd-shape")}
+    assert status_of(out) == {("sub-01", "L"): ("look", "odd-shape")}
 
 
 def test_rows_of_other_runs_stay(tmp_path):
@@ -271,7 +272,7 @@ def test_rows_of_other_runs_stay(tmp_path):
     run([make_input(tmp_path / "in", "02")], out)
     assert status_of(out) == {
         ("sub-01", "L"): ("failed", "body-too-short"),
-        ("sub-02", "L"): ("ok", "n/a"),
+        ("sub-02", "L"): ("use", "n/a"),
     }
 
 
@@ -311,7 +312,7 @@ def test_full_disk_ends_the_run_but_harms_nothing_else(tmp_path, monkeypatch):
     result = run(items, out)
     assert result.exit_code == ExitCode.NOT_WRITABLE
     assert status_of(out) == {
-        ("sub-01", "L"): ("ok", "n/a"),
+        ("sub-01", "L"): ("use", "n/a"),
         ("sub-02", "L"): ("failed", "disk-full"),
         ("sub-03", "L"): ("failed", "not-finished"),
     }
@@ -396,9 +397,9 @@ def test_run_that_dies_has_a_table_and_a_rerun_completes(tmp_path, number, code)
         assert "run the same command again" in errors
     found = status_of(out)
     assert len(found) == 9
-    assert set(found.values()) == {("ok", "n/a"), ("failed", "not-finished")}
+    assert set(found.values()) == {("use", "n/a"), ("failed", "not-finished")}
     complete = list(out.rglob("*_desc-qc_metrics.json"))
-    assert len(complete) == list(found.values()).count(("ok", "n/a"))
+    assert len(complete) == list(found.values()).count(("use", "n/a"))
     if code > 0:  # what was half done is gone
         assert len(list(out.rglob("*_thickness.shape.gii"))) == len(complete)
 
@@ -407,4 +408,4 @@ def test_run_that_dies_has_a_table_and_a_rerun_completes(tmp_path, number, code)
     assert result.exit_code == ExitCode.OK
     assert result.outcomes[0].skipped
     assert not list(out.rglob("*.tmp"))
-    assert status_of(out)[("sub-02", "L")] == ("ok", "n/a")
+    assert status_of(out)[("sub-02", "L")] == ("use", "n/a")

@@ -128,10 +128,10 @@ def test_parts_collected_are_as_if_one_run_had_done_all(last, command, tmp_path,
     assert data_files(parts) == data_files(whole)  # the tables of the parts are read as one
     capsys.readouterr()
     assert command("parts", last) == ExitCode.SOME_FAILED
-    assert "5 hemispheres: 1 failed, 1 flagged, 3 ok" in capsys.readouterr().out
+    assert "5 hemispheres: 1 failed, 1 look, 3 use" in capsys.readouterr().out
     assert data_files(parts) == data_files(whole)
     rows = read_table(parts / "status.tsv")
-    assert [row["status"] for row in rows] == ["ok", "failed", "flagged", "ok", "ok"]
+    assert [row["decision"] for row in rows] == ["use", "failed", "look", "use", "use"]
     assert all(row["seconds"] != "n/a" for row in rows)
 
 
@@ -165,7 +165,7 @@ def test_where_tables_differ_the_quality_record_decides(command, tmp_path):
     out = tmp_path / "out"
     command("out", "participant", "--shard", "1/1")
     (good, *_) = read_status(out)
-    late = good | {"status": "failed", "reason": "not-finished", "input_hash": "n/a"}
+    late = good | {"decision": "failed", "reason": "not-finished", "input_hash": "n/a"}
     update_status(out, [late])
     update_status(out, [good | {"seconds": "n/a"}], shard="2of3")
     assert read_status(out)[0] == good

@@ -63,7 +63,7 @@ def test_all_twelve_are_measured(out):
 def test_maps_are_plausible(out, subject, hemi, seg):
     found = results(out, subject, hemi, seg)
     row, sheet = found.row, found.sheet
-    assert row["status"] in {"ok", "repaired"} | ({"flagged"} if seg == "ashsABC3T" else set())
+    assert row["decision"] in {"use"} | ({"look"} if seg == "ashsABC3T" else set())
     assert PLAUSIBLE[0] < float(found.summary["thickness_mean"]) < PLAUSIBLE[1]
     assert (~sheet.valid).mean() <= 0.02
     assert sheet.thickness.notna().all()

@@ -46,7 +46,7 @@ def test_two_runs_measure_each_hemisphere_once_and_lose_nothing(tmp_path):
     assert [run.returncode for run in runs] == [0, 0]
     assert sum(measured) == 6
     out = tmp_path / "out"
-    assert [row["status"] for row in read_status(out)] == ["ok"] * 6
+    assert [row["decision"] for row in read_status(out)] == ["use"] * 6
     assert len(list(out.rglob("*_desc-qc_metrics.json"))) == 6
     assert not list(out.rglob("*.tmp"))
     json.loads((out / "dataset_description.json").read_text())
@@ -152,5 +152,5 @@ def test_a_lost_worker_does_not_undo_what_another_run_did(tmp_path, monkeypatch,
         items, tmp_path / "out", Settings(), runner.RunOptions(), lambda _: None
     )
     (row,) = read_status(tmp_path / "out")
-    assert row["status"] == result.outcomes[0].status == ("ok" if act == "ok" else "failed")
+    assert row["decision"] == result.outcomes[0].decision == ("use" if act == "ok" else "failed")
     assert row["reason"] == ("n/a" if act == "ok" else "timeout")

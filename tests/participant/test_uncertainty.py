@@ -31,7 +31,7 @@ from hipsta_bids.protocols.protocol import Tissue
 from hipsta_bids.reports.cohort import read_cohort
 from hipsta_bids.reports.participant import participant_page
 from hipsta_bids.settings import Settings, UncertaintySettings
-from hipsta_bids.types import EditedMask, LabelVolume, Status
+from hipsta_bids.types import Decision, EditedMask, LabelVolume
 
 SCHEME = load_protocol("freesurfer")
 STILL = UncertaintySettings(relabeling=0.0, end_shift=0.0, jitter=0.0, rotation=0.0)
@@ -337,7 +337,7 @@ def test_modes_are_recorded_and_flag_a_map(drawn, monkeypatch):
     (flag,) = set(flagged.flags) - set(maps.flags)
     assert flag.reason == "second-choice"
     assert "of the columns" in flag.message
-    assert flagged.status == Status.FLAGGED
+    assert flagged.decision == Decision.LOOK
     alike = replace(spread, modes=replace(spread.modes, value=0.1))
     assert add_uncertainty(maps, alike).flags == maps.flags
 

@@ -18,14 +18,14 @@ from hipsta_bids.reports.cohort import (
 from hipsta_bids.reports.results import Hemisphere, find_results
 
 
-def make(root, subject, values, *, hemi="L", status="ok", **record):
+def make(root, subject, values, *, hemi="L", decision="use", **record):
     """Write the two files that a cohort is read from."""
     result = ResultPlace(
         root=root, name=HemisphereName(subject=subject, session=None, hemi=hemi, seg="P")
     )
     result.path("qc").parent.mkdir(parents=True, exist_ok=True)
-    result.path("qc").write_text(json.dumps({"status": status, **record}))
-    if status != "failed":
+    result.path("qc").write_text(json.dumps({"decision": decision, **record}))
+    if decision != "failed":
         names = list(MEASURES)
         result.path("summary").write_text(
             "\t".join(names) + "\n" + "\t".join(f"{v}" for v in values) + "\n"
@@ -81,7 +81,7 @@ def test_few_hemispheres_are_not_compared(tmp_path):
 def test_failed_ones_and_other_sides_are_not_in_the_range(tmp_path):
     name = make(tmp_path, "01", np.ones(len(MEASURES))).name
     make(tmp_path, "02", np.ones(len(MEASURES)), hemi="R")
-    make(tmp_path, "03", (), status="failed")
+    make(tmp_path, "03", (), decision="failed")
     cohort = read_cohort(tmp_path)
     assert len(cohort.hemispheres) == 3
     assert cohort.values(name, next(iter(MEASURES))).tolist() == [1.0]
@@ -100,7 +100,7 @@ def test_the_last_run_that_measured_a_hemisphere_is_its_origin(tmp_path):
     logs.mkdir()
     line = "2026-01-0{0} 10:00:00,123 INFO {1}\n"
     title = "sub-01_hemi-L_seg-P"
-    for day, outcome in ((1, "ok"), (2, "repaired"), (3, "unchanged, skipped (repaired)")):
+    for day, outcome in ((1, "use"), (2, "look"), (3, "unchanged, skipped (look)")):
         text = line.format(day, f"command: run {day}") + line.format(day, f"{title}: {outcome}")
         (logs / f"run-2026010{day}T100000-1.log").write_text(text)
     assert read_cohort(tmp_path).origins[title] == ("run 2", "2026-01-02 10:00")
@@ -108,7 +108,7 @@ def test_the_last_run_that_measured_a_hemisphere_is_its_origin(tmp_path):
 
 def test_places_in_messages_are_found_and_folders_are_not_told(tmp_path):
     record = {
-        "status": "flagged",
+        "decision": "look",
         "flags": [{"reason": "a", "message": "a hole at RAS -1.5 20 3.25 mm (CA2/3): large"}],
         "repairs": ["a hole at RAS -1.5 20 3.25 mm (CA2/3)", "cut a bridge"],
         "message": "data/someone/scan.mgz: cannot be read (T1w/T2w)",

@@ -44,7 +44,7 @@ def fail(root, subject, hemi):
     """Turn a measured hemisphere into a failed one."""
     (path,) = (root / f"sub-{subject}/anat").glob(f"*hemi-{hemi}*_metrics.json")
     record = json.loads(path.read_text())
-    record |= {"status": "failed", "message": "nothing to be done", "metrics": {}}
+    record |= {"decision": "failed", "message": "nothing to be done", "metrics": {}}
     path.write_text(json.dumps(record))
 
 

@@ -47,7 +47,7 @@ def test_a_page_is_made_for_all_readers(page):
     assert '<html lang="en">' in page
 
 
-def test_statuses_are_said_with_what_to_do(out):
+def test_decisions_are_said_with_what_to_do(out):
     first, second = ((out / f"sub-0{n}.html").read_text() for n in (1, 2))
     verdicts = [
         re.findall(r'<p class="verdict">(.*?)</p>\n<p><b>(.*?)</b></p>', text)
@@ -56,8 +56,7 @@ def test_statuses_are_said_with_what_to_do(out):
     assert [title for page in verdicts for title, _ in page] == [
         *("Use", "Use", "Look before use", "Do not use")
     ]
-    assert verdicts[0][0][1] == "Nothing stood out."
-    assert verdicts[0][1][1].startswith("Cut a bridge of")
+    assert [reason for _, reason in verdicts[0]] == 2 * ["Nothing to look at first."]
     assert verdicts[1][1][1].startswith("The body is interrupted at RAS")
     assert "the body is interrupted at RAS" in second
     assert "fill in missing slices" in second
@@ -104,16 +103,14 @@ def cohort_data(text):
 
 def test_the_table_has_every_hemisphere(out):
     data = cohort_data((out / "report.html").read_text())
-    assert [(r["participant"], r["hemi"], r["status"]) for r in data["rows"]] == [
+    assert [(r["participant"], r["hemi"], r["decision"]) for r in data["rows"]] == [
         ("sub-02", "R", "failed"),
-        ("sub-02", "L", "flagged"),
-        ("sub-01", "R", "repaired"),
-        ("sub-01", "L", "ok"),
+        ("sub-02", "L", "look"),
+        ("sub-01", "L", "use"),
+        ("sub-01", "R", "use"),
     ]
     assert [r["tile"] for r in data["rows"]] == [None, 0, 1, 2]
-    severity = [r["severity"] for r in data["rows"]]
-    assert severity == sorted(severity, reverse=True)
-    assert (severity[0], severity[-1]) == (100, 0)
+    assert [r["change"] is None for r in data["rows"]] == [True, False, True, True]
     assert all((out / row["page"]).exists() for row in data["rows"])
 
 
@@ -146,7 +143,7 @@ def test_tags_in_any_text_of_the_results_stay_text(copy):
         "flags": [{"reason": EVIL, "message": f"{EVIL} at RAS -20 -20 -20 mm"}],
         "inputs": [{"file": f"bids:x:{EVIL}"}],
         "passed_over": [{"file": EVIL, "reason": EVIL}],
-        "status": "flagged",
+        "decision": "look",
     }
     for path in (copy / "sub-01/anat").glob("*_metrics.json"):
         spoil(path, lambda record: record.update(evil))
@@ -190,7 +187,7 @@ def test_a_section_that_fails_costs_itself_only(out, monkeypatch, caplog):
     monkeypatch.setattr(participant_module, "SECTIONS", (broken, *participant_module.SECTIONS))
     text = participant_page(out, "01", None, read_cohort(out))
     assert "ZeroDivisionError: by zero" in text
-    assert "Nothing stood out" in text
+    assert "Nothing to look at first." in text
     assert "section x" in caplog.text
 
 

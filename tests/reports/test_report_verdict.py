@@ -1,14 +1,13 @@
-"""What a page says first: the finding that decides, and what it may do to the map."""
+"""What a page says first: the decision, its reason, and what that may do to the map."""
 
 import csv
 import json
-import shutil
 
 import numpy as np
 import pytest
 
 from hipsta_bids.reports.results import Hemisphere, find_results
-from hipsta_bids.reports.verdict import RATINGS, consequences, verdict_of
+from hipsta_bids.reports.verdict import RATINGS, verdict_of
 
 
 def hemisphere(root, subject, hemi):
@@ -28,13 +27,11 @@ def flag(reason, message, share, change):
     }
 
 
-def test_each_status_has_its_verdict(out):
+def test_each_decision_has_its_verdict(out):
     verdicts = [verdict_of(hemisphere(out, *one)) for one in zip(("01", "01", "02", "02"), "LRLR")]  # noqa: B905
     assert [v.title for v in verdicts] == ["Use", "Use", "Look before use", "Do not use"]
-    assert [v.kind for v in verdicts] == ["use", "use", "look", "refuse"]
-    severity = [v.severity for v in verdicts]
-    assert severity[0] == 0
-    assert 0 < severity[1] < 1 <= severity[2] < severity[3] == 100
+    assert [v.decision for v in verdicts] == ["use", "use", "look", "failed"]
+    assert sorted(verdicts, key=lambda v: v.rank) == [verdicts[3], verdicts[2], *verdicts[:2]]
     assert "Fill missing slices" in verdicts[3].advice
     assert RATINGS[-1] == "exclude"
 
@@ -72,60 +69,38 @@ def smoothed(values, where):
     return found
 
 
-def test_what_repairs_may_do_is_computed_from_the_table(out):
+def test_what_repairs_may_do_is_that_of_the_repaired_columns(out):
     found = hemisphere(out, "01", "R")
     numbers, repaired = table_of(found)
     assert repaired.any()
     thickness = numbers["thickness"]
     area = areas_of(np.stack([numbers[k] for k in "ras"], axis=-1))
     mean = np.average(thickness, weights=area)
-    without = np.average(thickness[~repaired], weights=area[~repaired])
     other = np.average(smoothed(thickness, repaired), weights=area)
-    share = area[repaired].sum() / area.sum()
-    ((reason, consequence),) = consequences(found, 1.0)
-    assert reason.startswith("Cut a bridge of 7 grid nodes at RAS")
-    assert consequence.mean == pytest.approx(mean, abs=1e-6)
-    assert consequence.mean == pytest.approx(found.summary["thickness_mean"], abs=1e-3)
-    assert consequence.without == pytest.approx(without, abs=1e-6)
-    assert consequence.smoothed == pytest.approx(other, abs=1e-5)
-    assert consequence.share == pytest.approx(share, abs=1e-6)
-    severity = verdict_of(found).severity
-    assert severity == pytest.approx(abs(mean - other) * 100 * share, abs=0.006)
-    text = verdict_of(found).consequence
-    assert f"{share:.1%} of the map" in text
-    assert f"{mean:.2f} mm as measured" in text
-    assert f"{without:.2f} mm without them" in text
+    verdict = verdict_of(found)
+    assert verdict.reason == "Nothing to look at first."
+    assert found.metrics["repaired_change_mm"] == pytest.approx(mean - other, abs=1e-5)
+    assert verdict.consequence == (
+        f"1 repair of the labels, {repaired.mean():.1%} of the map; with these columns as those"
+        f" around them the mean would be {other:.2f} mm."
+    )
+    assert verdict_of(hemisphere(out, "01", "L")).consequence == "No label was repaired."
 
 
-def test_the_largest_consequence_decides(out):
-    found = hemisphere(out, "01", "L")
+def test_a_flag_decides_whatever_was_repaired(out):
+    found = hemisphere(out, "01", "R")
     mean = found.summary["thickness_mean"]
     flags = [
-        flag("section-bump", "a bump near RAS 1 2 3 mm: look", 0.02, 0.3),
         flag("edge-notch", "a notch near RAS 1 2 3 mm: look; it concerns 20%", 0.2, -0.05),
-        flag("folded", "folds: look", 0.5, None),
         flag("noisy-labels", "noise: look", None, None),
     ]
-    verdict = verdict_of(changed(found, status="flagged", flags=flags))
-    # 0.05 mm x 20 % of the map are more than 0.3 mm x 2 %.
+    verdict = verdict_of(changed(found, decision="look", flags=flags))
+    assert verdict.title == "Look before use"
     assert verdict.reason == "A notch near RAS 1 2 3 mm: look."
     assert verdict.consequence == (
         "The mean thickness could be 0.05 mm too small, and 20.0% of the map wrong:"
         f" {mean:.2f} mm as measured, {mean + 0.05:.2f} mm with these columns as those around them."
     )
-    assert verdict.severity == 1.0
-    flags[1]["mean_change_mm"] = -0.5
-    assert verdict_of(changed(found, status="flagged", flags=flags)).severity == 10.0
-    flags[1] |= {"columns_share": 1.0, "mean_change_mm": 2.0}
-    assert verdict_of(changed(found, status="flagged", flags=flags)).severity == 99.0
-
-
-def test_repairs_decide_where_they_weigh_more_than_flags(out):
-    found = hemisphere(out, "01", "R")
-    slight = [flag("section-bump", "a bump: look", 0.001, 0.001)]
-    verdict = verdict_of(changed(found, status="flagged", flags=slight))
-    assert verdict.reason.startswith("Cut a bridge")
-    assert (verdict.title, verdict.severity) == ("Look before use", 1.0)
 
 
 @pytest.mark.parametrize(
@@ -141,34 +116,8 @@ def test_repairs_decide_where_they_weigh_more_than_flags(out):
 )
 def test_what_is_not_known_is_said(out, reason, share, change, text):
     flags = [flag(reason, "doubtful", share, change)]
-    verdict = verdict_of(changed(hemisphere(out, "01", "L"), status="flagged", flags=flags))
+    verdict = verdict_of(changed(hemisphere(out, "01", "L"), decision="look", flags=flags))
     assert verdict.consequence.startswith(text)
-    assert (verdict.kind, verdict.severity) == ("look", 1.0)
-
-
-def test_a_flag_without_numbers_is_measured_round_its_point(out):
-    found = hemisphere(out, "02", "L")
-    numbers, _ = table_of(found)
-    points = np.stack([numbers[k] for k in "ras"], axis=-1)
-    area, thickness = areas_of(points), numbers["thickness"]
-    node = (20, 10)
-    place = " ".join(f"{v:.3f}" for v in points[node])
-    near = np.linalg.norm(points - np.round(points[node], 3), axis=-1) <= 1.5 + thickness / 2
-    assert 0.01 < near.mean() < 0.5
-    flags = [{"reason": "section-bump", "message": f"a bump near RAS {place} mm: look"}]
-    ((_, consequence),) = consequences(changed(found, flags=flags, repairs=[]), 1.5)
-    assert consequence.share == pytest.approx(area[near].sum() / area.sum(), abs=1e-6)
-    without = np.average(thickness[~near], weights=area[~near])
-    assert consequence.without == pytest.approx(without, abs=1e-6)
-
-
-def test_a_table_that_is_gone_costs_the_numbers_only(out, tmp_path):
-    copy = shutil.copytree(out, tmp_path / "copy")
-    found = hemisphere(copy, "01", "R")
-    found.result.path("sheet").unlink()
-    verdict = verdict_of(found)
-    assert verdict.title == "Use"
-    assert verdict.consequence == "What it does to the mean thickness is not known."
 
 
 def test_commands_open_the_files_from_the_output_folder(out):
@@ -199,15 +148,3 @@ def test_commands_of_a_container_name_no_folder_of_it(out, monkeypatch):
     assert snap.startswith("mri_convert LABELS_DIR/")
     monkeypatch.setenv("APPTAINER_CONTAINER", "image.sif")  # which sees the folders of the machine
     assert "LABELS_DIR" not in open_commands(hemisphere(out, "01", "R"))[0][1]
-
-
-def test_of_several_repairs_the_largest_is_named(out):
-    repairs = [
-        "filled a cavity of 4 grid nodes at RAS 1 2 3 mm (CA1); it concerns 1.0% of the columns",
-        "cut a bridge of 25 grid nodes at RAS 4 5 6 mm (CA1); it concerns 0.1% of the columns",
-        "left out the uncus, 11 mm3 at RAS 7 8 9 mm",
-    ]
-    found = changed(hemisphere(out, "01", "R"), repairs=repairs)
-    assert verdict_of(found).reason == (
-        "3 repairs of the labels, the largest: cut a bridge of 25 grid nodes at RAS 4 5 6 mm (CA1)."
-    )

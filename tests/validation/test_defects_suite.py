@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from hipsta_bids.errors import GeometryError
-from hipsta_bids.types import Status
+from hipsta_bids.types import Decision
 from validation import defects
 from validation.cases import Refusal, measure_reference
 from validation.defects import Damage, Trial, compare, measure_trial
@@ -20,7 +20,7 @@ def trial(kind, size, position=(0.5, 0.5)):
 @pytest.mark.parametrize("position", [(0.5, 0.5), (0.2, 0.35), (0.82, 0.6)])
 def test_holes_are_filled_to_the_walls_thickness(position):
     found = measure_trial(trial("hole", 0.8, position))
-    assert found.status == "repaired"
+    assert found.outcome == "repaired"
     assert found.shift < 0.15  # mm, the rule; the grid's nodes are the same, the mesh is not
     # Of about 100 columns near it; a plug of the wall's own thickness leaves few.
     assert found.near_wrong <= 6
@@ -28,7 +28,7 @@ def test_holes_are_filled_to_the_walls_thickness(position):
 
 def test_a_hole_beside_an_edge_is_not_cut_open():
     found = measure_trial(trial("hole", 1.6, (0.2, 0.35)))
-    assert found.status == "flagged"
+    assert found.outcome == "flagged"
     assert found.reasons[0] == "large-repair"
     assert found.near_wrong + found.far_wrong <= 6  # 42 columns moved when it was cut open
     assert found.shift < 0.15  # mm, as above
@@ -73,7 +73,7 @@ def test_what_cannot_be_repaired_is_flagged(kind, size, reason):
 
 def test_a_gap_that_the_hippocampus_encloses_is_filled():
     found = measure_trial(trial("gap", 0.4))
-    assert found.status == Status.REPAIRED
+    assert found.decision == Decision.USE
     assert (found.near_wrong, found.far_wrong) == (0, 0)
     assert abs(found.mean) < 0.01
 
@@ -90,20 +90,20 @@ def test_columns_are_counted_near_and_far():
     assert found.mean == pytest.approx(0.3 / shifted.size)
     assert found.missed == ("moved",)
     assert replace(found, shift=0.1).missed == ()
-    assert replace(found, status="flagged").missed == ()
+    assert replace(found, decision="look").missed == ()
 
 
 @pytest.mark.parametrize(
     ("damage", "missed"),
     [
-        (Damage(status="ok", reasons=(), near_wrong=2, columns=100), ()),
-        (Damage(status="ok", reasons=(), near_wrong=2, far_wrong=1, columns=100), ("wrong",)),
-        (Damage(status="flagged", reasons=("folded",), near_wrong=9, columns=100), ()),
-        (Damage(status="repaired", reasons=(), changed=0.06), ("big",)),
-        (Damage(status="failed", reasons=("topology",), message="near RAS 1 2 3 mm"), ()),
-        (Damage(status="failed", reasons=("topology",), message="somewhere"), ("placeless",)),
-        (Damage(status="failed", reasons=("sheet-too-thin",), message="all of it"), ()),
-        (Damage(status="crash", reasons=("timeout",)), ("crash",)),
+        (Damage(decision="use", reasons=(), near_wrong=2, columns=100), ()),
+        (Damage(decision="use", reasons=(), near_wrong=2, far_wrong=1, columns=100), ("wrong",)),
+        (Damage(decision="look", reasons=("folded",), near_wrong=9, columns=100), ()),
+        (Damage(decision="use", reasons=(), changed=0.06), ("big",)),
+        (Damage(decision="failed", reasons=("topology",), message="near RAS 1 2 3 mm"), ()),
+        (Damage(decision="failed", reasons=("topology",), message="somewhere"), ("placeless",)),
+        (Damage(decision="failed", reasons=("sheet-too-thin",), message="all of it"), ()),
+        (Damage(decision="crash", reasons=("timeout",)), ("crash",)),
     ],
 )
 def test_rules(damage, missed):
@@ -114,7 +114,7 @@ def test_the_tables_show_every_case_and_miss_crashes(monkeypatch):
     def some(work, cases, *, timeout):
         assert work is measure_trial
         assert timeout == 60.0
-        results = [Damage(status="ok", reasons=(), columns=861) for _ in cases]
+        results = [Damage(decision="use", reasons=(), columns=861) for _ in cases]
         results[1] = Refusal(reason="topology", message="no")
         results[2] = Refusal(reason="crash", message="bug")
         return results

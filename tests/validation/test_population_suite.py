@@ -8,7 +8,7 @@ import pytest
 from hipsta_bids.phantom import Phantom, PhantomSpec
 from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.settings import Settings
-from hipsta_bids.types import Status
+from hipsta_bids.types import Decision
 from validation import population
 from validation.cases import Refusal
 from validation.defects import PLAN, Damage
@@ -118,7 +118,7 @@ def member(brain="a", spacing=0.33, damages=(), origin="a 1", mean=1.6, **margin
 
 def damage(far_wrong=0, **margins):
     named = {name.replace("_", "-"): value for name, value in margins.items()}
-    return Damage(status=Status.OK, reasons=(), far_wrong=far_wrong, far=100, margins=named)
+    return Damage(decision=Decision.USE, reasons=(), far_wrong=far_wrong, far=100, margins=named)
 
 
 def test_limits_are_quantiles_with_room_but_no_less_than_what_matters():
@@ -139,7 +139,7 @@ def test_a_damage_is_silent_if_it_is_accepted_and_far_columns_are_off():
     assert is_silent(damage(far_wrong=6, folded=0.2), {}) is True
     assert is_silent(damage(far_wrong=5, folded=0.2), {}) is False
     assert is_silent(damage(far_wrong=6, folded=1.2), {}) is None
-    refused = Damage(status=Status.FAILED, reasons=("topology",))
+    refused = Damage(decision=Decision.FAILED, reasons=("topology",))
     assert is_silent(refused, {}) is None
 
 
@@ -178,7 +178,7 @@ def test_a_specimen_is_measured_with_its_damage():
     injuries = (("hole", 0.8, (0.5, 0.5)), ("notch", 2.0, (0.5, 0.5)))
     found = measure_specimen(Specimen(body=SPEC, number=1, voxel=FINE, injuries=injuries))
     assert found.spacing == 0.5
-    assert [d.status for d in found.damages] == ["repaired", "flagged"]
+    assert [d.outcome for d in found.damages] == ["repaired", "flagged"]
     assert found.damages[0].far > 500
     assert found.damages[1].margins["section-notch"] > 1 > found.margins["section-notch"]
 
@@ -187,7 +187,7 @@ def test_a_damage_that_is_refused_is_a_result():
     injuries = (("cut-short", 3.0, (0.5, 0.5)), ("hole", 0.01, (0.5, 0.5)))
     found = measure_specimen(Specimen(body=SPEC, number=0, voxel=None, injuries=injuries))
     (refused,) = found.damages  # the hole changes no voxel
-    assert (refused.status, refused.margins) == ("failed", {})
+    assert (refused.decision, refused.margins) == ("failed", {})
 
 
 @pytest.mark.long

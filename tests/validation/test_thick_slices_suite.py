@@ -55,7 +55,7 @@ def test_an_offset_moves_slices_by_its_share_of_their_distance():
 
 
 def maps(thickness, length=20.0):
-    return SimpleNamespace(thickness=thickness, qc={"body_length_mm": length}, status="ok")
+    return SimpleNamespace(thickness=thickness, qc={"body_length_mm": length}, decision="use")
 
 
 def test_maps_are_compared_node_by_node():
@@ -83,10 +83,10 @@ def test_sampling_a_spike_between_slices_loses_all_of_it():
     np.testing.assert_allclose(lost, np.array([-1, 3, -1]) / 21, atol=1e-12)
 
 
-def outcome(change, correlation=0.9, status="ok"):
+def outcome(change, correlation=0.9, decision="use"):
     sampled = ((0.01, 0.95), (-0.03, 0.93), (0.02, 0.97))
     return Outcome(
-        status=status,
+        decision=decision,
         change=change,
         correlation=correlation,
         sampled=sampled,
@@ -113,8 +113,8 @@ def row_of(results, step=2.0):
         ([outcome(0.04), outcome(-0.04)], False),  # mean
         ([outcome(0.02, 0.54), outcome(0.02)], False),  # one correlation
         ([outcome(0.02, 0.82), outcome(0.02, 0.85)], False),  # their median
-        ([*6 * [outcome(0.02)], outcome(0.02, status="flagged")], True),
-        ([*5 * [outcome(0.02)], outcome(0.02, status="flagged")], False),  # accepted
+        ([*6 * [outcome(0.02)], outcome(0.02, decision="look")], True),
+        ([*5 * [outcome(0.02)], outcome(0.02, decision="look")], False),  # accepted
     ],
 )
 def test_targets_are_judged(results, met):
@@ -123,7 +123,7 @@ def test_targets_are_judged(results, met):
 
 def test_no_accepted_map_may_be_far_off_whatever_the_distance():
     assert row_of([outcome(0.16)], step=thick_slices.PIXEL)[1] is False
-    assert row_of([outcome(0.16, status="flagged")], step=thick_slices.PIXEL)[1] is True
+    assert row_of([outcome(0.16, decision="look")], step=thick_slices.PIXEL)[1] is True
 
 
 def test_refusals_are_counted_and_explained():
@@ -159,7 +159,7 @@ def test_maps_half_a_slice_apart_are_compared():
     ("second", "flips"),
     [
         (outcome(0.25), 0),
-        (outcome(0.0, status="flagged"), 1),
+        (outcome(0.0, decision="look"), 1),
         (Refusal(reason="topology", message="a knot"), 1),
     ],
 )

@@ -37,7 +37,7 @@ def poses(count=400):
             true_curvature={},
             summary={"thickness_mean": 2 + 0.01 * random.normal()},
             true_summary={},
-            status="ok",
+            decision="use",
             flags=(),
         )
         for _ in range(count)

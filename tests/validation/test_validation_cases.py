@@ -45,7 +45,7 @@ def perfect(case, *, error=0.0):
         sheet=SimpleNamespace(points=points * ([-1, 1, 1] if case.mirrored else 1), middle=1),
         thickness=truth.thickness + error,
         summary=dict(truth.summary),
-        status="ok",
+        decision="use",
         flags=(SimpleNamespace(reason="thin"),),
         maps={name: getattr(truth, name) for name in (*CURVATURES, *GAUSSIAN_CURVATURES)},
     )
@@ -152,7 +152,7 @@ def constant(error, *, thickness=2.0, flags=()):
         true_curvature={},
         summary={},
         true_summary={},
-        status="ok",
+        decision="use",
         flags=flags,
     )
 
@@ -222,7 +222,7 @@ def test_rate_of_a_power_law():
 
 def test_a_case_is_measured_near_its_truth():
     measured = measure_case(Case(spec=replace(SMALL, variation=0.0), pose=any_pose(random())))
-    assert measured.status == "ok"
+    assert measured.decision == "use"
     # One pose of a short phantom: a tenth and a quarter of a voxel.
     assert abs(np.nanmean(measured.error)) < 0.04
     assert np.nanstd(measured.error) < 0.1

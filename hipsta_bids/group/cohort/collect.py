@@ -19,7 +19,7 @@ from hipsta_bids.io import files
 from hipsta_bids.io.files import checked_foreign
 from hipsta_bids.protocols.toml import settings_hash
 from hipsta_bids.settings import Settings, SheetSettings
-from hipsta_bids.types import PARTICIPANT, SESSION, Status
+from hipsta_bids.types import PARTICIPANT, SESSION, Decision
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,7 +38,7 @@ class GroupRequest:
     """Labels to leave out."""
     sessions: tuple[str, ...] = ()
     """Labels without ``ses-``; empty is all."""
-    exclude_flagged: bool = False
+    exclude_look: bool = False
     exclude_qc: tuple[Condition, ...] = ()
     exclude_table: Path | None = None
     """Participants, or single sessions and hemispheres, to leave out."""
@@ -65,8 +65,8 @@ class SheetRecord:
     version: str
     source: str
     """Address of the segmentation."""
-    flagged: bool = False
-    """Whether the participant level asks to look before use."""
+    doubtful: bool = False
+    """Whether the participant level asks to look before use, and nobody has rated it for use."""
 
 
 @dataclass(frozen=True)
@@ -265,15 +265,16 @@ def _judge(
     result: hemisphere.ResultPlace, request: GroupRequest, choices: Choices
 ) -> SheetRecord | Exclusion:
     record = hemisphere.read_record(result)
-    status = record.get("status")
-    reason, message = record.get("reason") or str(status), record.get("message") or ""
-    unwanted = choices.reason_to_leave_out(result.name, record.get("input_hash"))
+    decision = record.get("decision")
+    reason, message = record.get("reason") or str(decision), record.get("message") or ""
+    rated = result.name, record.get("input_hash")
+    unwanted = choices.reason_to_leave_out(*rated)
     if unwanted is not None:
         reason, message = unwanted
-    elif status == Status.FAILED:
+    elif decision == Decision.FAILED:
         reason = f"failed: {reason}"
-    elif request.exclude_flagged and status == Status.FLAGGED:
-        reason = f"flagged: {reason}"
+    elif request.exclude_look and decision == Decision.LOOK and not choices.approves(*rated):
+        reason = f"look: {reason}"
     elif request.exclude_qc and (condition := fulfilled(request.exclude_qc, _metrics(record))):
         reason, message = "quality", condition
     else:
@@ -283,7 +284,7 @@ def _judge(
             settings_hash=intern(str(record.get("settings_hash"))),
             version=intern(str(record.get("version"))),
             source=relocate(str(inputs[0].get("file", "")), request.segmentations),
-            flagged=status == Status.FLAGGED,
+            doubtful=decision == Decision.LOOK and not choices.approves(*rated),
         )
     return Exclusion.of_sheet(result.name, reason, message)
 
@@ -291,7 +292,7 @@ def _judge(
 def _metrics(record: Mapping[str, Any]) -> dict[str, Any]:
     """List what conditions can name: numbers and words of the record and of its metrics."""
     metrics = record.get("metrics") or {}
-    merged = {**metrics, **{name: record.get(name) for name in ("status", "undefined_columns")}}
+    merged = {**metrics, **{name: record.get(name) for name in ("decision", "undefined_columns")}}
     return {k: v for k, v in merged.items() if not isinstance(v, (list, dict))}
 
 

@@ -108,6 +108,10 @@ class Choices:
                 return "rated", _note(row, f"rated {RATINGS[-1]}")
         return None
 
+    def approves(self, name: HemisphereName, digest: str | None) -> bool:
+        """Tell whether all ratings of a hemisphere, given the hash of its input, are for use."""
+        return {row[_RATING] for row in self.rated.applying(name, digest)} == {RATINGS[0]}
+
     def counts(self, names: Iterable[tuple[HemisphereName, str | None]]) -> dict[str, int] | None:
         """Count hemispheres by rating, the strictest of several; ``None`` without a table."""
         if self.rated.path is None:

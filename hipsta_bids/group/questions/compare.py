@@ -156,9 +156,10 @@ def _notes(study: studies.Study, analysis: Analysis) -> list[str]:
         notes.append(
             f"{n_later} later sessions are not in it; --longitudinal takes all, --paired two"
         )
-    if flagged := sum(record.flagged for record in study.collection.records):
+    if doubtful := sum(record.doubtful for record in study.collection.records):
         notes.append(
-            f"{flagged} flagged hemispheres are in it; look at them, or use --exclude-flagged"
+            f"{doubtful} hemispheres are in it that a person should look at first, and has not"
+            " rated for use; --exclude-look leaves them out"
         )
     if separated := sum(one.columns["separated"] for *_, one in analysis.pairs):
         notes.append(

@@ -9,7 +9,7 @@
     return element;
   };
   const table = $("table"), tiles = $("tiles");
-  let order = { key: "severity", down: true };
+  let order = { key: "", down: false };  // as the rows come: those to look at first
   const collator = new Intl.Collator("en", { numeric: true });
   const FIRST = 60;
   let shown = rows, rest = 0;
@@ -41,9 +41,8 @@
       const cells = columns.map((column) => {
         const cell = make("td", { className: column.digits === undefined ? "" : "n" });
         if (column.key === "participant") cell.append(make("a", { href: `${row.page}#${row.key}`, textContent: row.participant }));
-        else if (column.key === "verdict") cell.append(make("span", { className: `badge ${row.kind}`, textContent: row.verdict, title: row.because }));
+        else if (column.key === "decision") cell.append(make("span", { className: `badge ${row.decision}`, textContent: row.decision, title: row.because }));
         else if (column.key === "rating") cell.append(row.rate, row.remark);
-        else if (column.key === "status") cell.append(make("span", { className: `badge ${row.status}`, textContent: row.status }));
         else if (column.key === "reason") cell.append(make("span", { className: "reason", textContent: row.reason, title: row.message }));
         else cell.textContent = words(row, column);
         if (column.key === "distance" && row.distance > apart) cell.classList.add("unusual");
@@ -64,7 +63,7 @@
       const title = make("span", { className: "name", textContent: `${row.participant.slice(4)}${row.session ? ` ${row.session.slice(4)}` : ""} ${row.hemi}` });
       const link = make("a", { href: `${row.page}#${row.key}`, title: `${whose(row)}: ${row.verdict}`, ariaLabel: `${whose(row)}, ${row.verdict}` }, tile, title);
       const far = row.distance > apart ? " apart" : "";
-      row.item = make("li", { className: row.status + far }, link);
+      row.item = make("li", { className: row.decision + far }, link);
     }
     for (const radio of document.querySelectorAll("[name=map]")) radio.addEventListener("change", showMaps);
     showMaps();
@@ -102,13 +101,13 @@
 
   function show() {
     const text = $("search").value.trim().toLowerCase();
-    const states = new Set([...document.querySelectorAll("[name=status]:checked")].map((box) => box.value));
+    const states = new Set([...document.querySelectorAll("[name=decision]:checked")].map((box) => box.value));
     shown = rows.filter((row) =>
-      states.has(row.status) && (!$("hemi").value || row.hemi === $("hemi").value) && (!$("seg").value || row.seg === $("seg").value)
+      states.has(row.decision) && (!$("hemi").value || row.hemi === $("hemi").value) && (!$("seg").value || row.seg === $("seg").value)
       && (!$("rating").value || (row.earlier ? "earlier" : row.rating || "none") === $("rating").value)
       && (!$("apart").checked || row.distance > apart)
       && (!text || [row.participant, row.session, row.reason, row.message, row.farthest, row.note].join(" ").toLowerCase().includes(text)));
-    shown = [...shown].sort(compare);
+    if (order.key) shown = [...shown].sort(compare);
     fill();
     kept.write("order", shown.map((row) => ({ key: row.key, page: row.page, words: `${whose(row)}: ${row.verdict.toLowerCase()}` })));
     tell();

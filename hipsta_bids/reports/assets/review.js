@@ -28,7 +28,7 @@
   const rate = (card, rating) => keep(card, { rating, note: card.querySelector(".remark").value.trim(), input_hash: card.dataset.hash });
 
   function lead() {
-    // The table's order, as it was left; without it, links are those by severity.
+    // The table's order, as it was left; without it, links are those of the table.
     const kind = /^sub-[\w-]+\.html$/;  // any page on this disk may write what this one reads
     const order = kept.read("order");
     if (!Array.isArray(order) || !order.every((row) => kind.test(row?.page))) return;

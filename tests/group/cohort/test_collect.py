@@ -72,9 +72,24 @@ def test_missing_region_is_refused_with_what_there_is(study, capsys):
 def test_unfinished_hemispheres_count_in_their_region(study, capsys):
     folders, out = study
     row = identity(place_of(out, "99", "L").name)
-    update_status(out, [row | {"status": "failed", "reason": "not-finished"}])
+    update_status(out, [row | {"decision": "failed", "reason": "not-finished"}])
     assert main([*folders, *QUICK, *EXTENDED]) == 0
     row = identity(place_of(out, "99", "L", region="extended").name)
-    update_status(out, [row | {"status": "failed", "reason": "not-finished"}])
+    update_status(out, [row | {"decision": "failed", "reason": "not-finished"}])
     assert main([*folders, *QUICK, *EXTENDED]) == 65
     assert "sub-99_hemi-L" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("rating", "kept"), [("use", True), ("unsure", False), (None, False)])
+def test_a_rating_for_use_overrules_the_decision(study, rating, kept, tmp_path):
+    _, out = study
+    path = place_of(out, "02", "R", region="extended").path("qc")
+    files.write_json(path, json.loads(path.read_text()) | {"decision": "look", "reason": "notch"})
+    table = tmp_path / "ratings.tsv"
+    cells = "" if rating is None else f"sub-02\tR\t{rating}\n"
+    table.write_text(f"participant_id\themi\trating\nsub-03\tL\tuse\n{cells}")
+    request = GroupRequest(roots=(out,), region="extended", exclude_look=True, ratings=table)
+    found = collect_sheets(request)
+    left_out = [(one.participant, one.hemi, one.reason) for one in found.exclusions]
+    assert left_out == ([] if kept else [("sub-02", "R", "look: notch")])
+    assert not any(record.doubtful for record in found.records)

@@ -262,14 +262,14 @@ def test_the_page_is_named_unless_it_could_not_be_made(tmp_path, monkeypatch, pr
     assert (result.page, result.problem) == (None if problem else page, problem)
 
 
-def test_flagged_hemispheres_are_told(dataset, quick, capsys):
+def test_hemispheres_to_look_at_are_told(dataset, quick, capsys):
     data, out = dataset
     path = place_of(out, "02", "R").path("qc")
     before = path.read_bytes()
-    files.write_json(path, json.loads(before) | {"status": "flagged"})
+    files.write_json(path, json.loads(before) | {"decision": "look"})
     assert main([str(data), str(out), "group", *quick, "--name", "flagged"]) == 0
     said = capsys.readouterr().out
-    assert "note: 1 flagged hemispheres are in it" in said
+    assert "note: 1 hemispheres are in it that a person should look at first" in said
     assert f"what was done and found: {out / 'group' / 'flagged.html'}\n" in said
     # The time of each stage, as it ends.
     timed = re.findall(r"^  ([\w -]+?) +\d+\.\d s$", said, re.MULTILINE)
@@ -290,10 +290,10 @@ def test_a_quiet_run_prints_nothing(dataset, quick, capsys):
 def test_left_out_hemispheres_are_listed_with_the_reason(tmp_path, quick):
     data, out = write_dataset(tmp_path)
     record = place_of(out, "01", "L").path("qc")
-    files.write_json(record, {"status": "failed", "reason": "too-thin", "message": "2 voxels"})
+    files.write_json(record, {"decision": "failed", "reason": "too-thin", "message": "2 voxels"})
     flagged = place_of(out, "02", "R").path("qc")
     content = json.loads(flagged.read_text())
-    files.write_json(flagged, content | {"status": "flagged", "reason": "notch"})
+    files.write_json(flagged, content | {"decision": "look", "reason": "notch"})
     filled = place_of(out, "03", "L").path("qc")
     content = json.loads(filled.read_text())
     files.write_json(filled, content | {"metrics": {"filled_fraction": 0.1, "rule": "labels"}})
@@ -321,7 +321,7 @@ def test_left_out_hemispheres_are_listed_with_the_reason(tmp_path, quick):
     assert ("sub-04", "R", "listed", "moved") in found
     assert {one[:2] for one in found if one[0] == "sub-05"} == {("sub-05", "L"), ("sub-05", "R")}
     assert {(a, c) for a, _, c, _ in found} >= {
-        ("sub-02", "flagged: notch"),
+        ("sub-02", "look: notch"),
         ("sub-03", "quality"),
         ("sub-06", "incomplete"),
     }
