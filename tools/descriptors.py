@@ -168,6 +168,7 @@ _ROOT = "[OUTPUT_DIR]"
 #: and a log of its own, without pages and maybe without hemispheres; ``dry_run`` writes nothing.
 _DATASET = {
     "status": ("status.tsv", "one row per hemisphere: decision, reason, message, time, memory"),
+    "measures": ("measures.tsv", "one row per hemisphere: decision, rating, origin, all numbers"),
     "inputs": ("inputs.tsv", "what was found: used, failed, not used, or no segmentation"),
     "settings": ("desc-settings.json", "all settings of these results, and their hash"),
     "description": ("dataset_description.json", "the dataset's description, as BIDS asks for"),

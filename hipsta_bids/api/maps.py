@@ -11,8 +11,8 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
-from hipsta_bids.derivatives.dataset import identity, provenance_of
 from hipsta_bids.derivatives.hemisphere import POSITION, STATE, read_sheet, sheet_labels, verdict
+from hipsta_bids.derivatives.measures import identify, origin
 from hipsta_bids.errors import InputError, NothingToDoError
 from hipsta_bids.geometry.catalog import MAPS
 from hipsta_bids.geometry.sheet import is_left_handed, layer_depth
@@ -322,13 +322,13 @@ class Results(NamedTuple):
 
     maps: "xr.Dataset"
     """(participant, session, side, x, y), read when values are used."""
-    table: pd.DataFrame
-    """One row per hemisphere: who, status, reason, message, where the labels come from (tool,
-    version, analysis and so on), and the summary measures."""
+    measures: pd.DataFrame
+    """One row per hemisphere, as in ``measures.tsv``: who, decision, reason, message, where the
+    labels come from (``labels_tool``, ``labels_version`` and so on), and the summary measures."""
 
 
 def load(out_dir: str | Path, *, protocol: str | None = None, region: str = "body") -> Results:
-    """Load an output dataset as one table and one lazy dataset of xarray.
+    """Load an output dataset as a table of measures and one lazy dataset of xarray.
 
     Nothing but the small records and summaries is read at once. Maps are read when their values
     are used, and only those of the participants, sides and measures that are used: select first,
@@ -350,8 +350,8 @@ def load(out_dir: str | Path, *, protocol: str | None = None, region: str = "bod
         (RAS mm of the mid-surface); where they were made, SDs of ``--uncertainty``
         (``thickness_sd``) and what ``--map`` sampled, by its name; by participant
         (``sub-01``), session (``ses-1``; ``n/a`` in datasets without), side (``L``, ``R``), x and
-        y (-1 to 1 in the body), with units; NaN where there is no map. ``status`` has no
-        x and y. ``table``: one row per hemisphere, failed ones included, whose
+        y (-1 to 1 in the body), with units; NaN where there is no map. ``decision`` has
+        no x and y. ``measures``: one row per hemisphere, failed ones included, whose
         ``participant_id`` is that of ``participants.tsv``.
 
     Raises
@@ -365,7 +365,7 @@ def load(out_dir: str | Path, *, protocol: str | None = None, region: str = "bod
     --------
     ::
 
-        maps, table = hb.load("out")
+        maps, measures = hb.load("out")
         thickness = maps.thickness.sel(side="L").mean(("participant", "session"))
         hb.plot_sheet(maps.sel(participant="sub-01", side="L").squeeze("session"))
     """
@@ -378,7 +378,7 @@ def load(out_dir: str | Path, *, protocol: str | None = None, region: str = "bod
         if (side.result.name.seg, side.result.name.region) == (seg, region)
     ]
     table = pd.DataFrame([_row(side) for side in selected])
-    return Results(maps=_lazy_dataset(root, selected, table), table=table)
+    return Results(maps=_lazy_dataset(root, selected, table), measures=table)
 
 
 def _one_protocol(
@@ -398,17 +398,12 @@ def _one_protocol(
 
 
 def _row(side: Hemisphere) -> dict[str, object]:
-    entities = identity(side.result.name)
     return {
-        "participant_id": entities["subject"],
-        "session_id": entities["session"],
-        "hemi": entities["hemi"],
-        "protocol": entities["seg"],
-        "region": entities["region"],
+        **identify(side.result.name),
         "decision": side.decision.value,
         "reason": side.record.get("reason") or "",
         "message": side.message,
-        **provenance_of(side.record),
+        **origin(side.record),
         **side.summary,
     }
 

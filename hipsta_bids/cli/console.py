@@ -174,7 +174,7 @@ def echo_result(result: "RunResult", out_dir: Path) -> None:
     unchanged = f" ({skipped} unchanged, skipped)" if skipped else ""
     echo(f"{result.n_requested} hemispheres: {counts}{unchanged}")
     echo(f"maps: {out_dir}")
-    echo(f"table of all hemispheres: {out_dir / 'status.tsv'}")
+    echo(f"table of all hemispheres: {out_dir / 'measures.tsv'}")
     page = out_dir / "report.html"
     if page.exists():
         echo(f"report: {page}")

@@ -148,7 +148,7 @@ def _write_summary(result: ResultPlace, summary: Mapping[str, float]) -> None:
     """Write one row of summary measures: those of the catalog, then those of subfields."""
     names = dict.fromkeys((*_SUMMARY_ROWS, *summary))
     columns = {name: _summary_cell(name, summary.get(name, np.nan)) for name in names}
-    _write_table(result, "summary", columns, {name: _summary_definition(name) for name in names})
+    _write_table(result, "summary", columns, {name: summary_definition(name) for name in names})
 
 
 def _summary_cell(name: str, value: float) -> list[str]:
@@ -231,7 +231,7 @@ def _measure(row: Column, wording: str = "{}") -> dict[str, object]:
     }
 
 
-def _summary_definition(column: str) -> dict[str, object]:
+def summary_definition(column: str) -> dict[str, object]:
     """Define a summary measure; the name of a subfield's begins with that of the measure."""
     if column in _SUMMARY_ROWS:
         return _measure(_SUMMARY_ROWS[column])
@@ -316,7 +316,7 @@ def write_spread(
     )
     columns, definitions = {}, {}
     for name, value in summary.items():
-        about = _summary_definition(name)
+        about = summary_definition(name)
         about["Description"] = wording.format(about["Description"])
         definitions[spread_name(name)] = about
         columns[spread_name(name)] = _summary_cell(name, value)
@@ -469,13 +469,24 @@ def read_record(result: ResultPlace) -> dict[str, Any]:
 
 def read_summary(result: ResultPlace) -> dict[str, float]:
     """Read the row of summary measures, NaN where missing."""
-    path = result.path("summary")
-    rows = files.read_tsv(path)
+    cells = read_summary_cells(result)
     try:
-        (row,) = rows
-        return {name: np.nan if v == files.MISSING else float(v) for name, v in row.items()}
+        return {name: np.nan if v == files.MISSING else float(v) for name, v in cells.items()}
     except ValueError as error:
-        raise InputError(f"{path}: not one row of numbers; {_REDO}", reason="bad-table") from error
+        raise _bad_summary(result) from error
+
+
+def read_summary_cells(result: ResultPlace) -> dict[str, str]:
+    """Read the row of summary measures as text."""
+    rows = files.read_tsv(result.path("summary"))
+    if len(rows) != 1:
+        raise _bad_summary(result)
+    return rows[0]
+
+
+def _bad_summary(result: ResultPlace) -> InputError:
+    path = result.path("summary")
+    return InputError(f"{path}: not one row of numbers; {_REDO}", reason="bad-table")
 
 
 def read_sheet(

@@ -28,6 +28,7 @@ from hipsta_bids.derivatives.dataset import (
     write_sidecar,
 )
 from hipsta_bids.derivatives.hemisphere import ResultPlace, read_record
+from hipsta_bids.derivatives.measures import write_measures
 from hipsta_bids.derivatives.names import DATASET_FILES, HemisphereName, write_shared
 from hipsta_bids.errors import ExitCode, HipstaError, InputError, OutputError, ProtocolError
 from hipsta_bids.inputs.scan import HemisphereInput
@@ -368,8 +369,10 @@ def _run(
                 if options.stop_on_first_crash and outcome.decision == Decision.FAILED:
                     break
             _write_inputs(out_dir, options, outcomes)
+            table.close()
+            if not any(isinstance(outcome.error, OutputError) for outcome in outcomes):
+                write_measures(out_dir)
             if pages.enabled and shard is None:
-                table.close()
                 copies += _find_copies(jobs, out_dir)
         result = RunResult(
             outcomes=tuple(outcomes),

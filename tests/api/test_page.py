@@ -36,6 +36,6 @@ def test_code_of_the_page_runs():
     for code in blocks():
         exec(code, names)  # noqa: S102  (our own page)
     assert names["left"].decision == "use"
-    assert names["table"]["participant_id"].nunique() == 2
+    assert names["measures"]["participant_id"].nunique() == 2
     assert names["fit"].significant[0, 0, 12:22, :10].mean() > 0.5
     assert len(plt.get_fignums()) == 3

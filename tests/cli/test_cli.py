@@ -347,7 +347,7 @@ def test_run_says_what_happened(stand_in_run, tmp_path, capsys):
     assert lines[2].endswith("[odd-shape] look at it")
     assert lines[3] == "4 hemispheres: 2 failed, 1 look, 1 use"
     assert lines[4] == f"maps: {tmp_path / 'out'}"
-    assert lines[5] == f"table of all hemispheres: {tmp_path / 'out' / 'status.tsv'}"
+    assert lines[5] == f"table of all hemispheres: {tmp_path / 'out' / 'measures.tsv'}"
     assert lines[6].startswith(f"log: {tmp_path / 'out' / 'logs'}")
     errors = said.err.splitlines()
     assert len(errors) == 2

@@ -56,6 +56,8 @@ def test_one_good_hemisphere_gives_a_complete_dataset(tmp_path):
     assert names(out) == {
         "dataset_description.json",
         "README.md",
+        "measures.tsv",
+        "measures.json",
         *(row.for_all for row in SHARED),
         ".bidsignore",
         "desc-settings.json",
@@ -97,6 +99,53 @@ def test_log_has_a_line_per_stage(tmp_path):
     assert result.log.parent == tmp_path / "out" / "logs"
     for stage in ("read", "surface", "write"):
         assert f"sub-01_hemi-L_seg-demo: {stage} " in text
+
+
+def measures_of(out):
+    rows = files.read_tsv(out / "measures.tsv")
+    return {(row["participant_id"], row["hemi"]): row for row in rows}
+
+
+def test_the_table_of_measures_follows_the_status(tmp_path):
+    out, acts = tmp_path / "out", {"01": "ok", "02": "bad-shape", "03": "flagged", "04": "repaired"}
+    items = [make_input(tmp_path / "in", subject, act=act) for subject, act in acts.items()]
+    run(items, out)
+    rows = measures_of(out)
+    assert {who: (row["decision"], row["reason"]) for who, row in rows.items()} == status_of(out)
+    assert [row["repairs"] for row in rows.values()] == ["0", "0", "0", "1"]
+    (summary,) = files.read_tsv(next((out / "sub-01").rglob("*_desc-summary_morph.tsv")))
+    assert summary.items() <= rows["sub-01", "L"].items()
+    assert {rows["sub-02", "L"][name] for name in summary} == {"n/a"}
+    about = files.read_json(out / "measures.json")
+    assert list(about) == list(rows["sub-01", "L"])
+    assert all(about[name]["Units"] for name in summary)
+
+    # What has not changed is not read again; what has, is.
+    kept = next((out / "sub-03").rglob("*_desc-summary_morph.tsv"))
+    kept.write_text("unreadable")
+    items[1] = make_input(tmp_path / "in", "02", act="ok")
+    run(items[1:2], out)
+    again = measures_of(out)
+    assert again["sub-02", "L"]["decision"] == "use"
+    assert again["sub-02", "L"]["thickness_mean"] == summary["thickness_mean"]
+    assert {w: r for w, r in again.items() if w[0] != "sub-02"} == {
+        w: r for w, r in rows.items() if w[0] != "sub-02"
+    }
+
+
+def test_ratings_beside_the_table_of_measures_are_in_it(tmp_path):
+    out = tmp_path / "out"
+    items = [make_input(tmp_path / "in", subject) for subject in ("01", "02", "03")]
+    run(items, out)
+    digest = measures_of(out)["sub-01", "L"]["input_hash"]
+    head = "participant_id\tsession_id\themi\tprotocol\tregion\trating\tnote\tinput_hash\n"
+    row = "sub-{}\tn/a\tL\tdemo\tbody\t{}\tn/a\t{}\n"
+    (out / "ratings.tsv").write_text(
+        head + row.format("01", "use", digest) + row.format("02", "exclude", "earlier")
+    )
+    run(items, out)
+    ratings = {who: row["rating"] for (who, _), row in measures_of(out).items()}
+    assert ratings == {"sub-01": "use", "sub-02": "n/a", "sub-03": "n/a"}
 
 
 @pytest.mark.usefixtures("workers")

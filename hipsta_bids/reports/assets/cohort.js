@@ -153,15 +153,22 @@
 
   const named = { participant_id: "participant", session_id: "session", hemi: "hemi", protocol: "seg", region: "region" };
 
+  const cell = (text) => String(text === 0 ? text : text || "n/a").split(/\s+/).join(" ");
+
   function ratingsTable() {
-    const cell = (text) => String(text || "n/a").split(/\s+/).join(" ");
     const lines = rows.filter((row) => row.rating || row.note).map((row) =>
       [...Object.values(named).map((key) => row[key]), row.rating, row.note, row.rated].map(cell).join("\t"));
     return [[...Object.keys(named), "rating", "note", "input_hash"].join("\t"), ...lines].join("\n") + "\n";
   }
 
-  function save() {
-    const link = make("a", { download: "ratings.tsv", href: URL.createObjectURL(new Blob([ratingsTable()], { type: "text/tab-separated-values" })) });
+  function shownTable() {
+    const keys = [...new Set([...Object.values(named), ...columns.map((column) => column.key)])];
+    const titles = Object.fromEntries(Object.entries(named).map(([title, key]) => [key, title]));
+    return [keys.map((key) => titles[key] ?? key), ...shown.map((row) => keys.map((key) => cell(row[key])))].map((line) => line.join("\t")).join("\n") + "\n";
+  }
+
+  function save(name, text) {
+    const link = make("a", { download: name, href: URL.createObjectURL(new Blob([text], { type: "text/tab-separated-values" })) });
     link.click();
     setTimeout(() => URL.revokeObjectURL(link.href), 1000);
   }
@@ -195,7 +202,8 @@
     target.value = "";
     show();
   });
-  $("save").addEventListener("click", save);
+  $("save").addEventListener("click", () => save("ratings.tsv", ratingsTable()));
+  $("save-table").addEventListener("click", () => save("hemispheres.tsv", shownTable()));
   $("load").addEventListener("change", async ({ target }) => {
     $("told").textContent = load(await target.files[0].text());
     target.value = "";

@@ -1,0 +1,117 @@
+"""``measures.tsv``: one row per hemisphere, with the decision, where labels come from, and numbers.
+
+It follows ``status.tsv``: a row is read from the quality record and the summary table when that of
+the status has changed. Whoever ends last, a shard or the run itself, finds all rows there.
+"""
+
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from hipsta_bids.derivatives.dataset import (
+    NOT_FINISHED,
+    RECORDED,
+    TABLES,
+    Row,
+    describe_columns,
+    name_of,
+    provenance_of,
+    read_status,
+)
+from hipsta_bids.derivatives.hemisphere import (
+    ResultPlace,
+    read_record,
+    read_summary_cells,
+    summary_definition,
+)
+from hipsta_bids.derivatives.names import DATASET_FILES, HemisphereName
+from hipsta_bids.errors import InputError
+from hipsta_bids.io import files
+
+_ORIGIN = "labels_"
+_COLUMNS = {
+    **TABLES["measures"],
+    **{f"{_ORIGIN}{name}": about for name, about in TABLES["provenance"].items()},
+    **{name: TABLES["status"][name] for name in ("version", "settings_hash", "input_hash")},
+}
+#: Cells that identify a hemisphere, as in ``ratings.tsv``.
+_KEY = ("participant_id", "session_id", "hemi", "protocol", "region")
+
+
+def identify(name: HemisphereName) -> dict[str, str]:
+    """Cells that identify a hemisphere, as ``participants.tsv`` and ``ratings.tsv`` do."""
+    session = f"ses-{name.session}" if name.session else files.MISSING
+    cells = (f"sub-{name.subject}", session, name.hemi, name.seg, name.region)
+    return dict(zip(_KEY, cells, strict=True))
+
+
+def origin(record: Mapping[str, Any]) -> dict[str, str]:
+    """Cells that say where the labels of a quality record come from."""
+    return {f"{_ORIGIN}{name}": cell for name, cell in provenance_of(record).items()}
+
+
+def write_measures(root: Path) -> None:
+    """Bring the table of a dataset and its sidecar up to date."""
+    path = root / DATASET_FILES["measures"]
+    with files.locked(root, path.name):
+        known = {_key(row): row for row in _read(path)}
+        rated = {_key(row): row for row in _read(root / DATASET_FILES["ratings"])}
+        rows = [row | {"rating": _rating(row, rated)} for row in _current_rows(root, known)]
+        numbers = dict.fromkeys(name for row in rows for name in row if name not in _COLUMNS)
+        columns = (*_COLUMNS, *numbers)
+        cells = ([row.get(column, files.MISSING) for column in columns] for row in rows)
+        files.write_tsv(path, columns, cells)
+        files.write_json(
+            root / DATASET_FILES["measures_sidecar"],
+            describe_columns(_COLUMNS) | {name: summary_definition(name) for name in numbers},
+        )
+
+
+def _current_rows(root: Path, known: Mapping[tuple[str, ...], Row]) -> Iterator[dict[str, str]]:
+    for status in read_status(root):
+        if status.get("reason") == NOT_FINISHED:
+            continue
+        name = name_of(status)
+        who = identify(name)
+        row = known.get(tuple(who.values()), {})
+        if any(row.get(column) != status.get(column) for column in RECORDED):
+            with suppress(InputError):  # its files are gone, or another run is at them
+                row = who | read_row(ResultPlace(root=root, name=name))
+        if row:
+            yield dict(row)
+
+
+def read_row(result: ResultPlace) -> dict[str, str]:
+    """Read cells of one hemisphere from its quality record and its summary table.
+
+    InputError if there is no readable record, or no summary of a hemisphere that was measured.
+    """
+    record = read_record(result)
+    cells = {
+        **{column: str(record.get(column) or files.MISSING) for column in RECORDED},
+        "repairs": str(len(record.get("repairs") or ())),
+        **origin(record),
+    }
+    is_measured = result.path("summary").exists()
+    return cells | (read_summary_cells(result) if is_measured else {})
+
+
+def _read(path: Path) -> list[dict[str, str]]:
+    """Read a table of hemispheres; empty if there is none, or if it is unreadable."""
+    try:
+        rows = files.read_tsv(path)
+    except InputError:
+        return []
+    return [row for row in rows if all(column in row for column in _KEY)]
+
+
+def _key(row: Row) -> tuple[str, ...]:
+    return tuple(row[column] for column in _KEY)
+
+
+def _rating(row: Row, rated: Mapping[tuple[str, ...], Row]) -> str:
+    """Rating of the same labels, if a person saved one beside the table."""
+    found = rated.get(_key(row), {})
+    is_current = found.get("input_hash") in {files.MISSING, None, row.get("input_hash")}
+    return found.get("rating", files.MISSING) if is_current else files.MISSING
