@@ -103,6 +103,12 @@ def _add_sheets(parser: Parser) -> None:
     )
     add("--seg", "NAME", "segmentation protocol, where there are several")
     add(
+        "--mixed",
+        "FIELD...",
+        "in what segmentations may differ, else they may not: tool, version, analysis (T1, T1-T2),"
+        " atlas, hierarchy, space, design (longitudinal or not), edited, voxel_size",
+    )
+    add(
         "--region",
         "",
         "what the participant level measured (default: body)",
@@ -403,6 +409,7 @@ def _settings(parsed: argparse.Namespace) -> "GroupSettings":
             "permutations": parsed.permutations,
             "blocks": parsed.blocks,
         },
+        "design": {"mixed": tuple(parsed.mixed) or None},
         "model": {"age": parsed.age_model},
         "longitudinal": {"random": parsed.longitudinal},
         "harmonization": {"column": parsed.harmonize},

@@ -123,6 +123,7 @@ def heading(record: Mapping[str, Any]) -> dict[str, Any]:
         "made_by": record.get("version"),
         "region": region,
         "experimental": region in EXPERIMENTAL,
+        "mixes": record.get("mixes") or (),
     }
 
 

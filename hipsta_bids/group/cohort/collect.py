@@ -10,7 +10,7 @@ from typing import Any
 import pandas as pd
 
 from hipsta_bids.derivatives import hemisphere
-from hipsta_bids.derivatives.dataset import NOT_FINISHED, name_of, read_status
+from hipsta_bids.derivatives.dataset import NOT_FINISHED, name_of, provenance_of, read_status
 from hipsta_bids.derivatives.names import DATASET_FILES, HemisphereName
 from hipsta_bids.errors import InputError, NothingToDoError
 from hipsta_bids.group.cohort.covariates import relocate
@@ -65,6 +65,8 @@ class SheetRecord:
     version: str
     source: str
     """Address of the segmentation."""
+    provenance: tuple[str, ...]
+    """Where its labels come from, in the order of ``PROVENANCE``."""
     doubtful: bool = False
     """Whether the participant level asks to look before use, and nobody has rated it for use."""
 
@@ -163,6 +165,11 @@ def collect_sheets(request: GroupRequest, *, may_lack: bool = False) -> Collecti
     )
 
 
+def counts_text(counts: Mapping[str, int]) -> str:
+    """List names with their numbers of hemispheres."""
+    return ", ".join(f"{name} ({n})" for name, n in sorted(counts.items()))
+
+
 def _digest(result: hemisphere.ResultPlace) -> str | None:
     """Hash of a hemisphere's input and settings, if its record has one."""
     digest = hemisphere.read_record(result).get("input_hash")
@@ -177,9 +184,8 @@ def _several_versions(records: Sequence[SheetRecord]) -> tuple[str, ...]:
     usual = counts.most_common(1)[0][0]
     stems = [record.result.name.stem for record in records if record.version != usual]
     ending = f" and {len(stems) - SHOWN} more" if len(stems) > SHOWN else ""
-    found = ", ".join(f"{version} ({n})" for version, n in sorted(counts.items()))
     text = (
-        f"hemispheres were measured by several versions, {found}; measure"
+        f"hemispheres were measured by several versions, {counts_text(counts)}; measure"
         f" {', '.join(stems[:SHOWN])}{ending} with {usual}: a version may change numbers"
     )
     return (text,)
@@ -243,9 +249,9 @@ def _one_protocol(
         )
         raise NothingToDoError(f"{request.roots[0]}: no hemisphere{request_text}; {hint}")
     if request.seg is None and len(counts) > 1:
-        names = ", ".join(f"{name} ({n})" for name, n in sorted(counts.items()))
         raise InputError(
-            f"{request.roots[0]}: hemispheres of several protocols, {names}; choose one by --seg"
+            f"{request.roots[0]}: hemispheres of several protocols, {counts_text(counts)}; choose"
+            " one by --seg"
         )
     return request.seg or next(iter(counts))
 
@@ -284,6 +290,7 @@ def _judge(
             settings_hash=intern(str(record.get("settings_hash"))),
             version=intern(str(record.get("version"))),
             source=relocate(str(inputs[0].get("file", "")), request.segmentations),
+            provenance=tuple(intern(text) for text in provenance_of(record).values()),
             doubtful=decision == Decision.LOOK and not choices.approves(*rated),
         )
     return Exclusion.of_sheet(result.name, reason, message)

@@ -18,6 +18,10 @@ from hipsta_bids.protocols import toml
 Codes = Annotated[tuple[float, ...], Strict(strict=False)]
 Splines = Annotated[int, Field(ge=4)]
 AtLeastTwo = Annotated[int, Field(ge=2)]
+#: Fields that say where labels come from, as ``PROVENANCE`` of ``derivatives`` has them.
+Provenance = Literal[
+    "tool", "version", "analysis", "atlas", "hierarchy", "space", "design", "edited", "voxel_size"
+]
 #: How to allow for many tests, as the command line spells it.
 Correction = Literal["fdr2", "bh", "permutation-tfce", "permutation-max"]
 CORRECTIONS: tuple[str, ...] = get_args(Correction)
@@ -79,6 +83,8 @@ class DesignSettings(toml.SettingsTable):
     values than these are from each other."""
     farthest: PositiveFloat = 1e4
     """Numbers farther than this from the median, in ranges between quartiles, are refused."""
+    mixed: Annotated[tuple[Provenance, ...], Strict(strict=False)] = ()
+    """Fields of provenance in which hemispheres of an analysis may differ; else it is refused."""
 
 
 class DefaultModelSettings(toml.SettingsTable):

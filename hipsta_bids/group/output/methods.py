@@ -22,6 +22,7 @@ from hipsta_bids.group.stats.trials import THINNING, TrialEffect, point_level
 from hipsta_bids.protocols import EXPERIMENTAL
 from hipsta_bids.types import PARTICIPANT
 
+REFERENCES = "# References"
 #: Level at which slopes are said to differ.
 _LEVEL = 0.05
 
@@ -61,7 +62,7 @@ class Citations:
         bibliography = references()
         works = "\n".join(f"{i}. {bibliography[key]}" for i, key in enumerate(self._keys, start=1))
         use = "This text may be used freely, as it stands or changed."
-        parts = ["# Methods and findings", use, first, *paragraphs[1:], "# References", works]
+        parts = ["# Methods and findings", use, first, *paragraphs[1:], REFERENCES, works]
         return "\n\n".join(parts) + "\n"
 
 

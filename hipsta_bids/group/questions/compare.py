@@ -7,8 +7,9 @@ from typing import Any
 
 from hipsta_bids.derivatives import dataset
 from hipsta_bids.group.cohort import collect
-from hipsta_bids.group.cohort.data import SHEET
+from hipsta_bids.group.cohort.data import SHEET, modeled_table
 from hipsta_bids.group.design import model as designs
+from hipsta_bids.group.design.grammar import closed_formula
 from hipsta_bids.group.design.settings import GroupSettings
 from hipsta_bids.group.output.results import Analysis, harmonization_record
 from hipsta_bids.group.output.saved import load_effects
@@ -17,6 +18,7 @@ from hipsta_bids.group.output.write import draw, write_results
 from hipsta_bids.group.questions import analysis as fitting
 from hipsta_bids.group.questions import study as studies
 from hipsta_bids.group.questions.exchange import SUMMARY, summarize, write_summary
+from hipsta_bids.group.questions.mixing import with_mixes
 from hipsta_bids.io import files
 from hipsta_bids.progress import tell
 
@@ -56,6 +58,8 @@ def _analyze(options: studies.GroupOptions, settings: GroupSettings) -> studies.
         comparison=options.comparison,
         visits=study.time,
     )
+    table = modeled_table(cohort.table, options.comparison)
+    study = with_mixes(study, table, closed_formula(model.formula).names)
     templates = studies.read_templates(options.template, cohort)
     analysis = fitting.analyze_cohort(
         cohort,

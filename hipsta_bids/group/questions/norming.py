@@ -24,6 +24,7 @@ from hipsta_bids.group.output.panels import draw_pages
 from hipsta_bids.group.output.results import ScoredMaps
 from hipsta_bids.group.output.saved import NormsFile, load_norms, save_norms, templates_from_json
 from hipsta_bids.group.questions import study as studies
+from hipsta_bids.group.questions.mixing import with_mixes
 from hipsta_bids.group.questions.scores import map_rows, score_rows
 from hipsta_bids.group.questions.trials import points_of
 from hipsta_bids.group.stats import norms as normative
@@ -84,6 +85,7 @@ def run_norms(
         return _score_people(options, path, settings, among, controls)
     study = studies.read_study(options, settings, among)
     file, people = _planned(study)
+    study = with_mixes(study, study.cohort.table[people.known], (file.age,))
     template, tables, cohorts, values = _registered(
         study, studies.read_templates(options.template, study.cohort)
     )
@@ -121,6 +123,7 @@ def _score_people(
     if not people.known.any():
         reasons = "; ".join(dict.fromkeys(message for _, message in study.left_out.values()))
         raise ModelError(f"{path}: nobody here can be scored: {reasons}")
+    study = with_mixes(study, table[people.known], (file.age,))
     controls_kept = studies.members(table, controls, "--controls")
     references = controls_kept & (controls is not None) & ~repeated.to_numpy()
     file = _with_new_sites(study, path, file, people, references, controls=controls)

@@ -19,6 +19,7 @@ from hipsta_bids.group.design import model as designs
 from hipsta_bids.group.design.formula import check_names, listed, with_factors
 from hipsta_bids.group.design.settings import GroupSettings
 from hipsta_bids.group.output import write
+from hipsta_bids.group.output.methods import REFERENCES
 from hipsta_bids.group.output.results import templates_of
 from hipsta_bids.group.output.saved import templates_from_json
 from hipsta_bids.group.output.tables import registration_tables
@@ -109,6 +110,8 @@ class Study:
     """Column and level of the participants; all without."""
     left_out: dict[str, tuple[str, str]] = field(default_factory=dict)
     """Reason and message by further visits that are left out."""
+    mixes: tuple[str, ...] = ()
+    """In what hemispheres differ, as far as the settings allow it, one line each."""
 
     @property
     def cohort(self) -> Cohort:
@@ -187,6 +190,7 @@ class Study:
         are of participants and of what is left out.
         """
         options, collection = self.options, self.collection
+        warnings = (*collection.warnings, *self.mixes)
         region = options.sheets.region
         name = options.model.name or (name if region == "body" else f"{name}_{region}")
         _describe_dataset(options)
@@ -208,17 +212,23 @@ class Study:
                     "template": options.template and str(options.template),
                     "harmonization": options.harmonize_model and str(options.harmonize_model),
                 },
+                "mixes": self.mixes,
                 **fill(folder),
-                "notes": [*collection.warnings, *notes],
+                "notes": [*warnings, *notes],
                 "settings": resolve(self.settings),
             }
             files.write_json(folder / "analysis.json", record)
+            if self.mixes:
+                lines = " ".join(f"Note that {line}." for line in self.mixes) + f"\n\n{REFERENCES}"
+                text = (folder / "methods.md").read_text(encoding="utf-8")
+                text = text.replace(REFERENCES, lines)
+                files.write_text(folder / "methods.md", text)
         return GroupResult(
             folder=final,
             n_participants=counts[0],
             n_excluded=counts[1],
             notes=tuple(notes),
-            warnings=collection.warnings,
+            warnings=warnings,
         )
 
 

@@ -25,6 +25,7 @@ from hipsta_bids.group.output.methods import Citations, power_text, retest_text
 from hipsta_bids.group.output.panels import Row, draw_pages, spanned
 from hipsta_bids.group.output.tables import entity_label
 from hipsta_bids.group.questions import study as studies
+from hipsta_bids.group.questions.mixing import with_mixes
 from hipsta_bids.group.stats import trials
 from hipsta_bids.group.stats.arrays import Bool, Float, Int, SideMaps, mean_of_known
 from hipsta_bids.group.stats.glm import FittedMaps, PointwiseFit, RowModel, fit_maps, most_frequent
@@ -299,6 +300,8 @@ def run_trial(
         for variable, lacking in source.model.design.dropped.items():
             reason = "incomplete", f"{variable} is missing"
             study.left_out.update(dict.fromkeys(lacking, reason))
+    modeled = cohort.table if source.rows is None else cohort.table.iloc[source.rows]
+    study = with_mixes(study, modeled, ())
     maps, summaries = study.measures.maps, study.measures.summaries
     results = [
         source.describe(layer)
@@ -308,7 +311,6 @@ def run_trial(
     if effect is not None:
         for result in results:
             result.tables.update(_sample_sizes(effect, result, settings))
-    modeled = cohort.table if source.rows is None else cohort.table.iloc[source.rows]
     people = int(modeled[PARTICIPANT].nunique())
 
     def fill(folder: Path) -> list[str]:

@@ -1,0 +1,88 @@
+"""Kinds of segmentation in one analysis: a mix is refused, or named with what it goes with."""
+
+import warnings
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+from scipy import stats
+
+from hipsta_bids.derivatives.dataset import PROVENANCE
+from hipsta_bids.errors import InputError
+from hipsta_bids.group.cohort.collect import counts_text
+from hipsta_bids.group.cohort.read import visit_name
+from hipsta_bids.group.design.formula import typed
+from hipsta_bids.group.questions.study import Study
+from hipsta_bids.reports.cells import p_text
+from hipsta_bids.types import PARTICIPANT, SESSION
+
+#: Largest difference of two edges of voxels, as a share: fields of view differ so within a
+#: protocol, while 0.75 and 0.8 mm are two. Level of tests, for a clause only.
+_SAME_EDGE, _LEVEL = 0.05, 0.05
+
+
+def with_mixes(study: Study, rows: pd.DataFrame, terms: Iterable[str]) -> Study:
+    """Find in what the hemispheres of a model differ; InputError unless the settings allow it.
+
+    ``rows`` are visits or, of pairs of sessions, participants; without ``terms`` they do not count.
+    """
+    table, sides, pair = study.cohort.table, study.cohort.sides, study.options.comparison.pair
+    records = ((record.result.name, record.provenance) for record in study.collection.records)
+    origins = {(visit_name(n.subject, n.session), n.hemi): origin for n, origin in records}
+    places = [(visit, hemi) for hemi, side in sides.items() for visit in table.index[side.rows]]
+    entries = [(*place, *origins[place]) for place in places if place in origins]
+    frame = pd.DataFrame(entries, columns=["visit", "side", *PROVENANCE])
+    frame = frame.join(table[[PARTICIPANT, SESSION]], on="visit")
+    key = PARTICIPANT if pair else "visit"
+    is_used = frame.duplicated([PARTICIPANT, "side"], keep=False) | (pair is None)
+    complete = pd.DataFrame({t: typed(rows[t]) for t in terms if t in rows}, rows.index).dropna()
+    frame = frame[is_used & frame[key].isin(complete.index)]
+    frame = frame.assign(voxel_size=frame["voxel_size"].map(_sizes(Counter(frame["voxel_size"]))))
+    mixed = {f: f"{f}: {counts_text(n)}" for f in PROVENANCE if len(n := Counter(frame[f])) > 1}
+    if refused := [field for field in mixed if field not in study.settings.design.mixed]:
+        raise InputError(
+            f"hemispheres of one analysis differ in {'; '.join(mixed[one] for one in refused)};"
+            f" segment all alike, exclude some, or allow it by --mixed {' '.join(refused)}"
+        )
+    values = {str(term): frame[key].map(complete[term]) for term in complete}
+    values |= {"session": frame[SESSION], "side": frame["side"]}
+    lines = []
+    for field, text in mixed.items():
+        tests = [(name, *_association(frame, field, column)) for name, column in values.items()]
+        parts = ", ".join(f"with {name} p {p_text(p)} ({test})" for name, test, p in tests if test)
+        names = ", ".join(name for name, _, p in tests if p < _LEVEL)
+        ending = f"; association {parts}" if parts else ""
+        ending += f"; effects of {names} may be those of {field}" if names else ""
+        lines.append(f"hemispheres differ in {text}{ending}")
+    return replace(study, mixes=tuple(lines))
+
+
+def _sizes(counts: Counter[str]) -> dict[str, str]:
+    """Return the most frequent size of voxels that is like each, whatever the order of axes."""
+    edges = {s: np.sort(pd.to_numeric((s.split(" x ") * 3)[:3], "coerce")) for s in counts}
+    sizes: dict[str, str] = {}
+    for size in sorted(counts, key=lambda size: (-counts[size], size)):
+        alike = (s for s in sizes.values() if np.allclose(edges[s], edges[size], _SAME_EDGE, 0.0))
+        sizes[size] = next(alike, size)
+    return sizes
+
+
+def _association(frame: pd.DataFrame, field: str, values: pd.Series) -> tuple[str, float]:
+    """Test whether kinds go with values: the name of the test, and p; no name if nothing varies."""
+    frame = pd.DataFrame({"kind": frame[field], "value": values, "person": frame[PARTICIPANT]})
+    frame = frame.dropna().drop_duplicates()
+    # Participants are units or, if kinds differ in some of them, the values of each participant.
+    is_between = frame.drop_duplicates(["person", "kind"])["person"].is_unique
+    units = frame.groupby(["person"] if is_between else ["person", "value"])
+    value, kind = units["value"].first(), units["kind"].agg(lambda kinds: " + ".join(sorted(kinds)))
+    table = pd.crosstab(value, kind).to_numpy()
+    if min(table.shape) < 2:  # noqa: PLR2004 -- nothing varies
+        return "", np.nan
+    if pd.api.types.is_numeric_dtype(value):
+        with warnings.catch_warnings(action="ignore"):  # of kinds without spread
+            samples = (value[kind == name] for name in kind.unique())
+            return "F test", float(stats.f_oneway(*samples).pvalue)
+    method = None if table.shape == (2, 2) else stats.MonteCarloMethod(rng=np.random.default_rng(0))
+    return "Fisher's exact test", float(stats.fisher_exact(table, method=method).pvalue)
