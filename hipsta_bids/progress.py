@@ -10,8 +10,9 @@ from typing import TypeVar
 
 Item = TypeVar("Item")
 
-#: Takes the stage, how many of its parts are done, and how many there are; 0 if it has none.
-Listener = Callable[[str, int, int], None]
+#: Takes the stage, how many of its parts are done (``None`` where that is as before), how many
+#: there are (0 if it has none), and what is in work.
+Listener = Callable[[str, int | None, int, str], None]
 
 _LISTENER: ContextVar[Listener | None] = ContextVar("listener", default=None)
 
@@ -26,11 +27,11 @@ def listening(listener: Listener) -> Iterator[None]:
         _LISTENER.reset(token)
 
 
-def tell(stage: str, count: int = 0, total: int = 0) -> None:
+def tell(stage: str, count: int | None = 0, total: int = 0, current: str = "") -> None:
     """Say what is being done. A stage ends when another begins."""
     listener = _LISTENER.get()
     if listener is not None:
-        listener(stage, count, total)
+        listener(stage, count, total, current)
 
 
 def each(stage: str, items: Sequence[Item]) -> Iterator[Item]:

@@ -3,10 +3,12 @@
 import os
 import re
 import shutil
+import signal
 import sys
 import textwrap
+import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, redirect_stdout
 from itertools import zip_longest
 from pathlib import Path
@@ -20,6 +22,8 @@ if TYPE_CHECKING:
     from hipsta_bids.participant.run import RunResult
 
 
+#: Name of the first stage.
+SEARCH = "segmentations"
 #: How many warnings of a kind are printed.
 _LISTED_ROWS = 3
 
@@ -58,10 +62,21 @@ def has_color(stream: TextIO) -> bool:
 
 def _print(text: str, stream: TextIO) -> None:
     text = _CONTROL.sub("\N{REPLACEMENT CHARACTER}", text)
+    if stream.isatty():
+        text = "\n".join(_wrapped(line) for line in text.splitlines())
     if has_color(stream):
         text = _WORD.sub(lambda word: f"\033[{_COLORS[word[0]]}m{word[0]}\033[0m", text)
     stream.write(f"{text}\n")
     stream.flush()
+
+
+def _wrapped(line: str) -> str:
+    """Break a line at words where it is wider than the terminal; paths stay whole."""
+    width = shutil.get_terminal_size().columns
+    if len(line) <= width:
+        return line
+    options: dict[str, Any] = {"break_long_words": False, "break_on_hyphens": False}
+    return textwrap.fill(line, width, subsequent_indent="    ", **options)
 
 
 def echo(text: str) -> None:
@@ -94,27 +109,35 @@ class Progress:
 
     def __init__(self, verbosity: int) -> None:
         self._verbosity = verbosity
+        self._has_bar = verbosity >= 0 and sys.stderr.isatty()
         self._stage, self._start = "", 0.0
         self._bar: Any = None
         self._listening = ExitStack()
 
     def __enter__(self) -> Self:
         self._listening.enter_context(listening(self.show))
+        if self._has_bar and threading.current_thread() is threading.main_thread():
+            self._listening.enter_context(_every_second(self._tick))
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         self._listening.close()
         self._close(announced=kind is None)
 
-    def show(self, stage: str, count: int = 0, total: int = 0) -> None:
+    def show(self, stage: str, count: int | None = 0, total: int = 0, current: str = "") -> None:
         """Show what is being done; a stage ends with a line that has its time."""
         if stage != self._stage:
             self._close(announced=True)
             self._stage, self._start = stage, time.monotonic()
-            if self._verbosity >= 0 and sys.stderr.isatty():
+            if self._has_bar:
                 self._bar = _bar(stage, total)
         if self._bar is not None:
-            self._bar.update(count - self._bar.n)
+            self._bar.set_description_str(f"{stage} ({current})" if current else stage)
+            self._bar.update(0 if count is None else count - self._bar.n)
+
+    def _tick(self) -> None:
+        if self._bar is not None:
+            self._bar.refresh()
 
     def report(self, outcome: "Outcome") -> None:
         """Show one outcome."""
@@ -133,9 +156,20 @@ class Progress:
         if self._bar is not None:
             self._bar.close()
             self._bar = None
-        # Hemispheres have a line each.
-        if announced and self._stage not in {"", "hemispheres"}:
+        if announced and self._stage not in {"", SEARCH, "hemispheres"}:  # these have a line each
             echo(f"  {self._stage:<18}{time.monotonic() - self._start:6.1f} s")
+
+
+@contextmanager
+def _every_second(tick: Callable[[], None]) -> Iterator[None]:
+    """Call a function every second of the block, without a thread, which would forbid forking."""
+    before = signal.signal(signal.SIGALRM, lambda *_: tick())
+    signal.setitimer(signal.ITIMER_REAL, 1.0, 1.0)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
 
 
 def _bar(stage: str, total: int) -> Any:  # noqa: ANN401  (tqdm's)

@@ -211,7 +211,9 @@ def _run(options: "Namespace", arguments: Sequence[str]) -> ExitCode:
 
     limit_memory(options.mem)
     requests = map_requests(options.map, options.map_sampling, options.map_interpolation)
-    findings = _find(request, options.shard, say=console.echo if options.dry_run else None)
+    with console.Progress(-1 if options.quiet or options.dry_run else 0) as progress:
+        progress.show(console.SEARCH)
+        findings = _find(request, options.shard, say=console.echo if options.dry_run else None)
     if findings is None:
         console.echo(f"part {options.shard.name} of the dataset has nothing to process")
         return ExitCode.OK
@@ -231,7 +233,7 @@ def _run(options: "Namespace", arguments: Sequence[str]) -> ExitCode:
         _check_labels(items, settings)
         return ExitCode.OK
     check_output_is_no_input(options.output_dir, items)
-    from hipsta_bids.participant.run import collect, run_participants  # noqa: PLC0415  (heavy)
+    from hipsta_bids.participant.run import STAGE, collect, run_participants  # noqa: PLC0415  (heavy)
 
     notes += tuple(f"not used: {entry.path}: {entry.reason}" for entry in findings.ignored)
     out, run_options = options.output_dir, _run_options(options, arguments, notes)
@@ -241,7 +243,7 @@ def _run(options: "Namespace", arguments: Sequence[str]) -> ExitCode:
         if collects:
             result = collect(items, out, settings, run_options)
         else:
-            progress.show("hemispheres", 0, len(items))
+            progress.show(STAGE, 0, len(items))
             result = run_participants(items, out, settings, run_options, progress.report)
     console.echo_result(result, out)
     return result.exit_code

@@ -151,8 +151,15 @@ class _Slot:
         self.connection.close()
 
 
-def run_jobs(plan: WorkerPlan, jobs: Iterable[Any]) -> Generator[tuple[Any, Any]]:
-    """Work off jobs in parallel; closing the generator stops all workers."""
+def run_jobs(
+    plan: WorkerPlan,
+    jobs: Iterable[Any],
+    begun: Callable[[list[Any]], None] = lambda _: None,
+) -> Generator[tuple[Any, Any]]:
+    """Work off jobs in parallel; closing the generator stops all workers.
+
+    ``begun`` is called with all jobs in work whenever one begins.
+    """
     queue: Iterator[Any] = iter(jobs)
     waiting = next(queue, None)
     slots: list[_Slot] = []
@@ -163,6 +170,7 @@ def run_jobs(plan: WorkerPlan, jobs: Iterable[Any]) -> Generator[tuple[Any, Any]
                 if waiting is not None and slot.ready and slot.job is None:
                     slot.give(waiting)
                     waiting = next(queue, None)
+                    begun([slot.job for slot in slots if slot.job is not None])
             if waiting is not None and len(slots) < plan.n_workers:
                 slots.append(_start(plan))
                 continue

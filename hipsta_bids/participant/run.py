@@ -7,10 +7,11 @@ import time
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from os import getpid
 from pathlib import Path
 from socket import gethostname
+from statistics import median
 
 from hipsta_bids import __version__
 from hipsta_bids.derivatives import dataset, hemisphere
@@ -46,11 +47,17 @@ from hipsta_bids.participant.job import (
 )
 from hipsta_bids.participant.pages import PagePlan, reports_after
 from hipsta_bids.participant.pool import WorkerLost, WorkerPlan, run_jobs
+from hipsta_bids.progress import tell
 from hipsta_bids.settings import Settings
 from hipsta_bids.types import Decision
 
 WORKER_GB = 0.6
 """Memory that one worker may need, GB: 500 MB for a hemisphere, and its helper process."""
+
+STAGE = "hemispheres"
+"""Name of the stage that measures them, on the terminal."""
+USUAL_SECONDS = 3.0
+"""Time of a hemisphere on a usual machine, s, where none was measured before."""
 
 _LOG_FORMAT = "%(asctime)s %(levelname)s %(message)s"
 _CHEAP_WRITE = 0.1  # s; quicker writes are never put off
@@ -97,6 +104,11 @@ class StatusTable:
             # The hemisphere's own error says more, and ends the run; the table keeps the row that
             # calls it not finished.
             self._pending = {}
+
+    def usual_seconds(self) -> float:
+        """Median time of the hemispheres that were measured before, s."""
+        cells = [row.get("seconds", files.MISSING) for row in self._known.values()]
+        return median([float(cell) for cell in cells if cell != files.MISSING] or [USUAL_SECONDS])
 
     def close(self) -> None:
         """Write what has not been written yet."""
@@ -501,7 +513,8 @@ def _measured(
         environment=() if options.work_dir is None else (("TMPDIR", str(options.work_dir)),),
     )
     if options.cluster is None or not able:
-        pool = run_jobs(plan, able)
+        tell(STAGE, None, current=f"about {_expected(table, plan, able)}")
+        pool = run_jobs(plan, able, _tell_titles)
     else:
         pool = run_on_cluster(options.cluster, plan, able)
     try:
@@ -513,6 +526,18 @@ def _measured(
             with contextlib.suppress(OutputError):
                 _remove_unfinished(job)
         raise
+
+
+def _tell_titles(jobs: list[Job]) -> None:
+    name, others = jobs[-1].result.name, len(jobs) - 1
+    more = f" and {others} more" if others else ""
+    tell(STAGE, None, current=f"sub-{name.subject} {name.hemi}{more}")
+
+
+def _expected(table: StatusTable, plan: WorkerPlan, jobs: Sequence[Job]) -> timedelta:
+    """Guess how long jobs take, from what others in the same folder took."""
+    each = table.usual_seconds() * (1 + jobs[0].copies if jobs else 1)
+    return timedelta(seconds=round(each * math.ceil(len(jobs) / plan.n_workers)))
 
 
 def _remove_unfinished(job: Job) -> None:

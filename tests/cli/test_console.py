@@ -4,10 +4,12 @@ import fcntl
 import os
 import pty
 import re
+import signal
 import struct
 import subprocess
 import sys
 import termios
+import time
 
 import pytest
 
@@ -151,11 +153,41 @@ def test_a_terminal_sees_how_much_of_a_stage_is_left(monkeypatch, capsys):
     assert capsys.readouterr().err == ""
 
 
+def test_the_clock_of_a_stage_moves_without_news(monkeypatch, capsys):
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    before = signal.getsignal(signal.SIGALRM)
+    with Progress(0):
+        tell("hemispheres", 0, 4)
+        tell("hemispheres", None, current="sub-01 L")
+        end = time.monotonic() + 2.2
+        while time.monotonic() < end:
+            time.sleep(0.05)
+    said = capsys.readouterr().err
+    assert "hemispheres (sub-01 L):   0%" in said
+    assert re.search(r"\| 0/4 \[00:0[12]<\?", said)
+    assert signal.getsignal(signal.SIGALRM) == before
+    assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
+
+
+def test_long_lines_break_at_words_on_a_terminal(monkeypatch, capsys):
+    text = "sub-01 look " + " ".join(["words"] * 30) + " /a/path/of/" + 90 * "x"
+    echo(text)
+    assert capsys.readouterr().out == f"{text}\n"
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    monkeypatch.setenv("COLUMNS", "60")
+    monkeypatch.setenv("NO_COLOR", "1")
+    echo(text)
+    lines = capsys.readouterr().out.splitlines()
+    assert " ".join(line.strip() for line in lines) == text
+    assert all(len(line) <= 60 for line in lines[:-1])
+    assert lines[-1].endswith(90 * "x")
+
+
 def test_parts_are_told_as_they_are_done():
     told = []
     with listening(lambda *what: told.append(what)):
         assert list(each("models", ["L", "R"])) == ["L", "R"]
-    assert told == [("models", 0, 2), ("models", 1, 2), ("models", 2, 2)]
+    assert told == [("models", 0, 2, ""), ("models", 1, 2, ""), ("models", 2, 2, "")]
 
 
 @pytest.mark.parametrize(
