@@ -244,6 +244,8 @@ def no_values(study):
         (None, ["--formula", "group + my age"], 64, "backticks"),
         (None, ["--formula", "thickness ~ I(age.map(open))"], 64, "'age.map(open)' is not allowed"),
         (None, ["--formula", "group + {age.to_csv('x')}"], 64, "is not allowed; allowed are"),
+        (None, ["--formula", "(group + age + sex + age + sex)**9"], 64, "more than 1000 products"),
+        (None, ["--formula", "log(group)"], 65, "'log(group)': functions take numbers, but group"),
         (None, ["--formula", "thickness ~ group | sex"], 64, "'|' is not allowed"),
         (None, ["--exclude", "nowhere.tsv"], 65, "no such file"),
         (one_patient, [], 65, "AD (1)"),
@@ -275,6 +277,7 @@ def no_values(study):
         (None, ["-d", "hipsta=/nowhere"], 65, "/nowhere"),
         (None, ["--align", "fancy"], 64, "fancy"),
         (None, ["--name", "../x"], 64, "../x"),
+        (None, ["--name", "é"], 64, "'é' is not a name of letters, digits"),
     ],
 )
 def test_refused_in_one_line(study, capsys, spoil, options, code, words):  # noqa: PLR0917 -- cases

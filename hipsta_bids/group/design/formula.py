@@ -244,10 +244,15 @@ def _refusal(problem: str) -> ModelError:
 
 def file_label(text: str) -> str:
     """Write a name in ASCII letters and digits, as BIDS has it; other scripts as ``u5973``."""
-    letters = unicodedata.normalize("NFKD", text.replace("+", " plus "))
-    plain = "".join(c if c.isascii() else f"u{ord(c):x}" * c.isalpha() for c in letters)
-    words = "".join(c if c.isalnum() else " " for c in plain).split()
+    words = ascii_letters(text.replace("+", " plus ")).split()
     return "".join(word[:1].upper() + word[1:] for word in words)
+
+
+def ascii_letters(text: str, filler: str = " ") -> str:
+    """Write a text in ASCII letters and digits, other scripts as ``u5973``; signs are filled."""
+    letters = unicodedata.normalize("NFKD", text)
+    plain = "".join(c if c.isascii() else f"u{ord(c):x}" * c.isalpha() for c in letters)
+    return re.sub(r"[^A-Za-z0-9]", filler, plain)
 
 
 def check_names(names: Iterable[str], columns: pd.Index) -> None:

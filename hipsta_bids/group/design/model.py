@@ -1,6 +1,7 @@
 """Which model is fitted, the user's or the paper's default, and its design matrix."""
 
 import difflib
+import math
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -289,8 +290,8 @@ def folder_name(formula: str, measures: tuple[str, ...] = ()) -> str:
     """Spell measures and a formula as the name of a folder; products must not look like sums."""
     right = formula.rpartition("~")[2].replace("*", " x ").replace(":", " by ")
     right = right.replace(" - ", " without ")
-    words = "".join(c if c.isalnum() else " " for c in right).split()
-    return "_".join(part for part in ("-".join(measures), "-".join(words) or "model") if part)
+    words = "-".join(formulas.ascii_letters(right).split()) or "model"
+    return "_".join(part for part in ("-".join(measures), words) if part)
 
 
 @dataclass(frozen=True)
@@ -343,6 +344,12 @@ def build_design(
     levels_used = formulas.set_levels(variables, references, settings)
     for name in map(str, numeric.columns):
         _check_possible(numeric[name], name.casefold())
+    if words := sorted(closed.numbers & set(levels_used)):
+        raise ModelError(
+            f"formula {model.formula!r}: functions take numbers, but {formulas.listed(words)} holds"
+            " names; write it without a function"
+        )
+    _check_size(formula, levels_used, len(variables), settings)
     try:
         with np.errstate(invalid="ignore", divide="ignore"):  # rows without a value are told below
             model_matrix = formula.get_model_matrix(
@@ -473,6 +480,17 @@ def _check_possible(values: pd.Series, name: str) -> None:
         )
 
 
+def _check_size(
+    formula: Formula, levels: Mapping[str, list[str]], n_rows: int, settings: DesignSettings
+) -> None:
+    """Refuse products of factors with more columns than rows, before they are made."""
+    least = 0
+    for term in formula:
+        names = closed_formula(str(term)).names
+        least += math.prod(len(levels[name]) - 1 for name in names if name in levels)
+    _refuse_more_columns(least, n_rows, settings)
+
+
 def _check_matrix(
     matrix: Float, columns: tuple[str, ...], rows: pd.Index, settings: DesignSettings
 ) -> None:
@@ -482,27 +500,32 @@ def _check_matrix(
             f"model: the formula has no value for rows {formulas.listed(rows.take(bad))}; a"
             " logarithm of zero or less?"
         )
-    if len(matrix) - len(columns) < settings.min_residual_df:
-        raise ModelError(
-            f"model: {len(matrix)} complete rows are too few for {len(columns)} columns; at least"
-            f" {len(columns) + settings.min_residual_df} are needed"
-        )
+    _refuse_more_columns(len(columns), len(matrix), settings)
     lengths = np.linalg.norm(matrix, axis=0)
     if (lengths == 0).any():
         raise ModelError(
             f"model: no row has {columns[int(np.argmin(lengths))]!r}; leave it out of the formula"
         )
     unit = matrix / lengths
-    for last in range(1, len(columns)):
-        before = unit[:, :last]
-        weights = np.linalg.lstsq(before, unit[:, last], rcond=None)[0]
-        remainder = float(np.linalg.norm(unit[:, last] - before @ weights))
-        if remainder < DEPENDENCE:
-            involved = [columns[i] for i in np.flatnonzero(np.abs(weights) > DEPENDENCE)]
-            raise ModelError(
-                f"model: column {columns[last]!r} is a combination of {formulas.listed(involved)};"
-                " leave one of them out"
-            )
+    # What is left of each unit column beside those before it.
+    remainders = np.abs(np.diag(np.linalg.qr(unit, mode="r")))
+    if (remainders < DEPENDENCE).any():
+        last = int(np.argmax(remainders < DEPENDENCE))
+        weights = np.linalg.lstsq(unit[:, :last], unit[:, last], rcond=None)[0]
+        involved = [columns[i] for i in np.flatnonzero(np.abs(weights) > DEPENDENCE)]
+        raise ModelError(
+            f"model: column {columns[last]!r} is a combination of {formulas.listed(involved)};"
+            " leave one of them out"
+        )
+
+
+def _refuse_more_columns(n_columns: int, n_rows: int, settings: DesignSettings) -> None:
+    """Refuse more columns than the rows can tell apart."""
+    if n_rows - n_columns < settings.min_residual_df:
+        raise ModelError(
+            f"model: {n_rows} complete rows are too few for {n_columns} columns; at least"
+            f" {n_columns + settings.min_residual_df} are needed"
+        )
 
 
 def asymmetry_name(measure: str) -> str:

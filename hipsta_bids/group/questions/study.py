@@ -16,7 +16,7 @@ from hipsta_bids.group.cohort import collect, external, read
 from hipsta_bids.group.cohort.covariates import add_icv, add_time, read_covariates
 from hipsta_bids.group.cohort.data import SHEET, Cohort, Measures, choose_visits
 from hipsta_bids.group.design import model as designs
-from hipsta_bids.group.design.formula import check_names, listed, with_factors
+from hipsta_bids.group.design.formula import ascii_letters, check_names, listed, with_factors
 from hipsta_bids.group.design.settings import GroupSettings
 from hipsta_bids.group.output import write
 from hipsta_bids.group.output.results import templates_of
@@ -346,7 +346,7 @@ def read_templates(path: Path | None, cohort: Cohort) -> Mapping[str, Template] 
 def folder_of(parts: Sequence[str], among: tuple[str, str] | None) -> str:
     """Name a folder of results by what was asked, and of whom."""
     words = (*parts, *(among or ())[1:])
-    return "_".join("".join(c if c.isalnum() else "-" for c in word) for word in words)
+    return "_".join(ascii_letters(word, "-") for word in words)
 
 
 def members(table: pd.DataFrame, among: tuple[str, str] | None, option: str = "--among") -> Bool:
