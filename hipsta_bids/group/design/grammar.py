@@ -15,6 +15,7 @@ from types import MappingProxyType
 from typing import NoReturn
 
 import numpy as np
+from formulaic.parser.types import Term
 
 from hipsta_bids.errors import UsageError
 
@@ -39,6 +40,7 @@ _TOKEN = re.compile(
 )
 #: Operators, the closer they bind the larger.
 _OPERATORS = {"+": 1, "-": 1, "*": 2, "/": 2, ":": 3, "**": 4}
+_PLAIN = re.compile(rf"(?!(?:{'|'.join(keyword.kwlist)})$)[^\W\d]\w*")  # needs no backticks
 _PLACEHOLDER = "quoted_column_"
 
 _LONGEST = 2000  # characters
@@ -148,6 +150,16 @@ def _products(parts: deque[str], binding: int = 1) -> int:
                 size += right
         size = min(size, _MOST_PRODUCTS + 1)
     return size
+
+
+def term_text(term: Term) -> str:
+    """Write a term as a formula has it; formulaic takes the backticks off."""
+    return ":".join(
+        f"`{factor.expr}`"
+        if factor.eval_method.value == "lookup" and not _PLAIN.fullmatch(factor.expr)
+        else factor.expr
+        for factor in term.factors
+    )
 
 
 def _refuse(text: str, part: str) -> NoReturn:

@@ -16,7 +16,7 @@ from scipy.linalg import null_space
 
 from hipsta_bids.errors import ModelError, UsageError
 from hipsta_bids.group.design import formula as formulas
-from hipsta_bids.group.design.grammar import CONTEXT, closed_formula
+from hipsta_bids.group.design.grammar import CONTEXT, closed_formula, term_text
 from hipsta_bids.group.design.settings import DefaultModelSettings, DesignSettings, GroupSettings
 from hipsta_bids.io import files
 from hipsta_bids.types import PARTICIPANT, SESSION, Float, Int64
@@ -409,7 +409,7 @@ class _Terms:
         columns = [
             column
             for structure in self.spec.structure
-            if closed_formula(str(structure.term)).names == (variable,)
+            if closed_formula(term_text(structure.term)).names == (variable,)
             for column in structure.columns
         ]
         places = [i for i, column in enumerate(self.columns) if column in columns]
@@ -486,7 +486,7 @@ def _check_size(
     """Refuse products of factors with more columns than rows, before they are made."""
     least = 0
     for term in formula:
-        names = closed_formula(str(term)).names
+        names = closed_formula(term_text(term)).names
         least += math.prod(len(levels[name]) - 1 for name in names if name in levels)
     _refuse_more_columns(least, n_rows, settings)
 
