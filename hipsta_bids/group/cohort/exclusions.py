@@ -130,7 +130,7 @@ def _read(path: Path, needed: Sequence[str]) -> list[dict[str, str]]:
         )
     for line, row in enumerate(rows, start=2):
         word = row.get(_RATING, files.MISSING)
-        if word not in {*RATINGS, files.MISSING, ""}:
+        if word not in RATINGS and not files.is_missing(word):
             raise InputError(
                 f"{path}: line {line}: {word!r} is no rating; {', '.join(RATINGS)} are",
                 reason="bad-table",
@@ -145,11 +145,12 @@ def _some(names: Sequence[str]) -> str:
 
 def _note(row: Mapping[str, str], default: str) -> str:
     note = row.get("note", files.MISSING)
-    return default if note in {files.MISSING, ""} else note
+    return default if files.is_missing(note) else note
 
 
 def _is_current(row: Mapping[str, str], digest: str | None) -> bool:
-    return digest is None or row.get(_HASH, files.MISSING) in {files.MISSING, "", digest}
+    rated = row.get(_HASH, files.MISSING)
+    return digest in {None, rated} or files.is_missing(rated)
 
 
 def is_listed(name: HemisphereName, row: Mapping[str, str]) -> bool:
@@ -160,8 +161,9 @@ def is_listed(name: HemisphereName, row: Mapping[str, str]) -> bool:
     keys = {"participant_id": name.subject, "session_id": name.session or "", "hemi": name.hemi}
     keys |= {"protocol": name.seg, "region": name.region} if name.seg else {}
     for key, value in keys.items():
-        cell = row.get(key, files.MISSING).removeprefix("sub-").removeprefix("ses-")
-        if cell not in {files.MISSING, "", value}:
+        cell = row.get(key, files.MISSING)
+        label = cell.removeprefix("sub-").removeprefix("ses-")
+        if label != value and not files.is_missing(cell):
             return False
     return True
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.design.grammar import CONTEXT, closed_formula
 from hipsta_bids.group.design.settings import DefaultModelSettings, DesignSettings
+from hipsta_bids.io.files import MISSING
 from hipsta_bids.types import Float, Int64
 
 #: A column with text is taken for a damaged number if more of it than this is numbers.
@@ -32,8 +33,6 @@ _TERM = re.compile(
 #: Outside of brackets, where it belongs to a level such as ``group[>=24]``.
 _EQUALS = re.compile(r"=(?![^\[]*\])")
 
-#: Texts that mean a missing value, besides what pandas takes for one.
-_MISSING = ("n/a", "NA", "N/A", "nan", "NaN", "")
 #: Numbers from here on overflow when they are squared and summed.
 _LARGEST = 1e100
 #: Name of the constant.
@@ -286,7 +285,7 @@ def as_factor(values: pd.Series) -> pd.Series:
         return values.map({True: "yes", False: "no"}).astype("category")
     text = values.astype(object).where(values.notna(), None)
     text = text.map(lambda value: None if value is None else level_name(value))
-    return text.where(~text.isin(_MISSING), None).astype("category")
+    return text.astype("category")
 
 
 def level_name(value: object) -> str:
@@ -307,7 +306,7 @@ def typed(values: pd.Series) -> pd.Series:
         return numbers.where(np.isfinite(numbers))
     text = values.astype(object).where(values.notna(), None)
     text = text.map(lambda value: None if value is None else str(value).strip())
-    text = text.where(~text.isin(_MISSING), None)
+    text = text.where(~text.isin([MISSING, ""]), None)
     present = text.notna()
     numbers = pd.to_numeric(text, errors="coerce").astype(np.float64)
     if present.any() and numbers[present].notna().all():

@@ -139,16 +139,8 @@ def _products(parts: deque[str], binding: int = 1) -> int:
     while parts and _OPERATORS.get(parts[0], 0) >= binding:
         sign = parts.popleft()
         right = _products(parts, _OPERATORS[sign] + 1)
-        match sign:
-            case "*":
-                size += right + size * right
-            case ":":
-                size *= right
-            case "**":
-                size **= right
-            case _:
-                size += right
-        size = min(size, _MOST_PRODUCTS + 1)
+        sizes = {"*": size + right + size * right, ":": size * right, "**": size**right}
+        size = min(sizes.get(sign, size + right), _MOST_PRODUCTS + 1)
     return size
 
 

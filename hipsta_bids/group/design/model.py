@@ -349,7 +349,10 @@ def build_design(
             f"formula {model.formula!r}: functions take numbers, but {formulas.listed(words)} holds"
             " names; write it without a function"
         )
-    _check_size(formula, levels_used, len(variables), settings)
+    products = [closed_formula(term_text(term)).names for term in formula]
+    sizes = {name: len(levels) - 1 for name, levels in levels_used.items()}
+    least = sum(math.prod(sizes.get(name, 1) for name in names) for names in products)
+    _refuse_more_columns(least, len(variables), settings)
     try:
         with np.errstate(invalid="ignore", divide="ignore"):  # rows without a value are told below
             model_matrix = formula.get_model_matrix(
@@ -478,17 +481,6 @@ def _check_possible(values: pd.Series, name: str) -> None:
             f"model: column {values.name!r} has {rows_text}, which nobody has; correct them, or"
             " mark them n/a"
         )
-
-
-def _check_size(
-    formula: Formula, levels: Mapping[str, list[str]], n_rows: int, settings: DesignSettings
-) -> None:
-    """Refuse products of factors with more columns than rows, before they are made."""
-    least = 0
-    for term in formula:
-        names = closed_formula(term_text(term)).names
-        least += math.prod(len(levels[name]) - 1 for name in names if name in levels)
-    _refuse_more_columns(least, n_rows, settings)
 
 
 def _check_matrix(

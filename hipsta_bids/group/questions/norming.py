@@ -319,12 +319,11 @@ def _people(study: studies.Study, file: NormsFile) -> normative.People:
         problems["norms-sex", f"{file.sex} is none of {listed(file.sexes)}"] = strange.to_numpy()
         for i, level in enumerate(file.sexes[1:]):
             sex[:, i] = levels == level
-    problems |= {
-        ("incomplete", f"{name} is missing"): is_problem for name, is_problem in lacks.items()
-    }
     for reason, is_problem in problems.items():
         study.left_out.update(dict.fromkeys(map(str, table.index[is_problem]), reason))
-    usable = ~np.any(list(problems.values()), axis=0)
+    lacking = {name: map(str, table.index[is_lacking]) for name, is_lacking in lacks.items()}
+    study.left_out.update(study.incomplete(lacking, table[PARTICIPANT]))
+    usable = ~np.any([*problems.values(), *lacks.values()], axis=0)
     sites = [*file.sites, *sorted(set(labels[usable]) - set(file.sites))]
     site = np.where(usable, pd.Categorical(labels, categories=sites).codes, -1).astype(np.int64)
     return normative.People(age=age, sex=sex, site=site)

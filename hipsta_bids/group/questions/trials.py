@@ -296,9 +296,8 @@ def run_trial(
     tell("points and measures")
     if not retest:
         source = Modeled(cohort, options.model, settings, study.time)
-        for variable, lacking in source.model.design.dropped.items():
-            reason = "incomplete", f"{variable} is missing"
-            study.left_out.update(dict.fromkeys(lacking, reason))
+        lacking = source.model.design.dropped
+        study.left_out.update(study.incomplete(lacking, cohort.table[PARTICIPANT]))
     maps, summaries = study.measures.maps, study.measures.summaries
     results = [
         source.describe(layer)
