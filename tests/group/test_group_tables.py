@@ -1,5 +1,6 @@
 """Tables as laboratories keep them, through the command line: each doubt costs one line."""
 
+import numpy as np
 import pytest
 from small_cohorts import FAST, read_participants, write_participants
 
@@ -101,3 +102,76 @@ def test_participants_who_are_not_in_the_table_are_named_so(study, capsys):
         ("sub-06", "incomplete", "not in participants.tsv"),
         ("sub-29", "incomplete", "not in participants.tsv"),
     }
+
+
+def with_numbers(study, name, function):
+    """Add a column of numbers, given the row and the age."""
+    rows = read_participants(study.data)
+    numbers = [f"{function(k, float(row[2])):.6g}" for k, row in enumerate(rows)]
+    rows = [[*row, number] for row, number in zip(rows, numbers, strict=True)]
+    write_participants(study.data, rows, ("participant_id", "group", "age", "sex", name))
+
+
+@pytest.mark.parametrize(
+    ("column", "n_small", "factor"), [("eTIV", 12, 1e-3), ("icv", 20, 1e-3), ("icv", 1, 1e-6)]
+)
+def test_head_volumes_in_two_units_are_refused(study, capsys, column, n_small, factor):
+    with_numbers(study, column, lambda k, age: (1.2e6 + 1e4 * age) * (factor if k < n_small else 1))
+    options = [*FAST, "--formula", f"group + {column}"]
+    assert main([str(study.data), str(study.out), "group", *options]) == 65
+    error = capsys.readouterr().err
+    assert f"{column!r} has {n_small} values up to" in error
+    assert f"and {30 - n_small} from" in error
+    assert "cm^3 and mm^3? write all in one unit" in error
+    assert error.count("\n") == 1
+
+
+def test_head_volumes_of_the_default_model_are_checked_too(study, capsys):
+    with_numbers(study, "TIV", lambda k, age: (1.2e6 + 1e4 * age) * (1e-3 if k < 9 else 1))
+    call = [str(study.data), str(study.out), "group", "--align", "none", "--no-reports"]
+    assert main([*call, "--no-classification"]) == 0
+    said = capsys.readouterr().out
+    assert "volumes are not adjusted for TIV: model: column 'TIV' has 9 values up to" in said
+
+
+def test_head_volumes_that_differ_as_heads_do_pass(study, capsys):
+    with_numbers(study, "icv", lambda k, age: (0.5 + 0.1 * k + 0 * age) * 1e6)
+    run(study, capsys, "--formula", "group + icv")
+
+
+@pytest.mark.parametrize(
+    ("noise", "is_noted"), [(0.0, None), (0.6, True), (8.0, False), (-0.6, True)]
+)
+def test_covariates_that_are_nearly_the_same_are_noted(study, capsys, noise, is_noted):
+    years = []
+
+    def shifted(k, age):
+        years.append((age, (-1 if noise < 0 else 1) * (age + noise * (-1) ** k)))
+        return years[-1][1]
+
+    with_numbers(study, "years", shifted)
+    r = np.corrcoef(np.transpose(years))[0, 1]
+    assert (abs(r) > 0.99) == (is_noted is not False)
+    options = ["--formula", "group + age + years", "--contrast", "group[CN]-group[AD]"]
+    if is_noted is None:
+        assert main([str(study.data), str(study.out), "group", *FAST, *options]) == 65
+        assert "combination of" in capsys.readouterr().err
+        return
+    said, *_ = run(study, capsys, *options)
+    assert said.count(f"age and years are nearly the same (r = {r:.3f})") == is_noted
+    assert said.count("nearly the same") == is_noted
+
+
+@pytest.mark.parametrize(
+    ("formula", "words"),
+    [
+        ("group + age + sex", None),
+        ("group * sex + age", "the model has 4 columns for 30 participants; use one per 10"),
+        ("group + poly(age, 12)", "the model has 13 columns for 30 participants; use one per 10"),
+        ("0 + group + age", None),
+    ],
+)
+def test_more_columns_than_a_tenth_of_the_participants_are_noted(study, capsys, formula, words):
+    said, *_ = run(study, capsys, "--formula", formula, "--contrast", "group[CN]-group[AD]")
+    assert said.count("columns for") == (words is not None)
+    assert (words or "") in said

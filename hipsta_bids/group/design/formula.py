@@ -320,7 +320,7 @@ def typed(values: pd.Series) -> pd.Series:
     if numbers[present].notna().mean() > NUMERIC_SHARE:
         bad = present & numbers.isna()
         raise ModelError(
-            f"model: column {values.name!r} holds numbers but for rows {_cells(text[bad])};"
+            f"model: column {values.name!r} holds numbers but for rows {cells(text[bad])};"
             " correct them, or mark them n/a"
         )
     _refuse_spellings(text[present])
@@ -376,7 +376,7 @@ def _refuse_spellings(text: pd.Series) -> None:
     ):
         if len(text) and written.mean() > NUMERIC_SHARE:
             raise ModelError(
-                f"model: column {text.name!r} holds {problem}, as {_cells(text[written][:1])};"
+                f"model: column {text.name!r} holds {problem}, as {cells(text[written][:1])};"
                 f" {remedy}"
             )
 
@@ -392,7 +392,7 @@ def check_numbers(values: pd.Series, settings: DesignSettings) -> None:
         far = codes & (gap > high - low)
         if far.any():
             raise ModelError(
-                f"model: column {values.name!r} has {_cells(present[far])} where all other values"
+                f"model: column {values.name!r} has {cells(present[far])} where all other values"
                 f" are {low:g} to {high:g}: a code for missing values? mark them n/a (or change the"
                 " setting design.missing_codes)"
             )
@@ -403,12 +403,12 @@ def check_numbers(values: pd.Series, settings: DesignSettings) -> None:
     far = (present - quartiles[1]).abs() > reach
     if reach > 0 and far.any():
         raise ModelError(
-            f"model: column {values.name!r} has {_cells(present[far])} where half of the other"
+            f"model: column {values.name!r} has {cells(present[far])} where half of the other"
             f" values are {quartiles[0]:.4g} to {quartiles[2]:.4g}; correct them, or mark them n/a"
         )
 
 
-def _cells(values: pd.Series) -> str:
+def cells(values: pd.Series) -> str:
     """List rows with what stands in them."""
     texts = [f"{value:g}" if isinstance(value, float) else repr(value) for value in values]
     return listed(f"{row} ({cell})" for row, cell in zip(values.index, texts, strict=True))

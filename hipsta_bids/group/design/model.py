@@ -1,6 +1,7 @@
 """Which model is fitted, the user's or the paper's default, and its design matrix."""
 
 import difflib
+import itertools
 import math
 import re
 from collections import Counter
@@ -33,6 +34,10 @@ _HEADS = DefaultModelSettings.model_fields["icv_columns"].default
 _OLDEST = 130.0  # years
 #: A line is in the span of columns if it is off by less, in standard deviations.
 _EXACT = 1e-6
+#: Head volumes differ by less, in one unit.
+_UNITS = 50.0
+#: A note names covariates that correlate by more, and columns for which there are fewer people.
+_NEARLY_SAME, _PEOPLE_PER_COLUMN = 0.99, 10
 #: Both sides of a participant, in names of hemispheres.
 BOTH = "LR"
 
@@ -365,6 +370,8 @@ def build_design(
     terms = _Terms(model_matrix, variables, levels_used)
     matrix, columns = terms.matrix, terms.columns
     _check_matrix(matrix, columns, variables.index, settings)
+    people = table.loc[complete, PARTICIPANT].nunique() if PARTICIPANT in table else len(matrix)
+    doubts = _doubts(numeric, len(set(columns) - {formulas.INTERCEPT}), people)
     specs = model.contrasts
     if model.dummy is not None:
         specs += tuple(
@@ -379,7 +386,7 @@ def build_design(
         dropped=dropped,
         references={name: levels[0] for name, levels in levels_used.items()},
         contrasts=tuple(terms.contrast(spec) for spec in specs),
-        notes={name: note for name, note in notes.items() if note},
+        notes={name: note for name, note in notes.items() if note} | doubts,
         levels=levels_used,
     )
 
@@ -465,6 +472,23 @@ class _Terms:
         return None, ""
 
 
+def _doubts(numeric: pd.DataFrame, n_columns: int, n_people: int) -> dict[str, str]:
+    """Note covariates that are nearly the same, and more columns than participants can bear."""
+    r = numeric.corr()
+    notes = {
+        f"{a}, {b}": f"{a} and {b} are nearly the same (r = {r.loc[a, b]:.3f}); keep one of them,"
+        " as their effects cannot be told apart"
+        for a, b in itertools.combinations(map(str, numeric.columns), 2)
+        if abs(r.loc[a, b]) > _NEARLY_SAME
+    }
+    if n_columns * _PEOPLE_PER_COLUMN > n_people:
+        notes["columns"] = (
+            f"the model has {n_columns} columns for {n_people} participants; use one per"
+            f" {_PEOPLE_PER_COLUMN} at most, as estimates are uncertain"
+        )
+    return notes
+
+
 def _check_possible(values: pd.Series, name: str) -> None:
     """Refuse ages, and volumes of heads, that nobody has."""
     if name not in {*_AGES, *_HEADS}:
@@ -480,6 +504,18 @@ def _check_possible(values: pd.Series, name: str) -> None:
         raise ModelError(
             f"model: column {values.name!r} has {rows_text}, which nobody has; correct them, or"
             " mark them n/a"
+        )
+    if name in _AGES or first <= 0:
+        return
+    ordered = values.sort_values()
+    ratios = ordered.to_numpy()[1:] / ordered.to_numpy()[:-1]
+    split = int(np.argmax(ratios)) + 1
+    if ratios[split - 1] > _UNITS:
+        parts = ordered.iloc[:split], ordered.iloc[split:]
+        raise ModelError(
+            f"model: column {values.name!r} has {len(parts[0])} values up to {parts[0].iloc[-1]:g}"
+            f" and {len(parts[1])} from {parts[1].iloc[0]:g}: cm^3 and mm^3? write all in one unit;"
+            f" fewer are {formulas.cells(min(parts, key=len))}"
         )
 
 
