@@ -1,11 +1,16 @@
 """Tables as laboratories keep them, through the command line: each doubt costs one line."""
 
+import re
+from html import unescape
+
 import numpy as np
 import pytest
+from markdown_it import MarkdownIt
 from small_cohorts import FAST, read_participants, write_participants
 
 from hipsta_bids.cli.main import main
 from hipsta_bids.io import files
+from hipsta_bids.reports.group import group_page
 
 pytestmark = pytest.mark.usefixtures("without_figures")
 COLUMNS = ("participant_id", "group", "age", "sex", "site")
@@ -175,3 +180,32 @@ def test_more_columns_than_a_tenth_of_the_participants_are_noted(study, capsys, 
     said, *_ = run(study, capsys, "--formula", formula, "--contrast", "group[CN]-group[AD]")
     assert said.count("columns for") == (words is not None)
     assert (words or "") in said
+
+
+def test_methods_show_names_of_tables_as_they_are(study, capsys):
+    """In GitHub's Markdown and on the page, whatever their signs mean there."""
+    groups = {"CN": "*a* <b>b</b> &lt;", "AD": "[x](http://y) _z_ $1$ `c`"}
+    sites = ("![i](j)", "~~k~~", "C:\\*")
+    rows = [
+        [*row[:1], groups[row[1]], *row[2:], sites[k % 3]]
+        for k, row in enumerate(read_participants(study.data))
+    ]
+    write_participants(study.data, rows, ("participant_id", "group", "my age_", "sex", "site"))
+    call = [str(study.data), str(study.out), "group", "--align", "none", "--measures", "thickness"]
+    call += ["--name", "t", "--formula", "group + `my age_` + site"]
+    assert main([*call, "--contrast", "`my age_`", "age_diff_ = 2*`my age_`"]) == 0
+    assert not capsys.readouterr().err
+    folder = study.out / "group"
+    source = (folder / "t" / "methods.md").read_text(encoding="utf-8")
+    page = group_page(folder / "t")
+    rendered = MarkdownIt("commonmark").enable(["strikethrough", "table"]).render(source)
+    for html in (rendered, page[page.index('<div class="methods">') :]):
+        method = html[: html.index("References")]
+        assert not re.search(r"<(?!/?(p|h\d|code|div|ul|li)\b)", method)
+        assert method.count("<code>group + `my age_` + site</code>") == 1
+        words = unescape(re.sub(r"<[^>]+>", "", method))
+        assert f"(16 {groups['CN']}, 14 {groups['AD']})" in words
+        assert f"(reference levels: group {groups['CN']}, site ![i](j))" in words
+        assert "; contrasts: `my age_`, age_diff_." in words
+        assert "Points that survive: thickness, `my age_`, L: " in words
+    assert "$1$" not in source  # GitHub's formulas, which the parser above does not know

@@ -19,7 +19,7 @@ from hipsta_bids.group.design.model import BOTH, FIRST_AGE, Comparison
 from hipsta_bids.group.design.settings import GroupSettings, NormSettings
 from hipsta_bids.group.output import write
 from hipsta_bids.group.output.figures import Drawing, deviation_rows, draw_norms, norm_rows
-from hipsta_bids.group.output.methods import norms_text
+from hipsta_bids.group.output.methods import escaped, norms_text
 from hipsta_bids.group.output.panels import draw_pages
 from hipsta_bids.group.output.results import ScoredMaps
 from hipsta_bids.group.output.saved import NormsFile, load_norms, save_norms, templates_from_json
@@ -180,7 +180,7 @@ def _write(study: studies.Study, scoring: _Made, notes: Iterable[str]) -> studie
         table = pd.concat(charts, ignore_index=True)
         first = ["hemi", "measure", "unit"]
         scoring.tables["centiles"] = table[[*first, *table.columns.drop(first)]]
-    among = f" ({' '.join(study.among)})" if study.among else ""
+    among = f" ({escaped(' '.join(study.among))})" if study.among else ""
     visits = cohort.table[people.known]
     is_first = ~visits[PARTICIPANT].duplicated().to_numpy()
     sample = f"{is_first.sum()} participants{among}"
