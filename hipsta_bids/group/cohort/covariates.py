@@ -63,7 +63,7 @@ def read_covariates(
     """
     joined = visits.copy()
     main = bids_dir / "participants.tsv"
-    tables = [main] if main.is_file() else []
+    tables = [main] if main.exists() else []
     described: dict[str, object] = {}
     spelled: Spellings = Counter()
     absent: frozenset[str] = frozenset()
@@ -158,7 +158,7 @@ def _refuse_alike(columns: pd.Index, settings: GroupSettings) -> None:
 
 
 def _sidecar(path: Path) -> dict[str, object]:
-    return dict(files.read_json(path)) if path.is_file() else {}
+    return dict(files.read_json(path)) if path.exists() else {}
 
 
 def _with_levels(values: pd.Series, description: object) -> pd.Series:
@@ -234,7 +234,7 @@ def _join_sessions(
     parts = []
     for participant in joined.loc[joined[SESSION].notna(), PARTICIPANT].unique():
         path = bids_dir / participant / f"{participant}_sessions.tsv"
-        if path.is_file():
+        if path.exists():
             part = pd.DataFrame(files.read_tsv(path), dtype=object)
             if SESSION not in part.columns:
                 raise InputError(f"{path}: has no column session_id", reason="bad-table")
@@ -309,16 +309,23 @@ def read_icv(sources: Sequence[str], roots: Sequence[Path]) -> list[float | None
 
 def _icv_beside(path: Path) -> float | None:
     stats = path.parent.parent / "stats" / "aseg.stats"
-    if stats.is_file():
-        for line in read_bounded(stats, SETTINGS).decode(errors="replace").splitlines():
+    if stats.exists():
+        for line in _read_text(stats).splitlines():
             if line.startswith("# Measure EstimatedTotalIntraCranialVol,"):
                 return _number(line.split(",")[-2])
     for folder in (path.parent, path.parent.parent, path.parent.parent / "final"):
         for found in sorted(folder.glob("*icv.txt")):
-            words = read_bounded(found, SETTINGS).decode(errors="replace").split()
+            words = _read_text(found).split()
             if words:  # subject and volume, or the volume alone
                 return _number(words[-1])
     return None
+
+
+def _read_text(path: Path) -> str:
+    try:
+        return read_bounded(path, SETTINGS).decode(errors="replace")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error}); restore or delete it") from error
 
 
 def _number(text: str) -> float | None:
