@@ -35,6 +35,7 @@ CASES = [
     ("fs/sub-01/stats/aseg.stats", SEGMENTATIONS),
     ("fs/sub-01/mri/sub-01_icv.txt", SEGMENTATIONS),
     ("out/desc-settings.json", []),
+    ("out/dataset_description.json", []),
     (RECORD, []),
     (SHEET, []),
 ]

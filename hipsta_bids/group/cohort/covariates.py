@@ -74,18 +74,23 @@ def read_covariates(
         if path == main:
             _check_known(joined, table, path)
             absent = frozenset(joined[PARTICIPANT]) - frozenset(table[PARTICIPANT])
-        joined = _join(joined, table, path, sidecar, spelled)
+        table = table[table[PARTICIPANT].isin(joined[PARTICIPANT])]
+        joined = _join(joined, mark_missing(table, sidecar, spelled), path)
         described |= sidecar
-        if path == main:
+        if path == main and (parts := _read_sessions(joined, bids_dir)):
             sidecar = _sidecar(bids_dir / "sessions.json")
-            joined = _join_sessions(joined, bids_dir, sidecar, spelled)
+            table = mark_missing(pd.concat(parts, ignore_index=True), sidecar, spelled)
+            joined = _join(joined, table, bids_dir / "sub-*_sessions.tsv")
             described |= sidecar
     for column in described.keys() & set(joined.columns):
         joined[column] = _with_levels(joined[column], described[column])
     for column in joined.columns.difference([PARTICIPANT, SESSION]):
         if joined[column].dtype == object:
             joined[column] = _without_codes(joined[column], settings.design.missing_codes, spelled)
-    _refuse_alike(joined.columns, settings)
+    folded = joined.columns.str.casefold()
+    pair = joined.columns[folded.duplicated(keep=False) & folded.isin(_known_columns(settings))]
+    if len(pair):
+        raise InputError(f"columns {' and '.join(pair)} differ in capitals only; keep one")
     return joined, absent, spelled
 
 
@@ -103,7 +108,7 @@ def mark_missing(
         is_cell_missing = table[name].isin([word for word in words if _is_missing(word, levels)])
         cells = table.loc[is_cell_missing, name]
         spelled.update((str(name), cell) for cell in cells if cell.strip() not in {"", MISSING})
-        if words:
+        if len(cells):
             marked[name] = table[name].where(~is_cell_missing, None)
     return marked
 
@@ -140,21 +145,9 @@ def spelled_note(spelled: Spellings, formula: str, settings: GroupSettings) -> s
 
 def _known_columns(settings: GroupSettings) -> set[str]:
     """Return the names, without capitals, of columns that are looked for in any case."""
-    rules = settings.model
-    names = (*settings.design.factors, *rules.group_columns, *rules.covariates, *rules.icv_columns)
+    rules, factors = settings.model, settings.design.factors
+    names = (*factors, *rules.group_columns, *rules.covariates, *rules.icv_columns)
     return {name.casefold() for name in names}
-
-
-def _refuse_alike(columns: pd.Index, settings: GroupSettings) -> None:
-    """Refuse columns that are found in any case of letters, and are there in two."""
-    names = _known_columns(settings)
-    for folded, count in Counter(map(str.casefold, columns)).items():
-        if count > 1 and folded in names:
-            pair = [name for name in columns if name.casefold() == folded]
-            raise InputError(
-                f"covariates: columns {' and '.join(pair)} differ in capitals only; keep one",
-                reason="bad-table",
-            )
 
 
 def _sidecar(path: Path) -> dict[str, object]:
@@ -228,9 +221,7 @@ def _cleaned(table: pd.DataFrame) -> pd.DataFrame:
     return table
 
 
-def _join_sessions(
-    joined: pd.DataFrame, bids_dir: Path, described: Mapping[str, object], spelled: Spellings
-) -> pd.DataFrame:
+def _read_sessions(joined: pd.DataFrame, bids_dir: Path) -> list[pd.DataFrame]:
     parts = []
     for participant in joined.loc[joined[SESSION].notna(), PARTICIPANT].unique():
         path = bids_dir / participant / f"{participant}_sessions.tsv"
@@ -239,29 +230,19 @@ def _join_sessions(
             if SESSION not in part.columns:
                 raise InputError(f"{path}: has no column session_id", reason="bad-table")
             parts.append(_cleaned(part).assign(**{PARTICIPANT: participant}))
-    if not parts:
-        return joined
-    table, pattern = pd.concat(parts, ignore_index=True), bids_dir / "sub-*_sessions.tsv"
-    return _join(joined, table, pattern, described, spelled)
+    return parts
 
 
-def _join(
-    joined: pd.DataFrame,
-    table: pd.DataFrame,
-    path: Path,
-    described: Mapping[str, object],
-    spelled: Spellings,
-) -> pd.DataFrame:
+def _join(joined: pd.DataFrame, table: pd.DataFrame, path: Path) -> pd.DataFrame:
     """Add the columns of one table, by participant, and by session if it has sessions."""
     by_session = SESSION in table.columns and bool(table[SESSION].notna().any())
     keys = [PARTICIPANT, SESSION] if by_session else [PARTICIPANT]
     table = table.drop(columns=[SESSION]) if SESSION in table and not by_session else table
-    table = table[table[PARTICIPANT].isin(joined[PARTICIPANT])]
     repeated = table.loc[table.duplicated(keys), keys].astype(str).agg(" ".join, axis=1)
     if len(repeated):
         names = listed(sorted(set(repeated)))
         raise InputError(f"{path}: {names} occur more than once; keep one row each")
-    indexed = mark_missing(table.set_index(keys), described, spelled)
+    indexed = table.set_index(keys)
     rows = pd.MultiIndex.from_frame(joined[keys]) if by_session else joined[PARTICIPANT]
     aligned = indexed.reindex(rows)
     result = joined.copy()

@@ -272,9 +272,8 @@ def read_study(
     )
     table_notes = [f"not in participants.tsv: {listed(sorted(absent))}"] if absent else []
     if spelled:
-        model = options.model
-        formula = model.formula or str(files.read_json(model.file) if model.file else "")
-        table_notes.append(spelled_note(spelled, formula, settings))
+        file = options.model.file and files.read_json(options.model.file)
+        table_notes.append(spelled_note(spelled, options.model.formula or str(file), settings))
     all_visits = Cohort(
         table=with_factors(covariates, settings.design, settings.model),
         sides=measured.sides,
