@@ -101,7 +101,9 @@ def test_participants_who_are_not_in_the_table_are_named_so(study, capsys):
     write_participants(study.data, [*rows[:28], rows[29]])
     said, design, excluded = run(study, capsys)
     assert len(design) == 27
-    assert "note: not in participants.tsv: sub-06, sub-29\n" in said
+    assert (
+        "note: participants.tsv: has no row of sub-06, sub-29; add it, or check its label\n" in said
+    )
     assert {(row["participant_id"], row["reason"], row["message"]) for row in excluded} == {
         ("sub-04", "incomplete", "age is missing"),
         ("sub-06", "incomplete", "not in participants.tsv"),
@@ -163,7 +165,7 @@ def test_covariates_that_are_nearly_the_same_are_noted(study, capsys, noise, is_
         assert "combination of" in capsys.readouterr().err
         return
     said, *_ = run(study, capsys, *options)
-    assert said.count(f"age and years are nearly the same (r = {r:.3f})") == is_noted
+    assert said.count(f"age and years are nearly the same (r = {r:.4f})") == is_noted
     assert said.count("nearly the same") == is_noted
 
 

@@ -474,13 +474,14 @@ class _Terms:
 
 def _doubts(numeric: pd.DataFrame, n_columns: int, n_people: int) -> dict[str, str]:
     """Note covariates that are nearly the same, and more columns than participants can bear."""
-    r = numeric.corr()
-    notes = {
-        f"{a}, {b}": f"{a} and {b} are nearly the same (r = {r.loc[a, b]:.3f}); keep one of them,"
-        " as their effects cannot be told apart"
-        for a, b in itertools.combinations(map(str, numeric.columns), 2)
-        if abs(r.loc[a, b]) > _NEARLY_SAME
-    }
+    notes = {}
+    for a, b in itertools.combinations(map(str, numeric.columns), 2):
+        r = numeric[a].corr(numeric[b])
+        if abs(r) > _NEARLY_SAME:
+            notes[f"{a}, {b}"] = (
+                f"{a} and {b} are nearly the same (r = {r:.4f}); keep one of them, as their effects"
+                " cannot be told apart"
+            )
     if n_columns * _PEOPLE_PER_COLUMN > n_people:
         notes["columns"] = (
             f"the model has {n_columns} columns for {n_people} participants; use one per"

@@ -270,7 +270,10 @@ def read_study(
     covariates, absent, spelled = read_covariates(
         measured.table, options.bids_dir, options.covariates, settings
     )
-    table_notes = [f"not in participants.tsv: {listed(sorted(absent))}"] if absent else []
+    lacking = (
+        f"participants.tsv: has no row of {listed(sorted(absent))}; add it, or check its label"
+    )
+    table_notes = [lacking] * bool(absent)
     if spelled:
         file = options.model.file and files.read_json(options.model.file)
         table_notes.append(spelled_note(spelled, options.model.formula or str(file), settings))
