@@ -10,6 +10,7 @@ from typing import Any
 
 from hipsta_bids.derivatives.names import HemisphereName
 from hipsta_bids.errors import InputError, UsageError
+from hipsta_bids.group.design.formula import listed
 from hipsta_bids.io import files
 from hipsta_bids.reports.verdict import RATINGS
 
@@ -73,12 +74,14 @@ class UserTable:
                 old.append(name.stem)
         unmatched = [row["participant_id"] for row in self.rows if id(row) not in matched]
         notes = (
-            [f"{self.path}: matches no hemisphere here: {_some(unmatched)}"] if unmatched else []
+            [f"{self.path}: matches no hemisphere here: {listed(unmatched, SHOWN)}"]
+            if unmatched
+            else []
         )
         if old:
             notes.append(
                 f"{self.path}: not applied to hemispheres whose labels have changed since they were"
-                f" rated: {_some(old)}; rate them again"
+                f" rated: {listed(old, SHOWN)}; rate them again"
             )
         return notes
 
@@ -136,11 +139,6 @@ def _read(path: Path, needed: Sequence[str]) -> list[dict[str, str]]:
                 reason="bad-table",
             )
     return rows
-
-
-def _some(names: Sequence[str]) -> str:
-    ending = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
-    return f"{', '.join(names[:SHOWN])}{ending}"
 
 
 def _note(row: Mapping[str, str], default: str) -> str:

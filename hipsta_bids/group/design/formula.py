@@ -530,8 +530,8 @@ def in_order(level: str) -> tuple[float, str]:
         return np.inf, level
 
 
-def listed(items: Iterable[object]) -> str:
+def listed(items: Iterable[object], limit: int = _NAMED) -> str:
     """Join names for a message, not too many."""
     texts = [str(item) for item in items]
-    ending = f" and {len(texts) - _NAMED} more" if len(texts) > _NAMED else ""
-    return ", ".join(texts[:_NAMED]) + ending
+    ending = f" and {len(texts) - limit} more" if len(texts) > limit else ""
+    return ", ".join(texts[:limit]) + ending
