@@ -125,7 +125,7 @@ def _without_codes(values: pd.Series, codes: Sequence[float], spelled: Spellings
     """Mark codes of missing values, as -9999, where they are out of the range of all others."""
     numbers = pd.to_numeric(values, errors="coerce")
     is_code = numbers.isin([code for code in codes if code < 0])
-    remaining = numbers[~is_code].dropna()
+    remaining = numbers[~is_code & numbers.between(-1e100, 1e100)]  # larger ones are refused
     low, high = (remaining.min(), remaining.max()) if len(remaining) else (0.0, 0.0)
     # A positive code may be a value; it is refused later.
     is_far = is_code & ((low >= 0) | (np.maximum(low - numbers, numbers - high) > high - low))

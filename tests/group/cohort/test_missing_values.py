@@ -136,6 +136,12 @@ def test_codes_are_missing_out_of_the_range_of_all_others(tmp_path, values, miss
     assert sorted(spelled.elements()) == sorted(("score", str(x)) for x in missing)
 
 
+def test_endless_numbers_give_no_range(tmp_path):
+    cells = ["inf", "-1e400", "1e308", "-1e308", "60", "70", "-9", "-99"]
+    *_, spelled = read(tmp_path, {"score": cells})
+    assert dict(spelled) == {("score", "-9"): 1, ("score", "-99"): 1}
+
+
 def test_later_tables_replace_nothing_by_what_is_missing(tmp_path):
     (tmp_path / "phenotype").mkdir()
     (tmp_path / "phenotype" / "a.tsv").write_text("participant_id\tage\nsub-01\t?\nsub-02\t9\n")
