@@ -313,7 +313,7 @@ def _condition(text: str) -> tuple[str, str, float]:
 
 
 def _name(text: str) -> str:
-    if not text.replace("-", "").replace("_", "").isalnum():
+    if not re.fullmatch(r"[\w-]*[^\W_][\w-]*", text, re.ASCII):
         raise argparse.ArgumentTypeError(f"{text!r} is not a name of letters, digits, - and _")
     return text
 

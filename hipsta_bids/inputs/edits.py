@@ -253,7 +253,7 @@ def _row(origin: str, row: dict[str, str]) -> EndRow:
     subject = cells["participant_id"].removeprefix("sub-")
     session = cells.get("session", "").removeprefix("ses-")
     hemi = cells["hemi"].upper()
-    if hemi not in scan.HEMIS or not subject or subject == files.MISSING:
+    if hemi not in scan.HEMIS or files.is_missing(subject):
         fault = f"hemi {cells['hemi']!r} is not L or R" if subject else "it has no participant_id"
         raise InputError(f"{origin}: {fault}; correct it", reason="unreadable-table")
     end: GivenEnd | HipstaError
@@ -263,7 +263,7 @@ def _row(origin: str, row: dict[str, str]) -> EndRow:
         end = InputError(f"{origin}: {error}", reason="unreadable-table")
     return EndRow(
         subject=subject,
-        session=session if session not in ("", files.MISSING) else None,
+        session=None if files.is_missing(session) else session,
         hemi=hemi,
         origin=origin,
         end=end,
@@ -286,7 +286,7 @@ def _given(cells: dict[str, str]) -> GivenEnd:
 def _vector(cells: dict[str, str], names: Sequence[str]) -> tuple[float, float, float] | None:
     """Read three numbers; none if all are missing."""
     texts = [cells.get(name, "") for name in names]
-    if all(text in ("", files.MISSING) for text in texts):
+    if all(map(files.is_missing, texts)):
         return None
     numbers = []
     for name, text in zip(names, texts, strict=True):

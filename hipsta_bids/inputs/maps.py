@@ -52,7 +52,7 @@ def read_regions(path: Path, shape: tuple[int, int]) -> Regions:
         raise InputError(
             f"{path}: {fault}; its columns are {', '.join(COLUMNS)} (and any of the sheet table)"
         )
-    drawn = [row for row in rows if row["region"].strip() not in ("", files.MISSING)]
+    drawn = [row for row in rows if not files.is_missing(row["region"])]
     if not drawn:
         raise InputError(f"{path}: no point belongs to a region; draw one")
     nodes = _nodes(path, drawn, shape)

@@ -14,7 +14,7 @@ from pathlib import Path
 from types import MappingProxyType
 
 from hipsta_bids.errors import InputError
-from hipsta_bids.io.files import MISSING, read_tsv
+from hipsta_bids.io.files import is_missing, read_tsv
 from hipsta_bids.types import Visit
 
 #: ``sub-X``, ``sub-X_ses-Y``, and FreeSurfer's longitudinal ``sub-X_ses-Y.long.BASE``.
@@ -317,7 +317,8 @@ def read_people(path: Path | None) -> People:
     for number, row in enumerate(read_tsv(path) if path else (), start=2):
         folder = os.path.normpath(row.get("folder") or "..").strip("/")
         subject = row.get("participant_id", "").removeprefix("sub-")
-        session = row.get("session_id", MISSING).removeprefix("ses-").replace(MISSING, "")
+        cell = row.get("session_id", "")
+        session = "" if is_missing(cell) else cell.removeprefix("ses-")
         # Nothing outside of a dataset, nor the dataset itself.
         is_inside = not folder.startswith(".")
         if not (is_inside and _LABEL.fullmatch(subject) and (_LABEL.fullmatch(session or "0"))):

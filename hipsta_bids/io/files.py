@@ -15,6 +15,7 @@ import json
 import math
 import os
 import platform
+import re
 import secrets
 import shutil
 import tempfile
@@ -35,6 +36,15 @@ LOGS = "logs"
 
 MISSING = "n/a"
 """A missing value in BIDS tables."""
+
+#: Spellings of a missing value, without capitals, blanks and signs; Excel's errors begin with #.
+_MISSING = re.compile(
+    r"(#?nan?|<na>|nil|none|#?null|unk|unkn|unknown|tbd|blank|1#(qnan|ind)|#(div0|name|num|ref|value)"
+    r"|missing(data|values?)?|no(answer|data|response|value)|un(defined|disclosed|specified)"
+    r"|not(applicable|assessed|available|collected|done|known|measured|recorded|reported|specified"
+    r"|stated|tested)|prefernotto(answer|say)|desconocido|inconnu|keineangabe|unbekannt)?"
+)
+_SIGNS = re.compile(r"[\s?!.*/\\|()\[\]_\u2010-\u2015\u2026\u2212-]+")
 
 _HALF_LETTERS = r"\ud"  # with two digits more, a half of a letter beyond the first plane
 
@@ -243,6 +253,11 @@ def read_json(path: Path, limit: float = opening.TABLE) -> dict[str, Any]:
     return value
 
 
+def is_missing(cell: str) -> bool:
+    """Check whether a cell of a table spells a missing value: ``n/a``, nothing, ``unknown`` ..."""
+    return _MISSING.fullmatch(_SIGNS.sub("", cell.casefold())) is not None
+
+
 def write_tsv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
     """Write a BIDS table atomically."""
     lines = ["\t".join(columns)]
@@ -268,8 +283,8 @@ def read_tsv(path: Path) -> list[dict[str, str]]:
             reason="unreadable-table",
         ) from error
     reader = csv.reader(io.StringIO(text), delimiter="\t", quoting=csv.QUOTE_NONE)
-    header = next(reader, [])
-    rows = [row for row in reader if row]
+    header = [name.strip() for name in next(reader, [])]
+    rows = [row for row in reader if any(map(str.strip, row))]
     if any(len(row) != len(header) for row in rows):
         raise InputError(
             f"{path}: rows and header differ in length; restore or delete it", reason="bad-table"

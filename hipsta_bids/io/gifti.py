@@ -247,7 +247,7 @@ def _from_table(path: Path, name: str) -> PointMap:
         fault = f"columns {', '.join(value_columns)}" if value_columns else "no column of values"
         raise InputError(f"{path}: has {fault}; name the map after one of them")
     try:
-        values = [np.nan if row[column] == files.MISSING else float(row[column]) for row in rows]
+        values = [np.nan if files.is_missing(row[column]) else float(row[column]) for row in rows]
         nodes = _nodes(rows) if {"x", "y"} <= set(columns) else None
     except ValueError as error:
         raise InputError(

@@ -251,9 +251,14 @@ def _blocks(text: str) -> list[dict[str, Any]]:
 
 
 def _runs(text: str) -> list[tuple[bool, str]]:
-    """Split a text into runs, and tell which are code."""
-    return [(i % 2 == 1, run) for i, run in enumerate(text.split("`")) if run]
+    """Split a text into runs, and tell which are code; no sign is escaped there."""
+    parts = re.split(r"(?<!\\)(?:`` (.+?) ``|`([^`]+)`)", text)
+    runs = [(i % 3 != 0, run) for i, run in enumerate(parts) if run]
+    return [(is_code, run if is_code else _ESCAPED.sub("", run)) for is_code, run in runs]
 
+
+#: A backslash before a sign of Markdown.
+_ESCAPED = re.compile(r"\\(?=[\\`*~<$\]&_])")
 
 #: Sections of the page, from top to bottom.
 SECTIONS: tuple[Section[GroupResults], ...] = (

@@ -1,6 +1,8 @@
 """Small cohorts of sheets as the participant level leaves them; nothing is measured."""
 
 import json
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -26,6 +28,15 @@ PLAN = SimulationPlan(
 SETTINGS = Settings(sheet=SheetSettings(x_nodes=NODES[0], y_nodes=NODES[1]))
 COLUMNS = ["x", "y", "thickness", "curvature", "subfield"]
 GROUPS = ("CN", "AD")
+#: What keeps runs short that look at the model only.
+FAST = ("--align", "none", "--measures", "thickness", "--no-classification", "--no-reports")
+
+
+class Study(NamedTuple):
+    """A BIDS dataset and the output of the participant level."""
+
+    data: Path
+    out: Path
 
 
 def place_of(root, subject, hemi, *, session=None, seg="demo", region="body"):

@@ -3,53 +3,16 @@
 import json
 import shutil
 from dataclasses import replace
-from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import pytest
-from small_cohorts import (
-    place_of,
-    read_participants,
-    write_dataset,
-    write_hemisphere,
-    write_participants,
-)
+from small_cohorts import FAST, place_of, read_participants, write_hemisphere, write_participants
 
 from hipsta_bids.cli.main import main
 from hipsta_bids.derivatives.dataset import identity, update_status
 from hipsta_bids.derivatives.names import HemisphereName
 from hipsta_bids.group.cohort.exclusions import is_listed
-from hipsta_bids.group.output import write
 from hipsta_bids.io import files
-
-#: What keeps runs short that look at the model only.
-FAST = ("--align", "none", "--measures", "thickness", "--no-classification", "--no-reports")
-
-
-class Study(NamedTuple):
-    data: Path
-    out: Path
-
-
-@pytest.fixture(scope="module")
-def written(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("study")
-    write_dataset(folder)
-    return folder
-
-
-@pytest.fixture
-def study(written, tmp_path):
-    """A copy that may be spoiled."""
-    shutil.copytree(written, tmp_path / "study")
-    return Study(tmp_path / "study" / "bids", tmp_path / "study" / "out")
-
-
-@pytest.fixture
-def without_figures(monkeypatch):
-    """Leave out what takes longer than all else."""
-    monkeypatch.setattr(write, "draw_figures", lambda *_: iter(()))
 
 
 def edit_record(place, **changes):
@@ -136,7 +99,7 @@ def age_in_months(study):
 
 def coded_age(study):
     rows = read_participants(study.data)
-    rows[3][2] = rows[7][2] = "-9999"
+    rows[3][2] = rows[7][2] = "999"
     write_participants(study.data, rows)
 
 
@@ -225,7 +188,7 @@ def no_values(study):
         (impossible_age, [], 65, "has sub-04 (1e+50) where half of the other values are"),
         (negative_age, [], 65, "sub-04 (-3), which nobody has"),
         (age_in_months, [], 65, "sub-04 (150), which nobody has"),
-        (coded_age, [], 65, "has sub-04 (-9999), sub-08 (-9999) where all other values are 5"),
+        (coded_age, [], 65, "has sub-04 (999), sub-08 (999) where all other values are 5"),
         (coded_sex, [], 65, "'sex' has 999 (3) among words: a code for missing values?"),
         (comma_age, [], 65, "'age' holds decimal commas, as sub-01 ('74,1')"),
         (date_age, [], 65, "'age' holds dates, as sub-01 ('1974-01-01')"),
@@ -244,6 +207,8 @@ def no_values(study):
         (None, ["--formula", "group + my age"], 64, "backticks"),
         (None, ["--formula", "thickness ~ I(age.map(open))"], 64, "'age.map(open)' is not allowed"),
         (None, ["--formula", "group + {age.to_csv('x')}"], 64, "is not allowed; allowed are"),
+        (None, ["--formula", "(group + age + sex + age + sex)**9"], 64, "more than 1000 products"),
+        (None, ["--formula", "log(group)"], 65, "'log(group)': functions take numbers, but group"),
         (None, ["--formula", "thickness ~ group | sex"], 64, "'|' is not allowed"),
         (None, ["--exclude", "nowhere.tsv"], 65, "no such file"),
         (one_patient, [], 65, "AD (1)"),
@@ -275,6 +240,7 @@ def no_values(study):
         (None, ["-d", "hipsta=/nowhere"], 65, "/nowhere"),
         (None, ["--align", "fancy"], 64, "fancy"),
         (None, ["--name", "../x"], 64, "../x"),
+        (None, ["--name", "é"], 64, "'é' is not a name of letters, digits"),
     ],
 )
 def test_refused_in_one_line(study, capsys, spoil, options, code, words):  # noqa: PLR0917 -- cases

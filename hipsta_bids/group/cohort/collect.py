@@ -15,6 +15,7 @@ from hipsta_bids.derivatives.names import DATASET_FILES, HemisphereName
 from hipsta_bids.errors import InputError, NothingToDoError
 from hipsta_bids.group.cohort.covariates import relocate
 from hipsta_bids.group.cohort.exclusions import SHOWN, Choices, Condition, fulfilled
+from hipsta_bids.group.design.formula import listed
 from hipsta_bids.io import files
 from hipsta_bids.io.files import checked_foreign
 from hipsta_bids.protocols.toml import settings_hash
@@ -183,10 +184,9 @@ def _several_versions(records: Sequence[SheetRecord]) -> tuple[str, ...]:
         return ()
     usual = counts.most_common(1)[0][0]
     stems = [record.result.name.stem for record in records if record.version != usual]
-    ending = f" and {len(stems) - SHOWN} more" if len(stems) > SHOWN else ""
     text = (
         f"hemispheres were measured by several versions, {counts_text(counts)}; measure"
-        f" {', '.join(stems[:SHOWN])}{ending} with {usual}: a version may change numbers"
+        f" {listed(stems, SHOWN)} with {usual}: a version may change numbers"
     )
     return (text,)
 

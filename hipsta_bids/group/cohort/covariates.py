@@ -1,6 +1,7 @@
 """Covariates of participants and sessions, from tables of a BIDS dataset and other tables."""
 
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path, PurePosixPath
@@ -11,21 +12,25 @@ import pandas as pd
 
 from hipsta_bids.derivatives.dataset import linked_path, read_links
 from hipsta_bids.errors import InputError, ModelError
-from hipsta_bids.group.design.formula import as_factor, check_numbers, level_name, typed
+from hipsta_bids.group.design.formula import as_factor, check_numbers, level_name, listed, typed
 from hipsta_bids.group.design.model import FIRST_AGE, VisitTime
 from hipsta_bids.group.design.settings import GroupSettings
 from hipsta_bids.io import files
+from hipsta_bids.io.files import MISSING, is_missing
 from hipsta_bids.opening import SETTINGS, read_bounded
 from hipsta_bids.types import PARTICIPANT, SESSION
 
-#: Number of rows that a message lists.
-_MOST_NAMES = 6
+Spellings = Counter[tuple[str, str]]
+"""Numbers of cells that were read as missing, by column and spelling."""
+
 #: Column of BIDS' sessions.tsv with dates, and columns that are made here.
 _DATE, TIME, _ICV = "acq_time", "time", "icv"
 _DAYS_PER_YEAR = 365.25
 #: Levels of factors that are numbers, and characters of a name for one.
 _CODE = re.compile(r"-?\d+(\.\d+)?")
 _LONGEST_NAME = 40
+#: A level whose description is this long, and spells a missing value, is one.
+_SHORTEST_MEANING = 5
 
 
 def locate_sources(sources: Sequence[str], roots: Sequence[Path]) -> list[Path | None]:
@@ -47,8 +52,10 @@ def relocate(source: str, folders: Sequence[Path]) -> str:
     return source
 
 
-def read_covariates(visits: pd.DataFrame, bids_dir: Path, extra: Sequence[Path]) -> pd.DataFrame:
-    """Join covariates to visits; cells stay text.
+def read_covariates(
+    visits: pd.DataFrame, bids_dir: Path, extra: Sequence[Path], settings: GroupSettings
+) -> tuple[pd.DataFrame, frozenset[str], Spellings]:
+    """Join covariates to visits; cells stay text. Also who is not in participants.tsv.
 
     In this order: ``participants.tsv``, ``sessions.tsv`` of the participants, ``phenotype/*.tsv``,
     and the user's own tables. A later table fills or replaces columns of the same name. Columns
@@ -56,34 +63,100 @@ def read_covariates(visits: pd.DataFrame, bids_dir: Path, extra: Sequence[Path])
     """
     joined = visits.copy()
     main = bids_dir / "participants.tsv"
-    tables = [main] if main.is_file() else []
+    tables = [main] if main.exists() else []
     described: dict[str, object] = {}
+    spelled: Spellings = Counter()
+    absent: frozenset[str] = frozenset()
     if not bids_dir.is_dir():
         raise InputError(f"{bids_dir}: no such folder; check its name")
     for path in (*tables, *sorted((bids_dir / "phenotype").glob("*.tsv")), *extra):
-        table = _read(path)
+        table, sidecar = _read(path), _sidecar(path.with_suffix(".json"))
         if path == main:
             _check_known(joined, table, path)
-        joined = _join(joined, table, path)
-        described |= _sidecar(path.with_suffix(".json"))
-        if path == main:
-            joined = _join_sessions(joined, bids_dir)
-            described |= _sidecar(bids_dir / "sessions.json")
+            absent = frozenset(joined[PARTICIPANT]) - frozenset(table[PARTICIPANT])
+        table = table[table[PARTICIPANT].isin(joined[PARTICIPANT])]
+        joined = _join(joined, mark_missing(table, sidecar, spelled), path)
+        described |= sidecar
+        if path == main and (parts := _read_sessions(joined, bids_dir)):
+            sidecar = _sidecar(bids_dir / "sessions.json")
+            table = mark_missing(pd.concat(parts, ignore_index=True), sidecar, spelled)
+            joined = _join(joined, table, bids_dir / "sub-*_sessions.tsv")
+            described |= sidecar
     for column in described.keys() & set(joined.columns):
         joined[column] = _with_levels(joined[column], described[column])
-    return joined
+    for column in joined.columns.difference([PARTICIPANT, SESSION]):
+        if joined[column].dtype == object:
+            joined[column] = _without_codes(joined[column], settings.design.missing_codes, spelled)
+    folded = joined.columns.str.casefold()
+    pair = joined.columns[folded.duplicated(keep=False) & folded.isin(_known_columns(settings))]
+    if len(pair):
+        raise InputError(f"columns {' and '.join(pair)} differ in capitals only; keep one")
+    return joined, absent, spelled
+
+
+def mark_missing(
+    table: pd.DataFrame, described: Mapping[str, object], spelled: Spellings
+) -> pd.DataFrame:
+    """Mark cells that spell a missing value, and count the spellings by column.
+
+    A level that a sidecar lists is not missing, unless it says that it is (``"9": "unknown"``).
+    """
+    marked = table.copy()
+    for name in table.columns:
+        levels = _levels(described.get(name))
+        words = [cell for cell in table[name].unique() if isinstance(cell, str)]
+        is_cell_missing = table[name].isin([word for word in words if _is_missing(word, levels)])
+        cells = table.loc[is_cell_missing, name]
+        spelled.update((str(name), cell) for cell in cells if cell.strip() not in {"", MISSING})
+        if len(cells):
+            marked[name] = table[name].where(~is_cell_missing, None)
+    return marked
+
+
+def _is_missing(cell: str, levels: Mapping[str, str]) -> bool:
+    meaning = levels.get(level_name(cell))
+    if meaning is None or cell == MISSING:
+        return is_missing(cell)
+    # Shorter words, as none, say nothing of whether the level is known.
+    return len(meaning) >= _SHORTEST_MEANING and is_missing(meaning)
+
+
+def _without_codes(values: pd.Series, codes: Sequence[float], spelled: Spellings) -> pd.Series:
+    """Mark codes of missing values, as -9999, where they are out of the range of all others."""
+    numbers = pd.to_numeric(values, errors="coerce")
+    is_code = numbers.isin([code for code in codes if code < 0])
+    remaining = numbers[~is_code & numbers.between(-1e100, 1e100)]  # larger ones are refused
+    low, high = (remaining.min(), remaining.max()) if len(remaining) else (0.0, 0.0)
+    # A positive code may be a value; it is refused later.
+    is_far = is_code & ((low >= 0) | (np.maximum(low - numbers, numbers - high) > high - low))
+    spelled.update((str(values.name), str(cell)) for cell in values[is_far])
+    return values.where(~is_far, None)
+
+
+def spelled_note(spelled: Spellings, formula: str, settings: GroupSettings) -> str:
+    """Note what was read as missing, first in columns that a model is likely to have."""
+    names = _known_columns(settings)
+    keys = sorted(
+        spelled, key=lambda key: (key[0].casefold() not in names and key[0] not in formula, key)
+    )
+    cells = listed(f"{name} {cell!r} ({spelled[name, cell]})" for name, cell in keys)
+    return f"read as missing: {cells}; if one is a level, list it in Levels of the table's sidecar"
+
+
+def _known_columns(settings: GroupSettings) -> set[str]:
+    """Return the names, without capitals, of columns that are looked for in any case."""
+    rules, factors = settings.model, settings.design.factors
+    names = (*factors, *rules.group_columns, *rules.covariates, *rules.icv_columns)
+    return {name.casefold() for name in names}
 
 
 def _sidecar(path: Path) -> dict[str, object]:
-    return dict(files.read_json(path)) if path.is_file() else {}
+    return dict(files.read_json(path)) if path.exists() else {}
 
 
 def _with_levels(values: pd.Series, description: object) -> pd.Series:
     """Make a factor of a column all of whose values are ``Levels`` of its description."""
-    listed = description.get("Levels") if isinstance(description, Mapping) else None
-    if not isinstance(listed, Mapping):
-        return values
-    levels = {level_name(code): meaning for code, meaning in listed.items()}
+    levels = _levels(description)
     factor = as_factor(values)
     present = [str(code) for code in factor.cat.categories]
     if not present or not set(present) <= set(levels):
@@ -95,12 +168,21 @@ def _with_levels(values: pd.Series, description: object) -> pd.Series:
     return factor
 
 
-def _level_word(meaning: object) -> str:
+def _levels(description: object) -> dict[str, str]:
+    """Return what a description of a column says of each of its ``Levels``."""
+    levels = description.get("Levels") if isinstance(description, Mapping) else None
+    meanings = {}
+    for code, meaning in levels.items() if isinstance(levels, Mapping) else ():
+        text = meaning
+        if isinstance(meaning, Mapping):
+            text = meaning.get("LongName") or meaning.get("Description")
+        meanings[level_name(code)] = " ".join(str(text or "").split())
+    return meanings
+
+
+def _level_word(meaning: str) -> str:
     """Name a level by what its description says, if that is short and may stand in a contrast."""
-    if isinstance(meaning, Mapping):
-        meaning = meaning.get("LongName") or meaning.get("Description")
-    word = " ".join(str(meaning or "").split())
-    return word if len(word) <= _LONGEST_NAME and not set(word) & set("[]=,") else ""
+    return meaning if len(meaning) <= _LONGEST_NAME and not set(meaning) & set("[]=,") else ""
 
 
 def _check_known(visits: pd.DataFrame, table: pd.DataFrame, path: Path) -> None:
@@ -129,27 +211,26 @@ def _read(path: Path) -> pd.DataFrame:
 
 
 def _cleaned(table: pd.DataFrame) -> pd.DataFrame:
-    """Take off blanks round cells, add prefixes that labels lack, and mark missing cells."""
+    """Take off blanks round cells, and add prefixes that labels lack."""
     table = table.map(str.strip)
     for column, prefix in ((PARTICIPANT, "sub-"), (SESSION, "ses-")):
         if column in table.columns:
-            has_prefix = (table[column] == files.MISSING) | table[column].str.startswith(prefix)
-            table[column] = table[column].where(has_prefix, prefix + table[column])
-    return table.where(table != files.MISSING, None)
+            labels = table[column].where(~table[column].map(is_missing), None)
+            has_prefix = labels.isna() | labels.str.startswith(prefix).fillna(value=True)
+            table[column] = labels.where(has_prefix, prefix + labels)
+    return table
 
 
-def _join_sessions(joined: pd.DataFrame, bids_dir: Path) -> pd.DataFrame:
+def _read_sessions(joined: pd.DataFrame, bids_dir: Path) -> list[pd.DataFrame]:
     parts = []
     for participant in joined.loc[joined[SESSION].notna(), PARTICIPANT].unique():
         path = bids_dir / participant / f"{participant}_sessions.tsv"
-        if path.is_file():
+        if path.exists():
             part = pd.DataFrame(files.read_tsv(path), dtype=object)
             if SESSION not in part.columns:
                 raise InputError(f"{path}: has no column session_id", reason="bad-table")
             parts.append(_cleaned(part).assign(**{PARTICIPANT: participant}))
-    if not parts:
-        return joined
-    return _join(joined, pd.concat(parts, ignore_index=True), bids_dir / "sub-*_sessions.tsv")
+    return parts
 
 
 def _join(joined: pd.DataFrame, table: pd.DataFrame, path: Path) -> pd.DataFrame:
@@ -157,15 +238,10 @@ def _join(joined: pd.DataFrame, table: pd.DataFrame, path: Path) -> pd.DataFrame
     by_session = SESSION in table.columns and bool(table[SESSION].notna().any())
     keys = [PARTICIPANT, SESSION] if by_session else [PARTICIPANT]
     table = table.drop(columns=[SESSION]) if SESSION in table and not by_session else table
-    table = table[table[PARTICIPANT].isin(joined[PARTICIPANT])]
     repeated = table.loc[table.duplicated(keys), keys].astype(str).agg(" ".join, axis=1)
     if len(repeated):
-        names = sorted(set(repeated))
-        ending = f" and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
-        raise InputError(
-            f"{path}: {', '.join(names[:_MOST_NAMES])}{ending} occur more than once; keep one row"
-            " each"
-        )
+        names = listed(sorted(set(repeated)))
+        raise InputError(f"{path}: {names} occur more than once; keep one row each")
     indexed = table.set_index(keys)
     rows = pd.MultiIndex.from_frame(joined[keys]) if by_session else joined[PARTICIPANT]
     aligned = indexed.reindex(rows)
@@ -214,16 +290,23 @@ def read_icv(sources: Sequence[str], roots: Sequence[Path]) -> list[float | None
 
 def _icv_beside(path: Path) -> float | None:
     stats = path.parent.parent / "stats" / "aseg.stats"
-    if stats.is_file():
-        for line in read_bounded(stats, SETTINGS).decode(errors="replace").splitlines():
+    if stats.exists():
+        for line in _read_text(stats).splitlines():
             if line.startswith("# Measure EstimatedTotalIntraCranialVol,"):
                 return _number(line.split(",")[-2])
     for folder in (path.parent, path.parent.parent, path.parent.parent / "final"):
         for found in sorted(folder.glob("*icv.txt")):
-            words = read_bounded(found, SETTINGS).decode(errors="replace").split()
+            words = _read_text(found).split()
             if words:  # subject and volume, or the volume alone
                 return _number(words[-1])
     return None
+
+
+def _read_text(path: Path) -> str:
+    try:
+        return read_bounded(path, SETTINGS).decode(errors="replace")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error}); restore or delete it") from error
 
 
 def _number(text: str) -> float | None:

@@ -10,6 +10,7 @@ from typing import Any
 
 from hipsta_bids.derivatives.names import HemisphereName
 from hipsta_bids.errors import InputError, UsageError
+from hipsta_bids.group.design.formula import listed
 from hipsta_bids.io import files
 from hipsta_bids.reports.verdict import RATINGS
 
@@ -73,12 +74,14 @@ class UserTable:
                 old.append(name.stem)
         unmatched = [row["participant_id"] for row in self.rows if id(row) not in matched]
         notes = (
-            [f"{self.path}: matches no hemisphere here: {_some(unmatched)}"] if unmatched else []
+            [f"{self.path}: matches no hemisphere here: {listed(unmatched, SHOWN)}"]
+            if unmatched
+            else []
         )
         if old:
             notes.append(
                 f"{self.path}: not applied to hemispheres whose labels have changed since they were"
-                f" rated: {_some(old)}; rate them again"
+                f" rated: {listed(old, SHOWN)}; rate them again"
             )
         return notes
 
@@ -134,7 +137,7 @@ def _read(path: Path, needed: Sequence[str]) -> list[dict[str, str]]:
         )
     for line, row in enumerate(rows, start=2):
         word = row.get(_RATING, files.MISSING)
-        if word not in {*RATINGS, files.MISSING, ""}:
+        if word not in RATINGS and not files.is_missing(word):
             raise InputError(
                 f"{path}: line {line}: {word!r} is no rating; {', '.join(RATINGS)} are",
                 reason="bad-table",
@@ -142,18 +145,14 @@ def _read(path: Path, needed: Sequence[str]) -> list[dict[str, str]]:
     return rows
 
 
-def _some(names: Sequence[str]) -> str:
-    ending = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
-    return f"{', '.join(names[:SHOWN])}{ending}"
-
-
 def _note(row: Mapping[str, str], default: str) -> str:
     note = row.get("note", files.MISSING)
-    return default if note in {files.MISSING, ""} else note
+    return default if files.is_missing(note) else note
 
 
 def _is_current(row: Mapping[str, str], digest: str | None) -> bool:
-    return digest is None or row.get(_HASH, files.MISSING) in {files.MISSING, "", digest}
+    rated = row.get(_HASH, files.MISSING)
+    return digest in {None, rated} or files.is_missing(rated)
 
 
 def is_listed(name: HemisphereName, row: Mapping[str, str]) -> bool:
@@ -164,8 +163,9 @@ def is_listed(name: HemisphereName, row: Mapping[str, str]) -> bool:
     keys = {"participant_id": name.subject, "session_id": name.session or "", "hemi": name.hemi}
     keys |= {"protocol": name.seg, "region": name.region} if name.seg else {}
     for key, value in keys.items():
-        cell = row.get(key, files.MISSING).removeprefix("sub-").removeprefix("ses-")
-        if cell not in {files.MISSING, "", value}:
+        cell = row.get(key, files.MISSING)
+        label = cell.removeprefix("sub-").removeprefix("ses-")
+        if label != value and not files.is_missing(cell):
             return False
     return True
 

@@ -402,7 +402,7 @@ def _entries(path: Path, text: str) -> Iterator[tuple[str, str, float]]:
 
 
 def _volume(text: str) -> float:
-    if text in {files.MISSING, "nan", "NaN"}:
+    if files.is_missing(text):
         return float("nan")
     value = float(text)
     if not 0 <= value < _LARGEST_VOLUME:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.design.grammar import CONTEXT, closed_formula
 from hipsta_bids.group.design.settings import DefaultModelSettings, DesignSettings
+from hipsta_bids.io.files import MISSING
 from hipsta_bids.types import Float, Int64
 
 #: A column with text is taken for a damaged number if more of it than this is numbers.
@@ -32,8 +33,6 @@ _TERM = re.compile(
 #: Outside of brackets, where it belongs to a level such as ``group[>=24]``.
 _EQUALS = re.compile(r"=(?![^\[]*\])")
 
-#: Texts that mean a missing value, besides what pandas takes for one.
-_MISSING = ("n/a", "NA", "N/A", "nan", "NaN", "")
 #: Numbers from here on overflow when they are squared and summed.
 _LARGEST = 1e100
 #: Name of the constant.
@@ -244,10 +243,15 @@ def _refusal(problem: str) -> ModelError:
 
 def file_label(text: str) -> str:
     """Write a name in ASCII letters and digits, as BIDS has it; other scripts as ``u5973``."""
-    letters = unicodedata.normalize("NFKD", text.replace("+", " plus "))
-    plain = "".join(c if c.isascii() else f"u{ord(c):x}" * c.isalpha() for c in letters)
-    words = "".join(c if c.isalnum() else " " for c in plain).split()
+    words = ascii_letters(text.replace("+", " plus ")).split()
     return "".join(word[:1].upper() + word[1:] for word in words)
+
+
+def ascii_letters(text: str, filler: str = " ") -> str:
+    """Write a text in ASCII letters and digits, other scripts as ``u5973``; signs are filled."""
+    letters = unicodedata.normalize("NFKD", text)
+    plain = "".join(c if c.isascii() else f"u{ord(c):x}" * c.isalpha() for c in letters)
+    return re.sub(r"[^A-Za-z0-9]", filler, plain)
 
 
 def check_names(names: Iterable[str], columns: pd.Index) -> None:
@@ -281,7 +285,7 @@ def as_factor(values: pd.Series) -> pd.Series:
         return values.map({True: "yes", False: "no"}).astype("category")
     text = values.astype(object).where(values.notna(), None)
     text = text.map(lambda value: None if value is None else level_name(value))
-    return text.where(~text.isin(_MISSING), None).astype("category")
+    return text.astype("category")
 
 
 def level_name(value: object) -> str:
@@ -302,7 +306,7 @@ def typed(values: pd.Series) -> pd.Series:
         return numbers.where(np.isfinite(numbers))
     text = values.astype(object).where(values.notna(), None)
     text = text.map(lambda value: None if value is None else str(value).strip())
-    text = text.where(~text.isin(_MISSING), None)
+    text = text.where(~text.isin([MISSING, ""]), None)
     present = text.notna()
     numbers = pd.to_numeric(text, errors="coerce").astype(np.float64)
     if present.any() and numbers[present].notna().all():
@@ -316,7 +320,7 @@ def typed(values: pd.Series) -> pd.Series:
     if numbers[present].notna().mean() > NUMERIC_SHARE:
         bad = present & numbers.isna()
         raise ModelError(
-            f"model: column {values.name!r} holds numbers but for rows {_cells(text[bad])};"
+            f"model: column {values.name!r} holds numbers but for rows {cells(text[bad])};"
             " correct them, or mark them n/a"
         )
     _refuse_spellings(text[present])
@@ -372,7 +376,7 @@ def _refuse_spellings(text: pd.Series) -> None:
     ):
         if len(text) and written.mean() > NUMERIC_SHARE:
             raise ModelError(
-                f"model: column {text.name!r} holds {problem}, as {_cells(text[written][:1])};"
+                f"model: column {text.name!r} holds {problem}, as {cells(text[written][:1])};"
                 f" {remedy}"
             )
 
@@ -388,7 +392,7 @@ def check_numbers(values: pd.Series, settings: DesignSettings) -> None:
         far = codes & (gap > high - low)
         if far.any():
             raise ModelError(
-                f"model: column {values.name!r} has {_cells(present[far])} where all other values"
+                f"model: column {values.name!r} has {cells(present[far])} where all other values"
                 f" are {low:g} to {high:g}: a code for missing values? mark them n/a (or change the"
                 " setting design.missing_codes)"
             )
@@ -399,12 +403,12 @@ def check_numbers(values: pd.Series, settings: DesignSettings) -> None:
     far = (present - quartiles[1]).abs() > reach
     if reach > 0 and far.any():
         raise ModelError(
-            f"model: column {values.name!r} has {_cells(present[far])} where half of the other"
+            f"model: column {values.name!r} has {cells(present[far])} where half of the other"
             f" values are {quartiles[0]:.4g} to {quartiles[2]:.4g}; correct them, or mark them n/a"
         )
 
 
-def _cells(values: pd.Series) -> str:
+def cells(values: pd.Series) -> str:
     """List rows with what stands in them."""
     texts = [f"{value:g}" if isinstance(value, float) else repr(value) for value in values]
     return listed(f"{row} ({cell})" for row, cell in zip(values.index, texts, strict=True))
@@ -526,8 +530,8 @@ def in_order(level: str) -> tuple[float, str]:
         return np.inf, level
 
 
-def listed(items: Iterable[object]) -> str:
+def listed(items: Iterable[object], limit: int = _NAMED) -> str:
     """Join names for a message, not too many."""
     texts = [str(item) for item in items]
-    ending = f" and {len(texts) - _NAMED} more" if len(texts) > _NAMED else ""
-    return ", ".join(texts[:_NAMED]) + ending
+    ending = f" and {len(texts) - limit} more" if len(texts) > limit else ""
+    return ", ".join(texts[:limit]) + ending

@@ -8,12 +8,14 @@ arithmetic and plain options. formulaic gets what these parts are put together t
 import ast
 import keyword
 import re
+from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import NoReturn
 
 import numpy as np
+from formulaic.parser.types import Term
 
 from hipsta_bids.errors import UsageError
 
@@ -36,13 +38,17 @@ _TOKEN = re.compile(
     r"|(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)|(?P<name>[^\W\d]\w*)"
     r"|(?P<sign>\*\*|[-+*/:(),=\[\].]))"
 )
-_OPERATORS = frozenset({"+", "-", "*", "/", ":", "**"})
+#: Operators, the closer they bind the larger.
+_OPERATORS = {"+": 1, "-": 1, "*": 2, "/": 2, ":": 3, "**": 4}
+_PLAIN = re.compile(rf"(?!(?:{'|'.join(keyword.kwlist)})$)[^\W\d]\w*")  # needs no backticks
 _PLACEHOLDER = "quoted_column_"
 
 _LONGEST = 2000  # characters
 _DEEPEST = 20  # parentheses within parentheses
 _HIGHEST_POWER = 9  # of a sum of terms
 _MOST_COLUMNS = 50  # of a spline or polynomial
+_WIDE = frozenset({"bs", "cr", "poly"})  # functions that make several columns
+_MOST_PRODUCTS = 1000  # columns of numbers that operators would make, repeated ones included
 
 
 #: Kind and text.
@@ -59,13 +65,17 @@ class ClosedFormula:
     """Columns that it needs, without backticks, in the order of their first use."""
     factors: frozenset[str] = frozenset()
     """Those of them that stand in ``C`` only."""
+    numbers: frozenset[str] = frozenset()
+    """Those of them that stand in other functions, which take numbers."""
 
 
 def closed_formula(text: str) -> ClosedFormula:
     """Check the right-hand side of a formula; UsageError names what is not allowed, and what is."""
     names: dict[str, None] = {}
     plain: set[str] = set()
+    numbers: set[str] = set()
     parts: list[str] = []
+    sizes: deque[str] = deque()
     tokens = _tokens(text)
     position, after_operand = 0, False
     while position < len(tokens):
@@ -79,7 +89,7 @@ def closed_formula(text: str) -> ClosedFormula:
             end = _call_end(tokens, position)
             inside = _check_call(text, tokens[position:end])
             names |= dict.fromkeys(inside)
-            plain |= set(inside) if word != "C" else set()
+            numbers |= set(inside) if word != "C" else set()
         elif kind == "number":
             is_power = position > 0 and tokens[position - 1][1] == "**"
             powers = [str(power) for power in range(1, _HIGHEST_POWER + 1)]
@@ -88,12 +98,60 @@ def closed_formula(text: str) -> ClosedFormula:
         elif kind in {"name", "quoted"}:
             names[_column(text, word)] = None
             plain.add(_column(text, word))
-        elif word not in _OPERATORS | {"(", ")"}:
+        elif word not in {*_OPERATORS, "(", ")"}:
             _refuse(text, word)
         after_operand = is_operand or word == ")"
+        is_column = is_operand and kind != "number"
+        sizes.append(_columns_of_call(tokens[position:end]) if is_column else word)
         parts.append("".join(part for _, part in tokens[position:end]))
         position = end
-    return ClosedFormula(" ".join(parts), tuple(names), frozenset(names) - plain)
+    if _products(sizes) > _MOST_PRODUCTS:
+        raise UsageError(
+            f"formula {_shortened(text)!r}: its operators make more than {_MOST_PRODUCTS} products;"
+            " write fewer * and lower powers"
+        )
+    factors = frozenset(names) - plain - numbers
+    return ClosedFormula(" ".join(parts), tuple(names), factors, frozenset(numbers))
+
+
+def _columns_of_call(tokens: Sequence[_Token]) -> str:
+    """Return how many columns a name makes, or a call: the largest whole number of its options."""
+    words = [word for _, word in tokens]
+    options = words[words.index(",") :] if "," in words and _WIDE & set(words) else []
+    return max(["1", *filter(str.isdecimal, options)], key=int)
+
+
+def _products(parts: deque[str], binding: int = 1) -> int:
+    """Count products that a formula is expanded to, before equal ones are joined, up to a limit.
+
+    ``parts`` are consumed up to an operator that binds less. They are numbers of columns in place
+    of operands. A formula without sense gets any count, as formulaic refuses it.
+    """
+    while parts and parts[0] in _OPERATORS:  # signs
+        parts.popleft()
+    if not parts or parts[0] == ")":
+        return 1
+    if (first := parts.popleft()) == "(":
+        size = _products(parts)
+        parts.popleft()
+    else:
+        size = int(first)
+    while parts and _OPERATORS.get(parts[0], 0) >= binding:
+        sign = parts.popleft()
+        right = _products(parts, _OPERATORS[sign] + 1)
+        sizes = {"*": size + right + size * right, ":": size * right, "**": size**right}
+        size = min(sizes.get(sign, size + right), _MOST_PRODUCTS + 1)
+    return size
+
+
+def term_text(term: Term) -> str:
+    """Write a term as a formula has it; formulaic takes the backticks off."""
+    return ":".join(
+        f"`{factor.expr}`"
+        if factor.eval_method.value == "lookup" and not _PLAIN.fullmatch(factor.expr)
+        else factor.expr
+        for factor in term.factors
+    )
 
 
 def _refuse(text: str, part: str) -> NoReturn:

@@ -1,6 +1,8 @@
 """Which model is fitted, the user's or the paper's default, and its design matrix."""
 
 import difflib
+import itertools
+import math
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -15,7 +17,7 @@ from scipy.linalg import null_space
 
 from hipsta_bids.errors import ModelError, UsageError
 from hipsta_bids.group.design import formula as formulas
-from hipsta_bids.group.design.grammar import CONTEXT, closed_formula
+from hipsta_bids.group.design.grammar import CONTEXT, closed_formula, term_text
 from hipsta_bids.group.design.settings import DefaultModelSettings, DesignSettings, GroupSettings
 from hipsta_bids.io import files
 from hipsta_bids.types import PARTICIPANT, SESSION, Float, Int64
@@ -32,6 +34,10 @@ _HEADS = DefaultModelSettings.model_fields["icv_columns"].default
 _OLDEST = 130.0  # years
 #: A line is in the span of columns if it is off by less, in standard deviations.
 _EXACT = 1e-6
+#: Head volumes differ by less, in one unit.
+_UNITS = 50.0
+#: A note names covariates that correlate by more, and columns for which there are fewer people.
+_NEARLY_SAME, _PEOPLE_PER_COLUMN = 0.99, 10
 #: Both sides of a participant, in names of hemispheres.
 BOTH = "LR"
 
@@ -289,8 +295,8 @@ def folder_name(formula: str, measures: tuple[str, ...] = ()) -> str:
     """Spell measures and a formula as the name of a folder; products must not look like sums."""
     right = formula.rpartition("~")[2].replace("*", " x ").replace(":", " by ")
     right = right.replace(" - ", " without ")
-    words = "".join(c if c.isalnum() else " " for c in right).split()
-    return "_".join(part for part in ("-".join(measures), "-".join(words) or "model") if part)
+    words = "-".join(formulas.ascii_letters(right).split()) or "model"
+    return "_".join(part for part in ("-".join(measures), words) if part)
 
 
 @dataclass(frozen=True)
@@ -343,6 +349,15 @@ def build_design(
     levels_used = formulas.set_levels(variables, references, settings)
     for name in map(str, numeric.columns):
         _check_possible(numeric[name], name.casefold())
+    if words := sorted(closed.numbers & set(levels_used)):
+        raise ModelError(
+            f"formula {model.formula!r}: functions take numbers, but {formulas.listed(words)} holds"
+            " names; write it without a function"
+        )
+    products = [closed_formula(term_text(term)).names for term in formula]
+    sizes = {name: len(levels) - 1 for name, levels in levels_used.items()}
+    least = sum(math.prod(sizes.get(name, 1) for name in names) for names in products)
+    _refuse_more_columns(least, len(variables), settings)
     try:
         with np.errstate(invalid="ignore", divide="ignore"):  # rows without a value are told below
             model_matrix = formula.get_model_matrix(
@@ -355,6 +370,8 @@ def build_design(
     terms = _Terms(model_matrix, variables, levels_used)
     matrix, columns = terms.matrix, terms.columns
     _check_matrix(matrix, columns, variables.index, settings)
+    people = table.loc[complete, PARTICIPANT].nunique() if PARTICIPANT in table else len(matrix)
+    doubts = _doubts(numeric, len(set(columns) - {formulas.INTERCEPT}), people)
     specs = model.contrasts
     if model.dummy is not None:
         specs += tuple(
@@ -369,7 +386,7 @@ def build_design(
         dropped=dropped,
         references={name: levels[0] for name, levels in levels_used.items()},
         contrasts=tuple(terms.contrast(spec) for spec in specs),
-        notes={name: note for name, note in notes.items() if note},
+        notes={name: note for name, note in notes.items() if note} | doubts,
         levels=levels_used,
     )
 
@@ -402,7 +419,7 @@ class _Terms:
         columns = [
             column
             for structure in self.spec.structure
-            if closed_formula(str(structure.term)).names == (variable,)
+            if closed_formula(term_text(structure.term)).names == (variable,)
             for column in structure.columns
         ]
         places = [i for i, column in enumerate(self.columns) if column in columns]
@@ -455,6 +472,24 @@ class _Terms:
         return None, ""
 
 
+def _doubts(numeric: pd.DataFrame, n_columns: int, n_people: int) -> dict[str, str]:
+    """Note covariates that are nearly the same, and more columns than participants can bear."""
+    notes = {}
+    for a, b in itertools.combinations(map(str, numeric.columns), 2):
+        r = numeric[a].corr(numeric[b])
+        if abs(r) > _NEARLY_SAME:
+            notes[f"{a}, {b}"] = (
+                f"{a} and {b} are nearly the same (r = {r:.4f}); keep one of them, as their effects"
+                " cannot be told apart"
+            )
+    if n_columns * _PEOPLE_PER_COLUMN > n_people:
+        notes["columns"] = (
+            f"the model has {n_columns} columns for {n_people} participants; use one per"
+            f" {_PEOPLE_PER_COLUMN} at most, as estimates are uncertain"
+        )
+    return notes
+
+
 def _check_possible(values: pd.Series, name: str) -> None:
     """Refuse ages, and volumes of heads, that nobody has."""
     if name not in {*_AGES, *_HEADS}:
@@ -471,6 +506,18 @@ def _check_possible(values: pd.Series, name: str) -> None:
             f"model: column {values.name!r} has {rows_text}, which nobody has; correct them, or"
             " mark them n/a"
         )
+    if name in _AGES or first <= 0:
+        return
+    ordered = values.sort_values()
+    ratios = ordered.to_numpy()[1:] / ordered.to_numpy()[:-1]
+    split = int(np.argmax(ratios)) + 1
+    if ratios[split - 1] > _UNITS:
+        parts = ordered.iloc[:split], ordered.iloc[split:]
+        raise ModelError(
+            f"model: column {values.name!r} has {len(parts[0])} values up to {parts[0].iloc[-1]:g}"
+            f" and {len(parts[1])} from {parts[1].iloc[0]:g}: cm^3 and mm^3? write all in one unit;"
+            f" fewer are {formulas.cells(min(parts, key=len))}"
+        )
 
 
 def _check_matrix(
@@ -482,27 +529,32 @@ def _check_matrix(
             f"model: the formula has no value for rows {formulas.listed(rows.take(bad))}; a"
             " logarithm of zero or less?"
         )
-    if len(matrix) - len(columns) < settings.min_residual_df:
-        raise ModelError(
-            f"model: {len(matrix)} complete rows are too few for {len(columns)} columns; at least"
-            f" {len(columns) + settings.min_residual_df} are needed"
-        )
+    _refuse_more_columns(len(columns), len(matrix), settings)
     lengths = np.linalg.norm(matrix, axis=0)
     if (lengths == 0).any():
         raise ModelError(
             f"model: no row has {columns[int(np.argmin(lengths))]!r}; leave it out of the formula"
         )
     unit = matrix / lengths
-    for last in range(1, len(columns)):
-        before = unit[:, :last]
-        weights = np.linalg.lstsq(before, unit[:, last], rcond=None)[0]
-        remainder = float(np.linalg.norm(unit[:, last] - before @ weights))
-        if remainder < DEPENDENCE:
-            involved = [columns[i] for i in np.flatnonzero(np.abs(weights) > DEPENDENCE)]
-            raise ModelError(
-                f"model: column {columns[last]!r} is a combination of {formulas.listed(involved)};"
-                " leave one of them out"
-            )
+    # What is left of each unit column beside those before it.
+    remainders = np.abs(np.diag(np.linalg.qr(unit, mode="r")))
+    if (remainders < DEPENDENCE).any():
+        last = int(np.argmax(remainders < DEPENDENCE))
+        weights = np.linalg.lstsq(unit[:, :last], unit[:, last], rcond=None)[0]
+        involved = [columns[i] for i in np.flatnonzero(np.abs(weights) > DEPENDENCE)]
+        raise ModelError(
+            f"model: column {columns[last]!r} is a combination of {formulas.listed(involved)};"
+            " leave one of them out"
+        )
+
+
+def _refuse_more_columns(n_columns: int, n_rows: int, settings: DesignSettings) -> None:
+    """Refuse more columns than the rows can tell apart."""
+    if n_rows - n_columns < settings.min_residual_df:
+        raise ModelError(
+            f"model: {n_rows} complete rows are too few for {n_columns} columns; at least"
+            f" {n_columns + settings.min_residual_df} are needed"
+        )
 
 
 def asymmetry_name(measure: str) -> str:

@@ -79,8 +79,9 @@ class DesignSettings(toml.SettingsTable):
         *(-9.0, -99.0, -999.0, -9999.0, -99999.0),
         *(99.0, 999.0, 9999.0, 99999.0, 777.0, 7777.0, 888.0, 8888.0),
     )
-    """Numbers that often stand for missing ones; refused where they are farther from all other
-    values than these are from each other."""
+    """Numbers that often stand for missing ones. Negative ones are missing out of the range of all
+    other values; positive ones, which are farther from these than they from each other, are
+    refused."""
     farthest: PositiveFloat = 1e4
     """Numbers farther than this from the median, in ranges between quartiles, are refused."""
     mixed: Annotated[tuple[Provenance, ...], Strict(strict=False)] = ()

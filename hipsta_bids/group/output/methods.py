@@ -1,5 +1,6 @@
 """A methods and results paragraph with the numbers of one analysis filled in."""
 
+import re
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -41,6 +42,20 @@ PROCEDURES: Mapping[str, str] = {
     "bh": "the procedure of Benjamini and Hochberg",
     "fdr2": "the two-stage procedure of Benjamini, Krieger and Yekutieli",
 }
+
+
+#: Signs in a name that Markdown, or the HTML in it, would take for its own.
+_SIGNS = re.compile(r"([\\`*~<$]|\](?=\()|&(?=#?\w+;)|(?<!\w)_|_(?!\w))")
+
+
+def escaped(text: object) -> str:
+    """Escape a name, or a text with names, that Markdown should show as it is."""
+    return _SIGNS.sub(r"\\\1", " ".join(str(text).split()))
+
+
+def code(formula: str) -> str:
+    """Write a formula as Markdown's code; it may have backticks."""
+    return f"`` {formula} ``" if "`" in formula else f"`{formula}`"
 
 
 class Citations:
@@ -108,7 +123,8 @@ def methods_text(
     if analysis.found:
         paragraphs.append(_findings(analysis))
     if analysis.skipped:
-        paragraphs.append("\n".join(["Left out:", "", *(f"- {one}" for one in analysis.skipped)]))
+        points = (f"- {escaped(line)}" for line in analysis.skipped)
+        paragraphs.append("\n".join(["Left out:", "", *points]))
     return cite.page(paragraphs, region)
 
 
@@ -129,7 +145,7 @@ def _sample(
     if analysis.groups is not None:
         members = table[analysis.groups.column][~table[PARTICIPANT].duplicated()]
         counts = Counter(members.dropna().astype(str))
-        text += f" ({', '.join(f'{counts[g]} {g}' for g in analysis.groups.levels)})"
+        text += f" ({', '.join(f'{counts[g]} {escaped(g)}' for g in analysis.groups.levels)})"
     if sheets := ", ".join(f"{len(one.used)} {hemi}" for hemi, one in analysis.fitted.items()):
         text += f", with hemispheres {sheets}"
     return f"{text}. {n_out} hemispheres or visits were left out; the table of exclusions says why."
@@ -189,13 +205,14 @@ def _harmonization(analysis: Analysis, cite: Callable[[str], str]) -> list[str]:
     if harmonization is None:
         return []
     plan = harmonization.plan
-    counts = ", ".join(f"{site} {n}" for site, n in plan.counts.items())
+    counts = ", ".join(f"{escaped(site)} {n}" for site, n in plan.counts.items())
+    column = escaped(plan.column)
     sources = f"{cite('johnson')}, {cite('combat')}"
-    preserved = f"`{plan.formula}`" if plan.names else "no variable"
+    preserved = code(plan.formula) if plan.names else "no variable"
     if plan.icv is not None:
-        preserved += f", for volumes also {plan.icv}"
+        preserved += f", for volumes also {escaped(plan.icv)}"
     text = (
-        f"Effects of {plan.column} ({counts} participants) were taken out of"
+        f"Effects of {column} ({counts} participants) were taken out of"
         f"{' the registered' if analysis.registered else ''} maps and summary measures by ComBat"
         f" {sources}: at each point, a shift and a scale of the residuals of a linear model that"
         f" keeps {preserved}. The two were pooled over the points of a map by empirical Bayes, and"
@@ -210,11 +227,12 @@ def _harmonization(analysis: Analysis, cite: Callable[[str], str]) -> list[str]:
     if plan.saved is not None:
         saved_sites = sum(site in plan.saved.sites for site in plan.counts)
         text += f" Parameters of {saved_sites} of these were those of an earlier analysis"
-        text += f"; those of {', '.join(plan.estimated)} were new." if plan.estimated else "."
+        new = escaped(", ".join(plan.estimated))
+        text += f"; those of {new} were new." if new else "."
     if plan.estimated and not analysis.comparison.pair:
         columns_lost = len(plan.counts) - 1
         text += (
-            f" As the shifts were estimated from the same participants, {plan.column} is also a"
+            f" As the shifts were estimated from the same participants, {column} is also a"
             f" factor of the model, which has {columns_lost}"
             f" degree{'s' if columns_lost > 1 else ''} of freedom less: without, tests would reject"
             f" too often {cite('nygaard')}."
@@ -230,8 +248,8 @@ def _harmonization(analysis: Analysis, cite: Callable[[str], str]) -> list[str]:
 def _models(
     analysis: Analysis, settings: group_settings.GroupSettings, cite: Callable[[str], str]
 ) -> str:
-    names = ", ".join(contrast.name for contrast in analysis.design.contrasts)
-    levels = ", ".join(f"{name} {level}" for name, level in analysis.design.references.items())
+    names = escaped(", ".join(contrast.name for contrast in analysis.design.contrasts))
+    levels = escaped(", ".join(map(" ".join, analysis.design.references.items())))
     errors = " with HC3 standard errors" if settings.glm.covariance == "hc3" else ""
     kind, subject, d = "linear model", "", "estimate over residual standard deviation"
     if analysis.comparison.pair:
@@ -250,7 +268,7 @@ def _models(
     adjusted = any(formula != analysis.model.formula for _, formula in analysis.measures)
     volumes = ", volumes also with intracranial volume" if adjusted else ""
     return (
-        f"At each point of the sheet a {kind} `{analysis.model.formula}` was"
+        f"At each point of the sheet a {kind} {code(analysis.model.formula)} was"
         f" fitted{subject}{errors} (reference levels: {levels or 'none'}); contrasts: {names}."
         f" {corrected} Effect sizes are"
         f" Cohen's d ({d}) or partial eta squared, with"
@@ -290,9 +308,9 @@ def _nonlinear(analysis: Analysis, settings: group_settings.GroupSettings) -> st
     ]
     result = control_fdr(np.concatenate(p or [np.empty(0)]), settings.multiplicity.alpha)
     return (
-        f" Age was in the model with {curve}; the contrast {names[0]} tests whether that differs"
-        f" from a line, as it did in {int(result.rejected.sum())} of {result.n_tests} tests of"
-        " summary measures (false discovery rate)."
+        f" Age was in the model with {curve}; the contrast {escaped(names[0])} tests whether that"
+        f" differs from a line, as it did in {int(result.rejected.sum())} of {result.n_tests} tests"
+        " of summary measures (false discovery rate)."
     )
 
 
@@ -307,7 +325,7 @@ def _correction(
                 f"the largest threshold-free cluster enhancement {cite('tfce')} (extent"
                 f" {TFCE_EXTENT:g}, height {TFCE_HEIGHT:g})"
             )
-        inside = f" within levels of {rules.blocks}" if rules.blocks else ""
+        inside = f" within levels of {escaped(rules.blocks)}" if rules.blocks else ""
         shuffled = (
             "the residuals of the model without the contrast (Freedman and Lane's; of signs, where"
             " a mean was tested"
@@ -321,7 +339,7 @@ def _correction(
             design = analysis.design
             blocks = row_blocks(analysis.row_model, analysis.compared.table, rules)
             visits = replace(visits, blocks=blocks)
-            end = exchange_text(design.matrix, design.contrasts, visits, rules.visits)
+            end = escaped(exchange_text(design.matrix, design.contrasts, visits, rules.visits))
         return (
             f"The family-wise error rate was held at {rules.alpha:g} by {statistic} in"
             f" {rules.permutations} permutations{inside} of {shuffled}; seed"
@@ -413,10 +431,10 @@ def norms_text(
             f" {levels}."
         )
     if new:
-        counts = ", ".join(f"{site} ({file.sites[site]})" for site in new)
+        counts = ", ".join(f"{escaped(site)} ({file.sites[site]})" for site in new)
         paragraphs.append(
             "Shift and scale of sites without norms were estimated from their controls"
-            f" {'='.join(controls or ())}: {counts}. All else was kept."
+            f" {escaped('='.join(controls or ()))}: {counts}. All else was kept."
         )
     return cite.page(paragraphs, file.region)
 
@@ -436,9 +454,10 @@ def _normative(
     formula: str, n_reference: int, group: str, settings: group_settings.GroupSettings, source: str
 ) -> str:
     return (
-        f"Each participant was scored against {n_reference} with {group}: w is the difference from"
-        f" what a linear model `{formula}` of these expects, over its residual standard deviation"
-        f" {source}. Members of the reference group were scored by the model without themselves."
+        f"Each participant was scored against {n_reference} with {escaped(group)}: w is the"
+        f" difference from what a linear model {code(formula)} of these expects, over its residual"
+        f" standard deviation {source}. Members of the reference group were scored by the model"
+        " without themselves."
         " Points count as low or high where the two-sided p, with the uncertainty of the model, is"
         " below"
         f" {1 - settings.glm.confidence:.2g}."
@@ -448,7 +467,7 @@ def _normative(
 def _classification(
     analysis: Analysis, settings: group_settings.GroupSettings, cite: Citations
 ) -> str:
-    rules = settings.classification
+    rules, base = settings.classification, escaped(" + ".join(settings.classification.base))
     delong, firth, snell = map(cite, ("delong", "firth", "snell"))
     separated = sum(one.columns["separated"] for *_, one in analysis.pairs)
     by_firth = (
@@ -457,7 +476,7 @@ def _classification(
         else f" No comparison was separated (else Firth's method {firth} is used)."
     )
     return (
-        f"Pairs of groups were told apart by logistic models of {' + '.join(rules.base)}, and of"
+        f"Pairs of groups were told apart by logistic models of {base}, and of"
         " the same with one measure added; a likelihood-ratio test compares the two, on the same"
         f" participants. Areas under the curve have DeLong intervals {delong}, and are also given"
         f" from {rules.folds}-fold stratified cross-validation repeated {rules.repeats} times (seed"
@@ -476,7 +495,7 @@ def _findings(analysis: Analysis) -> str:
         if discoveries.lenient:
             text += " - this cut-off is above the level, as happens with widespread effects"
         parts.append(text)
-    return "Points that survive: " + "; ".join(parts) + "."
+    return "Points that survive: " + escaped("; ".join(parts)) + "."
 
 
 Cite = Callable[[str], str]

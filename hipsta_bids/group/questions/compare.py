@@ -21,6 +21,7 @@ from hipsta_bids.group.questions.exchange import SUMMARY, summarize, write_summa
 from hipsta_bids.group.questions.mixing import with_mixes
 from hipsta_bids.io import files
 from hipsta_bids.progress import tell
+from hipsta_bids.types import PARTICIPANT
 
 
 def run_group(options: studies.GroupOptions, settings: GroupSettings) -> studies.GroupResult:
@@ -85,7 +86,9 @@ def _analyze(options: studies.GroupOptions, settings: GroupSettings) -> studies.
     discoveries |= {key: one.found for key, one in joint.items()}
     tested = tuple(joint.values())
     analysis = analyses[SHEET] = replace(analysis, found=discoveries)
-    exclusions = [*study.exclusions, *_incomplete(analysis)]
+    table = analysis.compared.table
+    incomplete = study.incomplete(analysis.design.dropped, table[PARTICIPANT])
+    exclusions = [*study.exclusions, *collect.exclude_visits(table, incomplete)]
     measures = designs.wanted_measures(options.model, options.measures)
     notes = [*study.notes, *_notes(study, analysis)]
     summary = _summary(study, analysis, notes)
@@ -203,15 +206,3 @@ def _record(analysis: Analysis, ratings: Mapping[str, int] | None) -> dict[str, 
         "ratings": ratings,
         "hemispheres": {hemi: len(one.used) for hemi, one in analysis.fitted.items()},
     }
-
-
-def _incomplete(analysis: Analysis) -> list[collect.Exclusion]:
-    """Visits that lack a variable of the model."""
-    table = analysis.compared.table
-    return [
-        one
-        for variable, visits in analysis.design.dropped.items()
-        for one in collect.exclude_visits(
-            table, dict.fromkeys(visits, ("incomplete", f"{variable} is missing"))
-        )
-    ]

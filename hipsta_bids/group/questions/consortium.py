@@ -16,7 +16,7 @@ from hipsta_bids.group.cohort.data import Cohort
 from hipsta_bids.group.design.settings import GroupSettings
 from hipsta_bids.group.output import write
 from hipsta_bids.group.output.figures import Drawing
-from hipsta_bids.group.output.methods import Citations, discovery_text
+from hipsta_bids.group.output.methods import Citations, code, discovery_text, escaped
 from hipsta_bids.group.output.panels import Row, contrasts, draw_pages
 from hipsta_bids.group.output.tables import META_COLUMNS
 from hipsta_bids.group.questions.exchange import SiteSummary, read_summary
@@ -199,7 +199,7 @@ def _methods(meta: Meta) -> str:
     counts = Counter[str]()
     for site in sites:
         counts.update(site.groups)
-    groups = f" ({', '.join(f'{n} {name}' for name, n in counts.items())})" if counts else ""
+    groups = f" ({escaped(', '.join(f'{n} {name}' for name, n in counts.items()))})" * bool(counts)
     aligned = (
         "Maps were not registered to each other."
         if sites[0].template is None
@@ -232,7 +232,8 @@ def _methods(meta: Meta) -> str:
         f"Measures of the hippocampus {cite('method')} of {meta.people} participants{groups} at"
         f" {len(sites)} sites were combined with hipsta_bids {__version__}; no values of"
         f" participants left a site. Each site fitted the linear model"
-        f" `{sites[0].models[0].formula}` at each point of the sheet and to each summary measure."
+        f" {code(sites[0].models[0].formula)} at each point of the sheet and to each summary"
+        " measure."
     )
     effects = (
         f"{fixed} In the random-effects model, true effects differ between sites; their variance"
@@ -254,5 +255,5 @@ def _methods(meta: Meta) -> str:
         for key, found in meta.found.items()
     ]
     if survivors:
-        paragraphs.append(f"Points that survive: {'; '.join(survivors)}.")
+        paragraphs.append(f"Points that survive: {escaped('; '.join(survivors))}.")
     return cite.page(paragraphs, sites[0].region)

@@ -11,7 +11,7 @@ from formulaic import Formula
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.cohort.data import Cohort, Measures, modeled_table
 from hipsta_bids.group.design import formula as formulas
-from hipsta_bids.group.design.grammar import closed_formula
+from hipsta_bids.group.design.grammar import closed_formula, term_text
 from hipsta_bids.group.design.model import DEPENDENCE, Comparison, Design, build_design
 from hipsta_bids.group.design.settings import GroupSettings
 from hipsta_bids.group.output.results import Harmonization, SitePlan, digests
@@ -148,7 +148,7 @@ def _own_columns(
 def _check_terms(model: formulas.ModelSpec, column: str) -> None:
     """Refuse interactions with the site."""
     for term in Formula(closed_formula(model.formula).text):
-        names = closed_formula(str(term)).names
+        names = closed_formula(term_text(term)).names
         if column in names and len(names) > 1:
             raise ModelError(
                 f"--harmonize {column}: the model has {term}, so that part of an effect is of"

@@ -1,7 +1,8 @@
 """The models of the group level on arrays, without files: ``hipsta_bids.group``."""
 
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -10,6 +11,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
+from hipsta_bids.group.cohort.covariates import Spellings, mark_missing, spelled_note
 from hipsta_bids.group.design.formula import with_factors
 from hipsta_bids.group.design.model import Design, ModelRequest, build_design, choose_model
 from hipsta_bids.group.design.settings import GroupSettings, load_group_settings
@@ -169,7 +171,8 @@ def group(
         perhaps ``side``, and x and y or vertices, as :func:`hipsta_bids.load` gives.
     table : DataFrame
         One row per participant, in the order of the maps. With an array of xarray, rows are found
-        by the column ``participant_id``, and may be in any order.
+        by the column ``participant_id``, and may be in any order. Cells that spell a missing value
+        (``unknown``, ``-``) are missing; ``design.notes`` of the result counts them.
     formula : str
         Such as ``"group + age + sex"``; names are columns of the table.
     contrasts : sequence of str
@@ -233,9 +236,13 @@ def group(
         and any(values.ndim == _VERTICES for values in sides.values())
     ):
         raise ValueError("clusters of vertices need triangles, (faces, 3)")
-    table = with_factors(table, settings.design, settings.model)
+    spelled: Spellings = Counter()
+    table = with_factors(mark_missing(table, {}, spelled), settings.design, settings.model)
     _, spec, _, levels = choose_model(request, table, settings)
     design = build_design(table, spec, settings.design, levels)
+    if spelled:
+        note = spelled_note(spelled, formula or "", settings)
+        design = replace(design, notes={**design.notes, "missing": note})
     model = RowModel(design, settings.glm)
     check_permutations(settings.multiplicity, settings.glm)
     side_maps = {side: _side(values, measure, triangles) for side, values in sides.items()}

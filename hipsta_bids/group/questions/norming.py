@@ -19,7 +19,7 @@ from hipsta_bids.group.design.model import BOTH, FIRST_AGE, Comparison
 from hipsta_bids.group.design.settings import GroupSettings, NormSettings
 from hipsta_bids.group.output import write
 from hipsta_bids.group.output.figures import Drawing, deviation_rows, draw_norms, norm_rows
-from hipsta_bids.group.output.methods import norms_text
+from hipsta_bids.group.output.methods import escaped, norms_text
 from hipsta_bids.group.output.panels import draw_pages
 from hipsta_bids.group.output.results import ScoredMaps
 from hipsta_bids.group.output.saved import NormsFile, load_norms, save_norms, templates_from_json
@@ -183,7 +183,7 @@ def _write(study: studies.Study, scoring: _Made, notes: Iterable[str]) -> studie
         table = pd.concat(charts, ignore_index=True)
         first = ["hemi", "measure", "unit"]
         scoring.tables["centiles"] = table[[*first, *table.columns.drop(first)]]
-    among = f" ({' '.join(study.among)})" if study.among else ""
+    among = f" ({escaped(' '.join(study.among))})" if study.among else ""
     visits = cohort.table[people.known]
     is_first = ~visits[PARTICIPANT].duplicated().to_numpy()
     sample = f"{is_first.sum()} participants{among}"
@@ -322,12 +322,11 @@ def _people(study: studies.Study, file: NormsFile) -> normative.People:
         problems["norms-sex", f"{file.sex} is none of {listed(file.sexes)}"] = strange.to_numpy()
         for i, level in enumerate(file.sexes[1:]):
             sex[:, i] = levels == level
-    problems |= {
-        ("incomplete", f"{name} is missing"): is_problem for name, is_problem in lacks.items()
-    }
     for reason, is_problem in problems.items():
         study.left_out.update(dict.fromkeys(map(str, table.index[is_problem]), reason))
-    usable = ~np.any(list(problems.values()), axis=0)
+    lacking = {name: map(str, table.index[is_lacking]) for name, is_lacking in lacks.items()}
+    study.left_out.update(study.incomplete(lacking, table[PARTICIPANT]))
+    usable = ~np.any([*problems.values(), *lacks.values()], axis=0)
     sites = [*file.sites, *sorted(set(labels[usable]) - set(file.sites))]
     site = np.where(usable, pd.Categorical(labels, categories=sites).codes, -1).astype(np.int64)
     return normative.People(age=age, sex=sex, site=site)

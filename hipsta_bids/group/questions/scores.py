@@ -10,7 +10,7 @@ from formulaic import Formula
 from hipsta_bids.errors import ModelError, UsageError
 from hipsta_bids.group.cohort import data
 from hipsta_bids.group.design.formula import Contrast, ModelSpec, check_names, listed, typed
-from hipsta_bids.group.design.grammar import closed_formula
+from hipsta_bids.group.design.grammar import closed_formula, term_text
 from hipsta_bids.group.design.model import Design, Groups, build_design
 from hipsta_bids.group.design.settings import ClassificationSettings, DesignSettings, GroupSettings
 from hipsta_bids.group.output.results import ScoredMaps
@@ -96,9 +96,9 @@ def score_cohort(
 def without_variable(formula: str, factor: str) -> str:
     """Leave out all terms in which a variable has a part."""
     terms = [
-        str(term)
+        term_text(term)
         for term in Formula(closed_formula(formula).text)
-        if factor not in closed_formula(str(term)).names
+        if factor not in closed_formula(term_text(term)).names
     ]
     return " + ".join(terms) or "1"
 

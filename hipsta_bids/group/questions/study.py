@@ -13,10 +13,10 @@ from hipsta_bids.derivatives import dataset
 from hipsta_bids.derivatives.names import group_report
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.cohort import collect, external, read
-from hipsta_bids.group.cohort.covariates import add_icv, add_time, read_covariates
+from hipsta_bids.group.cohort.covariates import add_icv, add_time, read_covariates, spelled_note
 from hipsta_bids.group.cohort.data import SHEET, Cohort, Measures, choose_visits
 from hipsta_bids.group.design import model as designs
-from hipsta_bids.group.design.formula import check_names, listed, with_factors
+from hipsta_bids.group.design.formula import ascii_letters, check_names, listed, with_factors
 from hipsta_bids.group.design.settings import GroupSettings
 from hipsta_bids.group.output import write
 from hipsta_bids.group.output.methods import REFERENCES
@@ -106,6 +106,8 @@ class Study:
     """Of hemispheres, and of sessions that are not compared."""
     notes: tuple[str, ...]
     """What to know, one line each."""
+    absent: frozenset[str] = frozenset()
+    """Participants who are not in participants.tsv."""
     among: tuple[str, str] | None = None
     """Column and level of the participants; all without."""
     left_out: dict[str, tuple[str, str]] = field(default_factory=dict)
@@ -122,6 +124,19 @@ class Study:
     def maps(self) -> list[str]:
         """Return the maps of all surfaces."""
         return [*self.measures.maps, *(name for name in self.cohorts if name != SHEET)]
+
+    def incomplete(
+        self, lacking: Mapping[str, Iterable[str]], people: pd.Series
+    ) -> dict[str, tuple[str, str]]:
+        """Give reason and message by visit, from visits by the variable that they lack."""
+        return {
+            visit: (
+                "incomplete",
+                "not in participants.tsv" if people[visit] in self.absent else f"{name} is missing",
+            )
+            for name, visits in lacking.items()
+            for visit in visits
+        }
 
     def take(self, keep: Bool, reason: tuple[str, str]) -> "Study":
         """Keep some visits; the others are left out, with a reason and a message."""
@@ -262,12 +277,18 @@ def read_study(
         sheets, collection.records, options.volumes, options.bids_dir
     )
     read.check_summaries(measures, measured.sides)
+    covariates, absent, spelled = read_covariates(
+        measured.table, options.bids_dir, options.covariates, settings
+    )
+    lacking = (
+        f"participants.tsv: has no row of {listed(sorted(absent))}; add it, or check its label"
+    )
+    table_notes = [lacking] * bool(absent)
+    if spelled:
+        file = options.model.file and files.read_json(options.model.file)
+        table_notes.append(spelled_note(spelled, options.model.formula or str(file), settings))
     all_visits = Cohort(
-        table=with_factors(
-            read_covariates(measured.table, options.bids_dir, options.covariates),
-            settings.design,
-            settings.model,
-        ),
+        table=with_factors(covariates, settings.design, settings.model),
         sides=measured.sides,
         x=measured.x,
         y=measured.y,
@@ -299,7 +320,8 @@ def read_study(
             *measured.damaged,
             *collect.exclude_visits(measured.table, reasons_of),
         ),
-        notes=(*collection.notes, *map_notes, *volume_notes, *_damaged(measured)),
+        notes=(*collection.notes, *map_notes, *volume_notes, *_damaged(measured), *table_notes),
+        absent=absent,
         among=among,
     )
     keep = members(cohort.table, among)
@@ -356,7 +378,7 @@ def read_templates(path: Path | None, cohort: Cohort) -> Mapping[str, Template] 
 def folder_of(parts: Sequence[str], among: tuple[str, str] | None) -> str:
     """Name a folder of results by what was asked, and of whom."""
     words = (*parts, *(among or ())[1:])
-    return "_".join("".join(c if c.isalnum() else "-" for c in word) for word in words)
+    return "_".join(ascii_letters(word, "-") for word in words)
 
 
 def members(table: pd.DataFrame, among: tuple[str, str] | None, option: str = "--among") -> Bool:

@@ -21,7 +21,7 @@ from hipsta_bids.group.design.settings import GroupSettings
 from hipsta_bids.group.output import write
 from hipsta_bids.group.output.columns import frame_of
 from hipsta_bids.group.output.figures import Drawing
-from hipsta_bids.group.output.methods import Citations, power_text, retest_text
+from hipsta_bids.group.output.methods import Citations, code, escaped, power_text, retest_text
 from hipsta_bids.group.output.panels import Row, draw_pages, spanned
 from hipsta_bids.group.output.tables import entity_label
 from hipsta_bids.group.questions import study as studies
@@ -241,13 +241,13 @@ class Modeled:
 
     def words(self, cite: Callable[[str], str]) -> str:
         """Name what means, changes and variances rest on."""
-        model = f"`{self.spec.formula}`"
+        model = code(self.spec.formula)
         if self.time is None:
             return f"these participants, after a linear model {model}"
         unit = "a month" if self.months == 1 else f"{self.months:.3g} months"
         return (
             f"these participants, by a linear mixed model {model} with intercepts and"
-            f" slopes of participants {cite('mixed')}; a unit of {self.time} is {unit}"
+            f" slopes of participants {cite('mixed')}; a unit of {escaped(self.time)} is {unit}"
         )
 
 
@@ -297,9 +297,8 @@ def run_trial(
     tell("points and measures")
     if not retest:
         source = Modeled(cohort, options.model, settings, study.time)
-        for variable, lacking in source.model.design.dropped.items():
-            reason = "incomplete", f"{variable} is missing"
-            study.left_out.update(dict.fromkeys(lacking, reason))
+        lacking = source.model.design.dropped
+        study.left_out.update(study.incomplete(lacking, cohort.table[PARTICIPANT]))
     modeled = cohort.table if source.rows is None else cohort.table.iloc[source.rows]
     study = with_mixes(study, modeled, ())
     maps, summaries = study.measures.maps, study.measures.summaries
@@ -404,7 +403,7 @@ def _methods(
 ) -> str:
     """Describe what was done, with the works it rests on."""
     settings, cite = study.settings, Citations()
-    among = f" ({' '.join(study.among)})" if study.among else ""
+    among = f" ({escaped(' '.join(study.among))})" if study.among else ""
     first = (
         f"Measures of the hippocampus {cite('method')} of {visits[PARTICIPANT].nunique()}"
         f" participants{among} with {len(visits)} visits were analyzed with hipsta_bids"

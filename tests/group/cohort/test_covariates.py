@@ -5,6 +5,7 @@ import pytest
 
 from hipsta_bids.errors import InputError
 from hipsta_bids.group.cohort.covariates import read_covariates, read_icv, relocate
+from hipsta_bids.group.design.settings import GroupSettings
 from hipsta_bids.io import files
 
 VISITS = pd.DataFrame(
@@ -24,7 +25,9 @@ def test_tables_are_joined_by_participant_and_by_session(tmp_path):
     write(tmp_path / "sub-1" / "sub-1_sessions.tsv", "session_id age\na 70.5\nses-b 72\n")
     write(tmp_path / "phenotype" / "tests.tsv", "participant_id session_id score\n1 b 12\n")
     extra = write(tmp_path / "more.tsv", "participant_id sex\nsub-2 n/a\nsub-1 female\n")
-    table = read_covariates(VISITS, tmp_path, [extra])
+    table, absent, spelled = read_covariates(VISITS, tmp_path, [extra], GroupSettings())
+    assert not absent
+    assert not spelled
     assert table["age"].tolist() == ["70.5", "72", "60"]
     assert table["sex"].tolist() == ["female", "female", "M"]  # n/a replaces nothing
     assert table["score"].tolist() == [None, "12", None]
@@ -34,13 +37,14 @@ def test_tables_are_joined_by_participant_and_by_session(tmp_path):
 def test_tables_without_participants_or_with_one_twice_are_refused(tmp_path):
     bad = write(tmp_path / "a.tsv", "subject age\nsub-1 3\n")
     with pytest.raises(InputError, match="no column participant_id"):
-        read_covariates(VISITS, tmp_path, [bad])
+        read_covariates(VISITS, tmp_path, [bad], GroupSettings())
     twice = write(tmp_path / "b.tsv", "participant_id age\nsub-1 3\n1 4\n")
     with pytest.raises(InputError, match="sub-1 occur more than once"):
-        read_covariates(VISITS, tmp_path, [twice])
+        read_covariates(VISITS, tmp_path, [twice], GroupSettings())
     # Those who are not in the cohort may stand there as they like.
     others = write(tmp_path / "c.tsv", "participant_id age\nsub-8 3\nsub-8 4\n")
-    assert read_covariates(VISITS, tmp_path, [others])["age"].isna().all()
+    table, *_ = read_covariates(VISITS, tmp_path, [others], GroupSettings())
+    assert table["age"].isna().all()
 
 
 def test_intracranial_volume_of_freesurfer_and_ashs(tmp_path):

@@ -8,6 +8,7 @@ import formulaic.materializers.base
 import numpy as np
 import pandas as pd
 import pytest
+from formulaic import Formula
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -16,6 +17,7 @@ from hipsta_bids.group.design.formula import model_from_shortcut, parse_model
 from hipsta_bids.group.design.grammar import closed_formula
 from hipsta_bids.group.design.model import build_design
 from hipsta_bids.group.design.settings import DesignSettings
+from hipsta_bids.group.questions.scores import without_variable
 
 N = 40
 AGE = np.linspace(50.0, 89.0, N)
@@ -144,6 +146,77 @@ def test_formula_without_sense_is_refused_in_one_line(formula):
     with pytest.raises(ModelError) as caught:
         design(formula)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("formula", "is_refused"),
+    [
+        ("(group + age + sex + a + b)**9", True),
+        ("((age + sex)**9)**9", True),
+        ("age*a*b*c*d*e*f*g*h*i", True),
+        ("bs(age, df=50):cr(a, df=30)", True),
+        ("(age + sex):((a + b)**9)", True),
+        ("(age + sex + a + b)**4", False),
+        ("age*a*b*c*d*e*f*g*h", False),
+        ("age/a/b/c - a:b", False),
+        ("poly(age / 50, 2)*poly(a / 50, 2)*bs(b, df=20)", False),
+        ("-" * 1900 + "age", False),
+    ],
+)
+def test_products_are_counted_before_they_are_made(formula, is_refused):
+    context = pytest.raises(UsageError, match="more than 1000 products")
+    with context if is_refused else contextlib.nullcontext():
+        assert "age" in closed_formula(formula).names
+
+
+@given(
+    st.recursive(
+        st.sampled_from(["a", "b", "c", "d"]),
+        lambda parts: st.one_of(
+            st.builds("({} {} {})".format, parts, st.sampled_from("+-*/:"), parts),
+            st.builds("{} {} {}".format, parts, st.sampled_from("+-*/:"), parts),
+            st.builds("({})**{}".format, parts, st.sampled_from("23")),
+        ),
+        max_leaves=9,
+    )
+)
+@settings(deadline=None, max_examples=100)
+def test_no_formula_that_passes_has_more_terms_than_counted(formula):
+    with contextlib.suppress(UsageError, TypeError):  # formulaic's, of an empty sum
+        closed_formula(formula)
+        assert len(list(Formula(formula))) <= 1001
+
+
+def test_products_of_factors_are_refused_before_columns_are_made():
+    many = np.arange(30_000) % 500
+    levels = {"a": many, "b": many[::-1], "c": many // 2}
+    table = pd.DataFrame(
+        {name: np.char.add("L", part.astype(str)) for name, part in levels.items()}
+    )
+    spec = parse_model(model_from_shortcut("a:b:c", [], "test"))
+    with pytest.raises(ModelError, match=f"few for {499 * 499 * 249 + 1} columns"):
+        build_design(table, spec, DesignSettings(), {})
+
+
+def test_names_with_blanks_in_terms_keep_their_backticks():
+    table = TABLE.rename(columns={"age": "age at scan", "sex": "lambda"})
+    model = model_from_shortcut(
+        "poly(`age at scan`, 2) + `lambda`", ["nonlinear(`age at scan`)"], "test"
+    )
+    found = build_design(table, parse_model(model), DesignSettings(), {})
+    bend = np.abs(found.contrasts[0].weights[0]) > 1e-12  # else rounding
+    assert [name for name, is_used in zip(found.columns, bend, strict=True) if is_used] == [
+        "poly(`age at scan`, 2)[2]"
+    ]
+    assert without_variable("`age at scan`*`lambda` + group", "group") == (
+        "1 + `age at scan` + `lambda` + `age at scan`:`lambda`"
+    )
+
+
+def test_functions_of_names_are_refused_by_the_name():
+    for formula in ("log(group)", "group + center(sex)", "poly(group, 2)"):
+        with pytest.raises(ModelError, match=r"take numbers, but (group|sex) holds names"):
+            design(formula)
 
 
 def test_column_named_as_a_function():

@@ -295,6 +295,7 @@ def test_different_models_have_different_folders():
     )
     assert len({folder_name(formula) for formula in formulas}) == len(formulas)
     assert folder_name("thickness ~ group + age") == "group-age"
+    assert folder_name("`âge` * 女") == "age-x-u5973"  # as --name has it
 
 
 @pytest.mark.parametrize("formula", [None, "thickness ~ group + age + sex"])

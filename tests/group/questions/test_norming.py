@@ -256,6 +256,24 @@ def test_measures_and_versions_are_compared(people, norms, capsys):
     refused(capsys, [*call, "--norms", people[0] / "participants.tsv"], "JSON")
 
 
+def test_unknown_sexes_and_people_without_a_row_are_named(people, norms, tmp_path, capsys):
+    data, out = people
+    rows = read_participants(data)
+    sex = TABLE.index("sex")
+    absent, unknown = rows[1][0], rows[2][0]
+    rows[2][sex] = "unknown"
+    write_participants(tmp_path, [rows[0], *rows[2:]], TABLE)
+    options = ["--norms", str(norms), *CONTROLS, "--measures", "volume", "--name", "unknown"]
+    assert main([str(tmp_path), str(out), "group", *options]) == 0
+    assert "read as missing: sex 'unknown' (1)" in capsys.readouterr().out
+    excluded = table(out / "group" / "unknown" / "excluded.tsv").set_index("participant_id")
+    assert excluded.reason[[absent, unknown]].tolist() == ["incomplete"] * 2
+    assert excluded.message[[absent, unknown]].tolist() == [
+        "not in participants.tsv",
+        "sex is missing",
+    ]
+
+
 def test_if_nobody_can_be_scored_it_says_why(people, norms, capsys):
     call = [*people, "group", "--norms", norms, "--participant-label", "2000"]
     refused(capsys, call, "nobody here can be scored: outside of the norms' 2")
