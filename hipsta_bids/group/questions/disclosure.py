@@ -21,8 +21,7 @@ from hipsta_bids.group.stats.arrays import Bool, Float, Int
 
 #: Share of a sum of squares that belongs to a few participants, if the sum is theirs alone.
 _WHOLE_SHARE = 1 - 1e-6
-#: Length of a column that is zero but for rounding.
-_ZERO = 1e-12
+_ZERO = 1e-12  # length of a column
 #: Below these shares of the largest value, a weight is taken for zero, step by step.
 _STEPS = np.geomspace(0.3, 1e-3, 12)
 
@@ -32,16 +31,15 @@ def check_people(
 ) -> list[Int]:
     """Refuse models of which sums are about few participants; return the rows of each cell.
 
-    ``people`` are the variables of the models, the groups first. ModelError with what is too small,
-    where, and what to try.
+    ``people`` are the variables of the models, the groups first.
     """
-    least = limits.min_cell
     factors = {name for design in designs for name in design.references}
     numbers = {
         name: values.to_numpy(dtype=np.float64)
         for name, values in people.items()
         if name not in factors and values.nunique() > FEW_VALUES
     }
+    least = limits.min_cell
     cells = check_cells({n: v for n, v in people.items() if n not in numbers}, least)
     cells = cells or {"": np.arange(len(designs[0].matrix))}
     for (name, values), (cell, rows) in product(numbers.items(), cells.items()):
@@ -55,18 +53,17 @@ def check_people(
 
 def check_cells(factors: Mapping[str, pd.Series], least: int) -> dict[str, Int]:
     """Refuse small or empty cells of the cross-tabulation of all factors; return rows by cell."""
-    levels = {name: level_labels(values).fillna("n/a") for name, values in factors.items()}
-    for size in range(1, len(levels) + 1):
-        for names in combinations(levels, size):
-            counts = Counter(zip(*(levels[name] for name in names), strict=True))
-            for cell in product(*(sorted(set(levels[name])) for name in names)):
+    levels = pd.DataFrame({n: level_labels(v).fillna("n/a") for n, v in factors.items()})
+    texts = levels.apply(lambda column: f"{column.name}=" + column)
+    for size in range(1, len(factors) + 1):
+        for names in map(list, combinations(factors, size)):
+            counts = Counter(texts[names].itertuples(index=False, name=None))
+            for cell in product(*(sorted(set(texts[name])) for name in names)):
                 if counts[cell] < least:
-                    *outer, level = (f"{n}={x}" for n, x in zip(names, cell, strict=True))
-                    place = f" in {', '.join(outer)}" if outer else ""
-                    _refuse(f"{level}{place} holds fewer than {least} participants", names[-1])
-    count = len(next(iter(levels.values()), ()))
-    named = [", ".join(f"{n}={v.iloc[row]}" for n, v in levels.items()) for row in range(count)]
-    return {cell: np.flatnonzero(np.array(named) == cell) for cell in dict.fromkeys(named)}
+                    place = f" in {', '.join(cell[:-1])}" if size > 1 else ""
+                    _refuse(f"{cell[-1]}{place} holds fewer than {least} participants", names[-1])
+    joined = texts.apply(", ".join, axis=1).to_numpy() if len(texts) else np.zeros(0)
+    return {cell: np.flatnonzero(joined == cell) for cell in dict.fromkeys(joined)}
 
 
 def is_traceable(values: Float, cells: Sequence[Int], least: int) -> Bool:
@@ -87,14 +84,15 @@ def _check_columns(
     design: Design, cells: Sequence[Int], numbers: Sequence[Float], limits: ExchangeSettings
 ) -> None:
     """Refuse few residual degrees of freedom, high leverage, and sums of few participants."""
-    matrix, least = design.matrix, limits.min_residual_df
-    basis = _span(matrix / np.linalg.norm(matrix, axis=0))
-    if len(matrix) - matrix.shape[1] < least:
-        raise ModelError(
-            f"--export-summary: {len(matrix)} participants are too few for {matrix.shape[1]}"
-            f" columns; at least {matrix.shape[1] + least} are needed"
-        )
+    matrix = design.matrix / np.linalg.norm(design.matrix, axis=0)
+    basis = _span(matrix)
+    (n, count), spare = matrix.shape, limits.min_residual_df
     leverage = float(np.max(np.sum(basis**2, axis=1)))
+    if n - count < spare:
+        raise ModelError(
+            f"--export-summary: {n} participants are too few for {count} columns; at least"
+            f" {count + spare} are needed"
+        )
     if leverage > limits.max_leverage:
         raise ModelError(
             f"--export-summary: one participant determines its own fitted value by {leverage:.0%};"
@@ -108,7 +106,7 @@ def _check_columns(
         if any(np.isin(rows, cell).all() and _plain(products, cell, numbers) for cell in cells):
             continue
         spread = (matrix - np.median(matrix, axis=0)) ** 2
-        shares = spread[rows].sum(axis=0) / np.maximum(spread.sum(axis=0), np.finfo(float).tiny)
+        shares = spread[rows].sum(axis=0) / np.maximum(spread.sum(axis=0), _ZERO)
         name = design.columns[int(np.argmax(shares))]
         _refuse(f"sums of {name} are about fewer than {limits.min_cell} participants", name)
 
@@ -124,9 +122,8 @@ def _span(columns: Float) -> Float:
 def _small_sums(basis: Float, count: int) -> Iterator[Int]:
     """Find rows, at most ``count``, outside of which some combination of columns is zero.
 
-    One of these rows has a leverage of ``1 / count`` or more. From each row with that leverage,
-    reweighted least squares look for the combination with the fewest rows (Gorodnitsky and Rao
-    1997).
+    One of them has a leverage of ``1 / count`` or more. From each such row, reweighted least
+    squares look for the combination with the fewest rows (Gorodnitsky and Rao 1997).
     """
     for row in np.flatnonzero(np.sum(basis**2, axis=1) >= 1 / count - DEPENDENCE):
         values = basis @ basis[row]
@@ -139,13 +136,9 @@ def _small_sums(basis: Float, count: int) -> Iterator[Int]:
 
 
 def _plain(basis: Float, cell: Int, numbers: Sequence[Float]) -> bool:
-    """Tell whether the sums of a cell are its count and sums of numbers as they are.
-
-    These are about all participants of the cell, though some combination is zero for most.
-    """
+    """Tell whether the known sums of a cell are its count and sums of numbers: about all in it."""
     sums = np.zeros((len(basis), 1 + len(numbers)))
-    centered = [x[cell] - x[cell].mean() for x in numbers]
-    sums[cell] = np.stack([np.ones(len(cell)), *centered], axis=1)
+    sums[cell] = np.column_stack([np.ones(len(cell)), *(x[cell] - x[cell].mean() for x in numbers)])
     is_known = np.sum((basis.T @ sums) ** 2, axis=0) > _WHOLE_SHARE * np.sum(sums**2, axis=0)
     n_known = np.sum(np.linalg.svd(basis[cell], compute_uv=False) ** 2 > _WHOLE_SHARE)
     return bool(is_known.any() and _span(sums[:, is_known]).shape[1] == n_known)

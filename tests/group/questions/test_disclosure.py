@@ -3,12 +3,14 @@
 import numpy as np
 import pandas as pd
 import pytest
+from check_disclosure import attack_designs, share_of_ordinary
 
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.design.formula import ModelSpec, typed
 from hipsta_bids.group.design.grammar import closed_formula
 from hipsta_bids.group.design.model import build_design
 from hipsta_bids.group.design.settings import DesignSettings, ExchangeSettings
+from hipsta_bids.group.questions import exchange
 from hipsta_bids.group.questions.disclosure import check_cells, check_people, is_traceable
 
 
@@ -130,3 +132,27 @@ def test_measures_that_count_rare_findings_are_traceable():
     assert is_traceable(values, cells, 5).tolist() == [False, True, True, True]
     values[:5, 3] = np.arange(5) + 2
     assert not is_traceable(values, cells, 5)[3]
+
+
+def test_nothing_is_read_out_of_summaries_of_random_designs():
+    """`tools/test-disclosure` attacks 1,000."""
+    outcome = attack_designs(60)
+    assert outcome.exported > 15
+    assert outcome.kinds == {}
+    assert outcome.leaking == 0
+
+
+def test_the_attack_reads_most_summaries_without_the_rule(monkeypatch):
+    monkeypatch.setattr(exchange, "check_people", lambda *_: [])
+    monkeypatch.setattr(
+        exchange, "is_traceable", lambda values, *_: np.zeros(values.shape[1], bool)
+    )
+    outcome = attack_designs(15)
+    assert outcome.exported == 15
+    assert outcome.leaking > 10
+    assert {"cell", "sum"} < set(outcome.kinds)
+
+
+def test_ordinary_cohorts_are_exported():
+    assert share_of_ordinary(12) == 1
+    assert share_of_ordinary(12, n=60) > 0.9
