@@ -86,22 +86,23 @@ def _check_columns(
     """Refuse few residual degrees of freedom, high leverage, and sums of few participants."""
     matrix = design.matrix / np.linalg.norm(design.matrix, axis=0)
     basis = _span(matrix)
-    (n, count), spare = matrix.shape, limits.min_residual_df
     leverage = float(np.max(np.sum(basis**2, axis=1)))
-    if n - count < spare:
+    first, second = np.triu_indices(basis.shape[1])
+    sums = [basis, basis[:, first] * basis[:, second]]
+    sums += [np.stack([x, x**2], axis=1) for x in numbers]  # means and standard deviations
+    products = _span(np.hstack(sums))
+    (n, count), n_sums = matrix.shape, products.shape[1]
+    # Combinations of so many sums can be about any few participants.
+    if n - count < limits.min_residual_df or n - n_sums < limits.min_cell - 1:
         raise ModelError(
-            f"--export-summary: {n} participants are too few for {count} columns; at least"
-            f" {count + spare} are needed"
+            f"--export-summary: {n} participants are too few for {count} columns, which hold"
+            f" {n_sums} sums; leave variables out of the shared model"
         )
     if leverage > limits.max_leverage:
         raise ModelError(
             f"--export-summary: one participant determines its own fitted value by {leverage:.0%};"
             " look for an extreme value of a covariate"
         )
-    first, second = np.triu_indices(basis.shape[1])
-    sums = [basis, basis[:, first] * basis[:, second]]
-    sums += [np.stack([x, x**2], axis=1) for x in numbers]  # means and standard deviations
-    products = _span(np.hstack(sums))
     for rows in _small_sums(products, limits.min_cell - 1):
         if any(np.isin(rows, cell).all() and _plain(products, cell, numbers) for cell in cells):
             continue

@@ -113,6 +113,17 @@ def test_a_column_that_is_nonzero_for_few_is_found_in_random_models():
             check(table, "a + b + c + d")
 
 
+def test_more_sums_than_participants_are_refused():
+    random = np.random.default_rng(2)
+    names = [f"x{i}" for i in range(8)]
+    table = pd.DataFrame(random.normal(size=(60, 8)), columns=names)
+    check(table, " + ".join(names))
+    with pytest.raises(ModelError, match="46 participants are too few for 9 columns, which hold"):
+        check(table[:46], " + ".join(names))
+    with pytest.raises(ModelError, match="11 participants are too few for 2 columns, which hold"):
+        check(table[:11], "x0")
+
+
 def test_groups_that_are_not_in_the_model_are_counted_too():
     groups = pd.Series(["CN"] * 20 + ["AD"] * 4)
     with pytest.raises(ModelError, match="group=AD holds fewer than 5"):
