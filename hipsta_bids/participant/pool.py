@@ -79,6 +79,8 @@ class WorkerPlan:
     """Importable function that loads libraries before the clock of the first job starts."""
     environment: tuple[tuple[str, str], ...] = ()
     """Further environment variables."""
+    begun: Callable[[list[Any]], None] | None = None
+    """Importable function that hears of all jobs in work whenever one begins."""
     patience: float | None = None
     """Seconds that an idle worker waits for a job before it ends; ``None`` is forever."""
 
@@ -151,15 +153,8 @@ class _Slot:
         self.connection.close()
 
 
-def run_jobs(
-    plan: WorkerPlan,
-    jobs: Iterable[Any],
-    begun: Callable[[list[Any]], None] = lambda _: None,
-) -> Generator[tuple[Any, Any]]:
-    """Work off jobs in parallel; closing the generator stops all workers.
-
-    ``begun`` is called with all jobs in work whenever one begins.
-    """
+def run_jobs(plan: WorkerPlan, jobs: Iterable[Any]) -> Generator[tuple[Any, Any]]:
+    """Work off jobs in parallel; closing the generator stops all workers."""
     queue: Iterator[Any] = iter(jobs)
     waiting = next(queue, None)
     slots: list[_Slot] = []
@@ -170,7 +165,8 @@ def run_jobs(
                 if waiting is not None and slot.ready and slot.job is None:
                     slot.give(waiting)
                     waiting = next(queue, None)
-                    begun([slot.job for slot in slots if slot.job is not None])
+                    if plan.begun is not None:
+                        plan.begun([slot.job for slot in slots if slot.job is not None])
             if waiting is not None and len(slots) < plan.n_workers:
                 slots.append(_start(plan))
                 continue

@@ -511,10 +511,11 @@ def _measured(
         log=log,
         warm_up=warm_up,
         environment=() if options.work_dir is None else (("TMPDIR", str(options.work_dir)),),
+        begun=_tell_titles,
     )
     if options.cluster is None or not able:
         tell(STAGE, None, current=f"about {_expected(table, plan, able)}")
-        pool = run_jobs(plan, able, _tell_titles)
+        pool = run_jobs(plan, able)
     else:
         pool = run_on_cluster(options.cluster, plan, able)
     try:

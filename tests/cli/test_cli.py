@@ -330,7 +330,7 @@ def stand_in_run(monkeypatch, tmp_path):
     for name in ("hipsta_bids.inputs.labels", "hipsta_bids.participant.measure"):
         monkeypatch.setitem(sys.modules, name, None)  # put back afterwards
     monkeypatch.setattr(
-        runner, "run_jobs", lambda _, jobs, __: ((job, stand_in_job(job)) for job in jobs)
+        runner, "run_jobs", lambda _, jobs: ((job, stand_in_job(job)) for job in jobs)
     )
     return ["x", str(tmp_path / "out"), "participant"]
 

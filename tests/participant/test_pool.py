@@ -146,6 +146,8 @@ def test_without_threads_workers_are_forked_and_nothing_is_loaded_twice(tmp_path
 def test_what_is_in_work_is_told(tmp_path):
     told = []
     jobs = ["square 3", "square 4", "square 5"]
-    done = dict(run_jobs(plan(tmp_path, n_workers=2), jobs, lambda now: told.append(list(now))))
-    assert list(done) and sorted({job for now in told for job in now}) == jobs
+    known = plan(tmp_path, n_workers=2, begun=lambda now: told.append(list(now)))
+    dict(run_jobs(known, jobs))
+    assert sorted({job for now in told for job in now}) == jobs
+    assert len(told) == 3
     assert max(map(len, told)) <= 2

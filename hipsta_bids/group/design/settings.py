@@ -287,8 +287,8 @@ class NormSettings(toml.SettingsTable):
 class ExchangeSettings(toml.SettingsTable):
     """What a summary for other sites may say."""
 
-    min_cell: Annotated[int, Field(ge=3)] = 5
-    """Fewest participants in a group, a level of a factor, or a cell of two factors."""
+    min_cell: Annotated[int, Field(ge=5)] = 5
+    """Fewest participants in a cell of all factors of the model, and behind a sum."""
     min_residual_df: PositiveInt = 10
     """Fewest participants beyond the columns of the model."""
     max_leverage: toml.OpenFraction = 0.5

@@ -19,7 +19,7 @@ from hipsta_bids.group.output.figures import Drawing
 from hipsta_bids.group.output.methods import Citations, code, discovery_text, escaped
 from hipsta_bids.group.output.panels import Row, contrasts, draw_pages
 from hipsta_bids.group.output.tables import META_COLUMNS
-from hipsta_bids.group.questions.exchange import SiteSummary, read_summary
+from hipsta_bids.group.questions.exchange import SiteSummary, read_summary, shown_counts
 from hipsta_bids.group.questions.sites import Meta, analyze_sites, check_agreement, meta_tables
 from hipsta_bids.group.stats.arrays import SideMaps
 from hipsta_bids.group.stats.glm import FittedMaps, PointTest
@@ -197,8 +197,9 @@ def _methods(meta: Meta) -> str:
     rules, sites = meta.settings.meta, meta.sites
     cite = Citations()
     counts = Counter[str]()
-    for site in sites:
-        counts.update(site.groups)
+    sizes = [size for site in sites for size in shown_counts(site.groups).items()]
+    for level, n in sizes if all(isinstance(n, int) for _, n in sizes) else ():
+        counts[level] += int(n)
     groups = f" ({escaped(', '.join(f'{n} {name}' for name, n in counts.items()))})" * bool(counts)
     aligned = (
         "Maps were not registered to each other."

@@ -23,8 +23,9 @@ from hipsta_bids.group.cohort.data import Cohort, summary_values
 from hipsta_bids.group.design.formula import typed
 from hipsta_bids.group.design.grammar import closed_formula
 from hipsta_bids.group.design.model import Design, build_design
-from hipsta_bids.group.design.settings import ExchangeSettings, GroupSettings
+from hipsta_bids.group.design.settings import GroupSettings
 from hipsta_bids.group.output.results import Analysis, templates_of
+from hipsta_bids.group.questions.disclosure import check_cells, check_people, is_traceable
 from hipsta_bids.group.stats.arrays import Float, Int
 from hipsta_bids.group.stats.glm import FittedMaps, PointTest, fit_points, with_mean
 from hipsta_bids.group.stats.meta import SiteFit
@@ -41,11 +42,14 @@ _AXES = "x from medial to lateral, y from posterior to anterior, on both sides"
 _MOST_BYTES = 50_000_000
 #: Sums in another order, and rounding to these digits, differ by less.
 _ROUNDING = 1e-5
+#: Smaller counts are not shown.
+_FEWEST = 5
 _LEAST = 1e-15  # eigenvalue of a covariance, relative to the largest
 #: Functions whose columns depend on who is in the table.
 _OF_THE_SAMPLE = re.compile(r"(?<![\w.])(bs|center|cr|poly|scale)\s*\(")
 Word = Annotated[str, Field(min_length=1, max_length=60, pattern=r"^[\w][\w .+-]*$")]
 Name = Annotated[str, Field(min_length=1, max_length=200, pattern=r"^\w[\w .:+-]*$")]
+Count = Annotated[int, Field(ge=0)] | Literal["<5"]
 Numbers = list[Number]
 
 
@@ -161,9 +165,9 @@ class SiteSummary(TomlTable):
     template: dict[str, Any] | None
     """Template of registration, as in ``template.json``; ``None`` without registration."""
     participants: Annotated[int, Field(ge=1)]
-    groups: dict[Text, Annotated[int, Field(ge=0)]]
+    groups: dict[Text, Count]
     """Participants by group, the reference first; empty without groups."""
-    factors: dict[Text, dict[Text, Annotated[int, Field(ge=0)]]]
+    factors: dict[Text, dict[Text, Count]]
     """Participants by level of each factor of the model, the reference level first."""
     covariates: dict[Text, dict[Literal["mean", "sd"], Number]]
     """Of the numbers of the model."""
@@ -176,6 +180,14 @@ class SiteSummary(TomlTable):
             return "none"
         text = json.dumps(self.template, sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def shown_counts(counts: Mapping[str, Count]) -> dict[str, int | str]:
+    """Hide counts below five; then other counts are hidden too, as their sum is known."""
+    levels = {level for level, n in counts.items() if n == "<5" or n < _FEWEST}
+    if not levels:
+        return dict(counts)
+    return {level: "<5" if level in levels else f"{_FEWEST}+" for level in counts}
 
 
 def write_summary(path: Path, summary: Mapping[str, Any]) -> None:
@@ -240,10 +252,14 @@ def summarize(
     }
     groups = {}
     if analysis.groups is not None:
-        groups = _counts(table[analysis.groups.column], analysis.groups.reference)
-    for design in designs.values():
-        _check_people({**factors, "group": groups}, design, settings.exchange)
-    models = list(_models(compared, analysis, rows, designs, settings))
+        column = table[analysis.groups.column]
+        check_cells({analysis.groups.column: column}, settings.exchange.min_cell)
+        groups = _counts(column, analysis.groups.reference)
+    names = {name for formula in designs for name in closed_formula(formula).names}
+    first = analysis.groups.column if analysis.groups else None
+    variables = {name: typed(table[name]) for name in sorted(names, key=lambda n: (n != first, n))}
+    cells = check_people([*designs.values()], variables, settings.exchange)
+    models = list(_models(compared, analysis, rows, designs, settings, cells=cells))
     if not models:
         raise ModelError(
             "--export-summary: nothing to export; maps of other programs are not in a summary"
@@ -255,7 +271,7 @@ def summarize(
             notes.append(
                 f"{SUMMARY}: {model['measures'][0] if points_text == 'points' else 'summaries'},"
                 f" {model['hemi']}: without {missing} {points_text} that are not known of all"
-                " participants"
+                " participants, or differ in few"
             )
     numbers = {
         name: typed(table[name]).astype(np.float64)
@@ -315,40 +331,14 @@ def _check_model(analysis: Analysis, settings: GroupSettings) -> None:
         raise ModelError(f"--export-summary: a model {problem}")
 
 
-def _check_people(
-    counts: Mapping[str, Mapping[str, int]], design: Design, limits: ExchangeSettings
-) -> None:
-    """Refuse numbers that are about few participants, or hang on one."""
-    matrix, least = design.matrix, limits.min_cell
-    cells = {f"{name} {level}": n for name, own in counts.items() for level, n in own.items()}
-    for name, column in zip(design.columns, matrix.T, strict=True):
-        if set(np.unique(column)) == {0.0, 1.0}:
-            cells |= {f"{name} = {i}": int((column == i).sum()) for i in (0, 1)}
-    small = [f"{name} ({n})" for name, n in cells.items() if n < least]
-    leverage = float(np.max(np.sum(np.linalg.qr(matrix)[0] ** 2, axis=1), initial=0.0))
-    problem = None
-    if small:
-        problem = f"too few participants for {', '.join(small)}; at least {least} are needed"
-    elif len(matrix) - matrix.shape[1] < limits.min_residual_df:
-        problem = (
-            f"{len(matrix)} participants are too few for {matrix.shape[1]} columns; at least"
-            f" {matrix.shape[1] + limits.min_residual_df} are needed"
-        )
-    elif leverage > limits.max_leverage:
-        problem = (
-            f"one participant determines its own fitted value by {leverage:.0%}; look for an"
-            " extreme value of a covariate"
-        )
-    if problem is not None:
-        raise ModelError(f"--export-summary: {problem}")
-
-
 def _models(
     compared: Cohort,
     analysis: Analysis,
     rows: Int,
     designs: Mapping[str, Design],
     settings: GroupSettings,
+    *,
+    cells: Sequence[Int],
 ) -> Iterator[dict[str, Any]]:
     """Models of maps, and of summary measures, of the participants in ``rows``."""
     formula = analysis.model.formula
@@ -362,7 +352,7 @@ def _models(
                 "measures": [measure],
                 "formula": formula,
                 "subfield": _subfields(one),
-                **_model(values, designs[formula], fit.tests, settings),
+                **_model(values, designs[formula], fit.tests, settings, cells),
             }
     for (hemi, model_formula), (_, fit, _) in analysis.measures.items():
         if model_formula not in designs:
@@ -377,7 +367,7 @@ def _models(
             "hemi": hemi,
             "measures": names,
             "formula": model_formula,
-            **_model(values, designs[model_formula], fit.tests, settings),
+            **_model(values, designs[model_formula], fit.tests, settings, cells),
         }
 
 
@@ -387,14 +377,19 @@ def _subfields(fitted: FittedMaps) -> list[str | None]:
 
 
 def _model(
-    values: Float, design: Design, tests: Sequence[PointTest], settings: GroupSettings
+    values: Float,
+    design: Design,
+    tests: Sequence[PointTest],
+    settings: GroupSettings,
+    cells: Sequence[Int],
 ) -> dict[str, Any]:
     """Fit the model where all participants have a value, and spell the results."""
     names = [test.contrast.name for test in tests]
     contrasts = [one for one in design.contrasts if one.n_rows == 1 and one.name in names]
     complete = np.isfinite(values).all(axis=0)
     fit = fit_points(np.where(complete, values, 0.0), design.matrix, contrasts, settings.glm)
-    usable = complete & np.isfinite(fit.sigma)
+    traceable = is_traceable(values, cells, settings.exchange.min_cell)
+    usable = complete & np.isfinite(fit.sigma) & ~traceable
 
     def known(numbers: Float) -> list[Any]:
         return rounded(np.where(usable, numbers, np.nan))  # type: ignore[no-any-return]

@@ -13,7 +13,7 @@ from hipsta_bids.errors import ModelError
 from hipsta_bids.group.design.formula import Contrast, listed
 from hipsta_bids.group.design.settings import GroupSettings
 from hipsta_bids.group.output import columns, tables
-from hipsta_bids.group.questions.exchange import ModelSummary, SiteSummary
+from hipsta_bids.group.questions.exchange import ModelSummary, SiteSummary, shown_counts
 from hipsta_bids.group.stats.arrays import Float
 from hipsta_bids.group.stats.clusters import sheet_edges
 from hipsta_bids.group.stats.glm import MEAN, PointTest
@@ -266,7 +266,8 @@ def meta_tables(meta: Meta) -> Iterator[tuple[str, pd.DataFrame]]:
 def _sites(meta: Meta) -> pd.DataFrame:
     rows = []
     for site in meta.sites:
-        levels = {f"{k}_{level}": n for k, own in site.factors.items() for level, n in own.items()}
+        counts = {k: shown_counts(own) for k, own in site.factors.items()}
+        levels = {f"{k}_{level}": n for k, own in counts.items() for level, n in own.items()}
         numbers = {
             f"{k}_{what}": v for k, own in site.covariates.items() for what, v in own.items()
         }

@@ -2,22 +2,30 @@
 
 import json
 import re
+from dataclasses import replace
 
 import nibabel as nib
 import numpy as np
 import pandas as pd
 import pytest
 from page_outline import Outline
-from small_cohorts import place_of, write_dataset
+from small_cohorts import (
+    PLAN,
+    place_of,
+    read_participants,
+    write_dataset,
+    write_participants,
+)
 
 from hipsta_bids.cli.main import main
 from hipsta_bids.group.output import write
 from hipsta_bids.group.questions import analysis
 from hipsta_bids.io import files
 
+#: Twelve of each group at each site, six of each sex.
 SITES = {
-    "a": [f"{i:02d}" for i in (*range(1, 9), *range(17, 24))],
-    "b": [f"{i:02d}" for i in (*range(9, 17), *range(24, 31))],
+    "a": [f"{i:02d}" for i in (*range(1, 13), *range(25, 37))],
+    "b": [f"{i:02d}" for i in (*range(13, 25), *range(37, 49))],
 }
 #: What draws figures, which most tests here go without.
 DRAW = write.write_figures
@@ -37,7 +45,10 @@ def _only_what_counts():
 @pytest.fixture(scope="module")
 def cohort(tmp_path_factory):
     """A dataset of two sites, and its output."""
-    data, out = write_dataset(tmp_path_factory.mktemp("sites"))
+    plan = replace(PLAN, sizes=(24, 24))
+    data, out = write_dataset(tmp_path_factory.mktemp("sites"), plan=plan)
+    people = read_participants(data)
+    write_participants(data, [[*row[:3], "FM"[i % 2]] for i, row in enumerate(people)])
     rows = [[f"sub-{label}", site] for site, labels in SITES.items() for label in labels]
     files.write_tsv(data.parent / "site.tsv", ["participant_id", "site"], rows)
     return data, out
@@ -125,10 +136,10 @@ def test_a_summary_has_no_value_of_a_participant(cohort, plain):
     text = plain[0].read_text()
     content = json.loads(text)
     assert "sub-" not in text
-    assert content["participants"] == 15
-    assert content["groups"] == {"CN": 8, "AD": 7}
+    assert content["participants"] == 24
+    assert content["groups"] == {"CN": 12, "AD": 12}
     (maps,) = (m for m in content["models"] if m["hemi"] == "L" and m["measures"] == ["thickness"])
-    assert maps["df"] == 11
+    assert maps["df"] == 20
     assert len(maps["sd"]) == 147
     # No number of a participant's sheet or summary occurs.
     sheet = files.read_tsv(place_of(cohort[1], "01", "L").path("sheet"))
@@ -160,8 +171,8 @@ def test_every_number_is_about_the_same_participants(cohort, tmp_path, capsys):
     files.write_tsv(excluded, ["participant_id", "hemi"], [["sub-01", "R"]])
     summary = export(cohort, "a", "--align", "none", "--exclude", str(excluded), name="lacking")
     content = json.loads(summary.read_text())
-    assert content["participants"] == 14
-    assert {model["df"] for model in content["models"]} == {10}
+    assert content["participants"] == 23
+    assert {model["df"] for model in content["models"]} == {19}
     assert len({json.dumps(m["covariance"]) for m in content["models"]}) == 1
     assert "without 1 participants who lack a hemisphere" in capsys.readouterr().out
 
@@ -169,14 +180,14 @@ def test_every_number_is_about_the_same_participants(cohort, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ((), "too few participants for group CN (8), group AD (7)"),
+        ((), "group=AD holds fewer than 13 participants; merge levels, or leave group out"),
         (("--formula", "group + scale(age)"), "with scale() has other columns at each site"),
         (("--formula", "group", "--contrast", "g = group[CN], group[AD]"), "contrast"),
     ],
 )
 def test_what_could_be_traced_or_not_combined_is_refused(cohort, tmp_path, capsys, options, said):
     strict = tmp_path / "strict.toml"
-    strict.write_text("[exchange]\nmin_cell = 9\n")
+    strict.write_text("[exchange]\nmin_cell = 13\n")
     options = ["--align", "none", "--settings", str(strict), *options]
     code, folder = run(cohort, "refused", "--export-summary", "a", *options, site="a")
     assert code == 65
@@ -184,6 +195,44 @@ def test_what_could_be_traced_or_not_combined_is_refused(cohort, tmp_path, capsy
     assert said in error
     assert "\n" not in error
     assert not folder.exists()
+
+
+@pytest.mark.parametrize("formula", ["group + age + hand", "group*age + hand", "hand + age"])
+def test_one_participant_in_a_cell_is_refused(cohort, tmp_path, capsys, formula):
+    """Of a single left-handed patient the sums of products hold the exact age."""
+    left = [*SITES["a"][:6], SITES["a"][12]]
+    rows = [[f"sub-{i}", "left" if i in left else "right"] for i in SITES["a"]]
+    files.write_tsv(tmp_path / "hand.tsv", ["participant_id", "hand"], rows)
+    options = ["--align", "none", "--covariates", str(tmp_path / "hand.tsv"), "--formula", formula]
+    code, folder = run(cohort, "hand", "--export-summary", "a", *options, site="a")
+    if "group" not in formula:
+        assert code == 0
+        assert "group" not in (folder / "summary.json").read_text().partition('"models"')[2]
+        return
+    assert code == 65
+    error = capsys.readouterr().err.strip()
+    assert "hand=left in group=AD holds fewer than 5 participants; merge levels, or" in error
+    assert "\n" not in error
+    assert not folder.exists()
+
+
+def test_small_counts_of_earlier_summaries_are_not_shown(plain, tmp_path):
+    old = edited(plain[0], tmp_path / "old.json", factors=lambda f: f | {"sex": {"F": 21, "M": 3}})
+    hidden = edited(
+        plain[1], tmp_path / "hidden.json", factors=lambda f: f | {"sex": {"F": 20, "M": "<5"}}
+    )
+    assert main(["meta", str(old), str(hidden), str(tmp_path / "out")]) == 0
+    sites = pd.read_csv(tmp_path / "out" / "meta" / "sites.tsv", sep="\t")
+    assert sites.sex_M.tolist() == ["<5", "<5"]
+    assert sites.sex_F.tolist() == ["5+", "5+"]
+    assert sites.group_CN.tolist() == [12, 12]
+    page = (tmp_path / "out" / "meta.html").read_text(encoding="utf-8")
+    assert page.count("&lt;5</td>") == 2
+    assert "24 CN, 24 AD" in (tmp_path / "out" / "meta" / "methods.md").read_text()
+    small = edited(plain[0], tmp_path / "small.json", groups={"CN": 20, "AD": "<5"})
+    assert main(["meta", str(small), str(plain[1]), str(tmp_path / "out")]) == 0
+    methods = (tmp_path / "out" / "meta" / "methods.md").read_text()
+    assert "48 participants at 2 sites" in methods
 
 
 def test_harmonized_values_are_refused(cohort, tmp_path, capsys):
