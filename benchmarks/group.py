@@ -119,7 +119,7 @@ def run(data: Path, out: Path, size: int) -> Run:
     stages: dict[str, float] = {}
     now, since = "start", 0.0
 
-    def note(stage: str, _done: int, _total: int) -> None:
+    def note(stage: str, *_: object) -> None:
         nonlocal now, since
         used = time.process_time()
         stages[now] = stages.get(now, 0.0) + used - since

@@ -30,3 +30,11 @@ def work(job):
 
 def broken_start():
     raise ModuleNotFoundError("not installed")
+
+
+#: Jobs in work, each time that one began.
+HEARD = []
+
+
+def hear(jobs):
+    HEARD.append(list(jobs))

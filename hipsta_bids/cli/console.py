@@ -9,7 +9,7 @@ import textwrap
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, redirect_stdout
+from contextlib import ExitStack, contextmanager, redirect_stdout, suppress
 from itertools import zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self, TextIO
@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from hipsta_bids.participant.run import RunResult
 
 
-#: Name of the first stage.
-SEARCH = "segmentations"
 #: How many warnings of a kind are printed.
 _LISTED_ROWS = 3
 
@@ -43,6 +41,8 @@ _WORD = re.compile(r"^(hipsta-bids:|warning:|note:)|(?<![^\s(])(use|look|failed)
 #: Bars of stages with parts, and of those without.
 _PARTS = "{desc}: {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}]"
 _WHOLE = "{desc} [{elapsed}]"
+
+_SEARCH = "segmentations"
 
 #: Narrowest that a column of a table is made, and the space between two.
 _NARROWEST, _GAP = 16, 2
@@ -136,8 +136,9 @@ class Progress:
             self._bar.update(0 if count is None else count - self._bar.n)
 
     def _tick(self) -> None:
-        if self._bar is not None:
-            self._bar.refresh()
+        with suppress(RuntimeError):  # it came while a line was written
+            if self._bar is not None:
+                self._bar.refresh()
 
     def report(self, outcome: "Outcome") -> None:
         """Show one outcome."""
@@ -156,8 +157,16 @@ class Progress:
         if self._bar is not None:
             self._bar.close()
             self._bar = None
-        if announced and self._stage not in {"", SEARCH, "hemispheres"}:  # these have a line each
+        if announced and self._stage not in {"", _SEARCH, "hemispheres"}:  # these have a line each
             echo(f"  {self._stage:<18}{time.monotonic() - self._start:6.1f} s")
+
+
+@contextmanager
+def searching(*, shown: bool) -> Iterator[None]:
+    """Show that segmentations are sought; what is found has lines of its own."""
+    with Progress(0 if shown else -1) as progress:
+        progress.show(_SEARCH)
+        yield
 
 
 @contextmanager

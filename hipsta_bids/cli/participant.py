@@ -184,8 +184,6 @@ def run_participant_level(options: "Namespace", arguments: Sequence[str] = ()) -
 
 def _run(options: "Namespace", arguments: Sequence[str]) -> ExitCode:
     pin_threads()
-    from hipsta_bids.settings import PUBLISHED, load_settings  # noqa: PLC0415  (start-up time)
-
     for name, reason in dict(options.ignored).items():
         console.echo(f"note: {name} has no effect: {reason}")
     check_folders(options)
@@ -194,12 +192,7 @@ def _run(options: "Namespace", arguments: Sequence[str]) -> ExitCode:
         raise UsageError("collect is about all parts; leave --shard out")
     if options.reports_only:
         return _rebuild_reports(options)
-    preset = PUBLISHED if options.method == "published" else {}
-    settings = load_settings(options.settings).changed(**preset)
-    settings = settings.changed(
-        body={"region": options.region} if options.region else {},
-        sheet={"x_coordinate": options.x_coordinate} if options.x_coordinate else {},
-    )
+    settings = _settings(options)
     if settings.body.region in EXPERIMENTAL:
         console.echo(f"note: region {settings.body.region} is experimental")
     request = input_request(options)
@@ -211,8 +204,7 @@ def _run(options: "Namespace", arguments: Sequence[str]) -> ExitCode:
 
     limit_memory(options.mem)
     requests = map_requests(options.map, options.map_sampling, options.map_interpolation)
-    with console.Progress(-1 if options.quiet or options.dry_run else 0) as progress:
-        progress.show(console.SEARCH)
+    with console.searching(shown=not (options.quiet or options.dry_run)):
         findings = _find(request, options.shard, say=console.echo if options.dry_run else None)
     if findings is None:
         console.echo(f"part {options.shard.name} of the dataset has nothing to process")
@@ -260,6 +252,18 @@ def _check_labels(items: "Sequence[HemisphereInput]", settings: "Settings") -> N
         console.echo(f"sub-{item.subject}{session} {item.hemi} {item.protocol.name}, {text}")
     wrong = len({id(item) for item, _ in problems})
     console.echo(f"labels of {len(usable)} hemispheres checked, problems in {wrong}")
+
+
+def _settings(options: "Namespace") -> "Settings":
+    """Resolve settings: those of a file, of the published method, and of single options."""
+    from hipsta_bids.settings import PUBLISHED, load_settings  # noqa: PLC0415  (start-up time)
+
+    preset = PUBLISHED if options.method == "published" else {}
+    settings = load_settings(options.settings).changed(**preset)
+    return settings.changed(
+        body={"region": options.region} if options.region else {},
+        sheet={"x_coordinate": options.x_coordinate} if options.x_coordinate else {},
+    )
 
 
 def _find(

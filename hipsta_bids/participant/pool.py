@@ -64,6 +64,10 @@ def processors() -> int:
     return os.cpu_count() or 1
 
 
+def _ignore(_jobs: list[Any]) -> None:
+    pass
+
+
 @dataclass(frozen=True, kw_only=True)
 class WorkerPlan:
     """How workers run."""
@@ -79,7 +83,7 @@ class WorkerPlan:
     """Importable function that loads libraries before the clock of the first job starts."""
     environment: tuple[tuple[str, str], ...] = ()
     """Further environment variables."""
-    begun: Callable[[list[Any]], None] | None = None
+    begun: Callable[[list[Any]], None] = _ignore
     """Importable function that hears of all jobs in work whenever one begins."""
     patience: float | None = None
     """Seconds that an idle worker waits for a job before it ends; ``None`` is forever."""
@@ -165,8 +169,7 @@ def run_jobs(plan: WorkerPlan, jobs: Iterable[Any]) -> Generator[tuple[Any, Any]
                 if waiting is not None and slot.ready and slot.job is None:
                     slot.give(waiting)
                     waiting = next(queue, None)
-                    if plan.begun is not None:
-                        plan.begun([slot.job for slot in slots if slot.job is not None])
+                    plan.begun([slot.job for slot in slots if slot.job is not None])
             if waiting is not None and len(slots) < plan.n_workers:
                 slots.append(_start(plan))
                 continue

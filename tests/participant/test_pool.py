@@ -8,7 +8,7 @@ import time
 from pathlib import Path
 
 import pytest
-from pool_jobs import broken_start, work
+from pool_jobs import HEARD, broken_start, hear, work
 
 from hipsta_bids.participant import pool
 from hipsta_bids.participant.pool import WorkerLost, WorkerPlan, run_jobs
@@ -144,10 +144,9 @@ def test_without_threads_workers_are_forked_and_nothing_is_loaded_twice(tmp_path
 
 
 def test_what_is_in_work_is_told(tmp_path):
-    told = []
     jobs = ["square 3", "square 4", "square 5"]
-    known = plan(tmp_path, n_workers=2, begun=lambda now: told.append(list(now)))
-    dict(run_jobs(known, jobs))
-    assert sorted({job for now in told for job in now}) == jobs
-    assert len(told) == 3
-    assert max(map(len, told)) <= 2
+    HEARD.clear()
+    dict(run_jobs(plan(tmp_path, n_workers=2, begun=hear), jobs))
+    assert sorted({job for now in HEARD for job in now}) == jobs
+    assert len(HEARD) == 3
+    assert max(map(len, HEARD)) <= 2

@@ -294,7 +294,9 @@ def test_pairs_count_what_was_measured_in_both_sessions(tmp_path, call):
     options = ("--paired", "1", "2")
     assert "analysis: T1 (47), T1-T2 (1);" in refused(call, (data, out), *options)
     gone = place_of(out, "05", "L", session="2").path("qc")
-    gone.write_text(json.dumps(json.loads(gone.read_text()) | {"decision": "failed", "reason": "x"}))
+    gone.write_text(
+        json.dumps(json.loads(gone.read_text()) | {"decision": "failed", "reason": "x"})
+    )
     assert not call((data, out), *options).lines
 
 
