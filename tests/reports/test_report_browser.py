@@ -118,15 +118,6 @@ def test_a_failed_hemisphere_shows_its_body_and_the_defect(visit):
     until(has_mark)
 
 
-def test_layers_of_the_slices_can_be_hidden(visit):
-    browser = visit("sub-01.html")
-    lines = browser.find_elements(By.CSS_SELECTOR, ".layers .line.mask")
-    shown = "return getComputedStyle(arguments[0]).display"
-    assert browser.execute_script(shown, lines[0]) != "none"
-    one(browser, ".t-mask").click()
-    assert browser.execute_script(shown, lines[0]) == "none"
-
-
 def rows(browser):
     return texts(browser, "#table tbody tr td:first-child")
 
@@ -270,7 +261,7 @@ def test_links_follow_the_table_as_it_was_left_or_severity_without_it(review, vi
     browser.execute_script("localStorage.clear()")
     visit("sub-02.html")
     link = one(browser, "[data-key=sub-02_hemi-L_seg-freesurfer] .next")
-    assert link.text == "next: sub-01 right: use →"
+    assert link.text == "sub-01 right: use →"
     assert link.get_attribute("href").endswith("sub-01.html#sub-01_hemi-R_seg-freesurfer")
 
 
