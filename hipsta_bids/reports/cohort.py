@@ -255,7 +255,10 @@ def cohort_page(cohort: Cohort) -> str | None:
 def _columns(hemispheres: Sequence[Hemisphere], *, compared: bool) -> list[Mapping[str, Any]]:
     """Columns of the table; those of one protocol, or of bodies alone, are left out."""
     names = [h.result.name for h in hemispheres]
-    columns: list[Mapping[str, Any]] = [{"key": "participant", "title": "Participant"}]
+    columns: list[Mapping[str, Any]] = [
+        {"key": "participant", "title": "Participant"},
+        {"key": "verdict", "title": "Verdict"},
+    ]
     if any(name.session for name in names):
         columns.append({"key": "session", "title": "Session"})
     columns.append({"key": "hemi", "title": "Side"})
@@ -271,7 +274,6 @@ def _columns(hemispheres: Sequence[Hemisphere], *, compared: bool) -> list[Mappi
             "help": "mm by which the mean thickness could be off times % of the map that could be"
             " wrong; from 1 on look before use; 100 is not measured",
         },
-        {"key": "verdict", "title": "Verdict"},
         {"key": "rating", "title": "Rating"},
         {"key": "status", "title": "Status"},
         {"key": "reason", "title": "Reason"},
