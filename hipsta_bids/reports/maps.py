@@ -54,9 +54,10 @@ _STYLE: Any = {
 _SVG_TAG = re.compile(rb"<svg[^>]*>")
 #: Style of drawings in a dark page. Lines on maps stay as they are: colors are behind them.
 _DARK = b"""<style>@media (prefers-color-scheme: dark) {
-text { fill: #e4e7ea } [style*="fill: #ffffff"] { fill: #15191d !important }
-:is([id^="matplotlib.axis"], [id^="patch"]) [style*="stroke: #000000"] {
-stroke: #e4e7ea !important } }</style>"""
+text { fill: #e4e7ea } text[style*="fill: #4d4d4d"] { fill: #a7b0ba !important }
+[style*="fill: #ffffff"] { fill: #15191d !important }
+:is([id^="matplotlib.axis"], [id^="patch"], [id^="figure"] > [id^="line2d"])
+[style*="stroke: #000000"] { stroke: #e4e7ea !important } }</style>"""
 
 # Tiles: many small maps in one picture, of which a browser shows a part each.
 _COLUMNS = 20  # side by side
