@@ -75,7 +75,10 @@
     return lines;
   }
 
-  const shown = Object.fromEntries([...document.querySelectorAll(".toggles input")].map((box) => [box.value, box.checked]));
+  // Boxes of all sides are one choice.
+  const shown = {}, boxes = [...document.querySelectorAll(".toggles input")];
+  for (const { value, checked } of boxes) shown[value] ||= checked;
+  for (const box of boxes) box.checked = shown[box.value];
 
   // A picture of one slice; its box is the corners of what it shows, mm to the right and up.
   class Picture {
