@@ -43,7 +43,7 @@ from hipsta_bids.reports.verdict import RATINGS
 from hipsta_bids.types import Float, Status
 
 #: Finer masks of failed hemispheres are thinned to about this edge before they are drawn, mm.
-_EDGE = 0.6
+_EDGE = 0.9
 
 
 def scene_of(hemisphere: Hemisphere, views: Views | None, names: Sequence[str]) -> dict[str, Any]:
@@ -342,7 +342,7 @@ def _sides(series: Series) -> Mapping[str, Any]:
 
         def message(finding: Finding, reason: str = reason) -> str:
             head = finding.message.partition(_CONCERNS)[0]
-            return head if head.lower() in reason else finding.message
+            return head if reason.startswith(head.lower()) else finding.message
 
         cards.append(
             {

@@ -84,6 +84,22 @@ def test_the_stack_of_slices_has_labels_body_and_image(shown):
     assert grays[labeled].mean() < grays[~labeled].mean() - 15
 
 
+def test_slices_across_have_one_scale_and_the_whole_body(shown):
+    hemisphere, views = views_of(shown.parent)
+    *across, along = stack_of(hemisphere, views)["panels"]
+    assert [panel["across"] for panel in (*across, along)] == [1, 1, 1, 1, 1, 0]
+    boxes = np.array([panel["box"] for panel in across])
+    sizes = boxes[:, 1] - boxes[:, 0]
+    np.testing.assert_allclose(sizes, np.broadcast_to(sizes[0], sizes.shape), atol=0.02)  # rounded
+    assert 1.5 - 0.01 <= sizes[0, 0] / sizes[0, 1] <= 2.0 + 0.01
+    levels = [round(panel["center"][1]) for panel in across]
+    assert levels == sorted({*levels})  # from posterior to anterior
+    for level, (low, high) in zip(levels, boxes, strict=True):
+        body = np.argwhere(views.mask[:, level]) * views.voxel[[0, 2]]
+        assert (body.min(axis=0) > low + 2).all()
+        assert (body.max(axis=0) < high - 2).all()
+
+
 def shift(path):
     image = nib.load(path)
     affine = image.affine.copy()

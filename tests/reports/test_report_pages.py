@@ -86,7 +86,7 @@ def test_a_finding_has_one_share(copy):
     other = f"filled a cavity of 5 grid nodes at RAS 20.0 -20.0 -20.0 mm (CA1){concerns}"
     spoil(path, lambda record: record["repairs"].append(other))
     both = participant_page(copy, "01", None, read_cohort(copy))
-    assert other in re.findall(listed, both)
+    assert re.findall(listed, both) == [repair + concerns, other]
 
 
 def scenes(text):
