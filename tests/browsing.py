@@ -149,3 +149,24 @@ def pixels(element):
 def colored(picture):
     """Share of the pixels that have a color, which neither the background nor letters have."""
     return float((np.ptp(picture, axis=-1) > 40).mean())
+
+
+def center(browser, element):
+    """Scroll an element to the middle of the window."""
+    browser.execute_script("arguments[0].scrollIntoView({block: 'center'})", element)
+    return element
+
+
+def enlarge(browser, selector):
+    """Click a slice, and wait for the large one."""
+    button = center(browser, one(browser, selector))
+    button.click()
+    until(lambda: texts(browser, "dialog[open] .facts"))
+    return button
+
+
+def show_layers(browser, *layers):
+    """Show these layers of slices only."""
+    for box in browser.find_elements(By.CSS_SELECTOR, ".card:first-of-type .toggles input"):
+        if box.is_selected() != (box.get_attribute("value") in layers):
+            box.click()

@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
@@ -10,6 +10,9 @@ import pandas as pd
 from hipsta_bids.io import files
 from hipsta_bids.protocols.protocol import Tissue
 from hipsta_bids.reports.display import subfield_title
+
+if TYPE_CHECKING:
+    from markupsafe import Markup
 
 #: Names of the sides in tables of maps; in those of summary measures LR may be a mean.
 SIDES = {"L": "left", "R": "right", "LR": "left minus right", "both": "both sides"}
@@ -181,8 +184,26 @@ def _usual_range(usual: Mapping[str, Any]) -> str:
     return f"at most {high}" if np.isinf(usual["low"]) else f"{low} to {high}"
 
 
+def _code(text: str) -> "Markup":
+    """Set what stands between backticks as code; no sign is escaped there, others may be."""
+    from markupsafe import Markup, escape  # noqa: PLC0415  (start-up)
+
+    html = Markup()
+    for n, run in enumerate(_CODE.split(text)):
+        if n % 3:
+            html += Markup("<code>{}</code>").format(run) if run else ""
+        else:
+            html += escape(_ESCAPED.sub("", run))
+    return html
+
+
+#: Code in Markdown, in one backtick or two, and a backslash before a sign.
+_CODE = re.compile(r"(?<!\\)(?:`` (.+?) ``|`([^`]+)`)")
+_ESCAPED = re.compile(r"\\(?=[\\`*~<$\]&_])")
+
 #: By the names that templates use.
 FILTERS: dict[str, Callable[..., str]] = {
+    "code": _code,
     "number": number_text,
     "decimals": _decimals,
     "p": p_text,

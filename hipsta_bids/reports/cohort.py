@@ -254,7 +254,10 @@ def cohort_page(cohort: Cohort) -> str | None:
 def _columns(hemispheres: Sequence[Hemisphere], *, compared: bool) -> list[Mapping[str, Any]]:
     """Columns of the table; those of one protocol, or of bodies alone, are left out."""
     names = [h.result.name for h in hemispheres]
-    columns: list[Mapping[str, Any]] = [{"key": "participant", "title": "Participant"}]
+    columns: list[Mapping[str, Any]] = [
+        {"key": "participant", "title": "Participant"},
+        {"key": "decision", "title": "Decision"},
+    ]
     if any(name.session for name in names):
         columns.append({"key": "session", "title": "Session"})
     columns.append({"key": "hemi", "title": "Side"})
@@ -263,7 +266,6 @@ def _columns(hemispheres: Sequence[Hemisphere], *, compared: bool) -> list[Mappi
     if any(name.region != "body" for name in names):
         columns.append({"key": "region", "title": "Region"})
     columns += [
-        {"key": "decision", "title": "Decision"},
         {"key": "rating", "title": "Rating"},
         {"key": "reason", "title": "Reason"},
         {

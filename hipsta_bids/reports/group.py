@@ -241,24 +241,14 @@ def _blocks(text: str) -> list[dict[str, Any]]:
         lines = part.splitlines()
         items = [re.match(r"(-|\d+\.)\s+(.*)", line) for line in lines]
         if part.startswith("#"):
-            blocks.append({"kind": "heading", "runs": [_runs(part.lstrip("# "))]})
+            blocks.append({"kind": "heading", "texts": [part.lstrip("# ")]})
         elif all(items):
             kind = "points" if part.startswith("-") else "numbers"
-            blocks.append({"kind": kind, "runs": [_runs(item[2]) for item in items if item]})
+            blocks.append({"kind": kind, "texts": [item[2] for item in items if item]})
         else:
-            blocks.append({"kind": "paragraph", "runs": [_runs(" ".join(lines))]})
+            blocks.append({"kind": "paragraph", "texts": [" ".join(lines)]})
     return blocks
 
-
-def _runs(text: str) -> list[tuple[bool, str]]:
-    """Split a text into runs, and tell which are code; no sign is escaped there."""
-    parts = re.split(r"(?<!\\)(?:`` (.+?) ``|`([^`]+)`)", text)
-    runs = [(i % 3 != 0, run) for i, run in enumerate(parts) if run]
-    return [(is_code, run if is_code else _ESCAPED.sub("", run)) for is_code, run in runs]
-
-
-#: A backslash before a sign of Markdown.
-_ESCAPED = re.compile(r"\\(?=[\\`*~<$\]&_])")
 
 #: Sections of the page, from top to bottom.
 SECTIONS: tuple[Section[GroupResults], ...] = (

@@ -15,6 +15,7 @@ from hipsta_bids.io import files
 from hipsta_bids.reports import cells
 
 _ALPHA = 0.05  # of tests of summary measures and of models, for a word only
+_LEAST_SHARE = 0.01  # share of a map; what survives in less of it is no finding of the same rank
 _MOST_ROWS = 200  # of lists, so that pages stay small
 
 
@@ -98,7 +99,7 @@ def direction(results: GroupResults, contrast: str, hemi: str, sign: float) -> s
 
 
 def findings(results: GroupResults) -> Mapping[str, Any] | None:
-    """Describe what survived, by measure and contrast."""
+    """Describe what survived, by measure and contrast, the largest part of a map first."""
     maps = results.table("maps")
     if "contrasts" not in results.record:
         return None  # nothing was compared
@@ -106,19 +107,25 @@ def findings(results: GroupResults) -> Mapping[str, Any] | None:
     if len(maps):
         for (measure, contrast), rows in maps.groupby(["measure", "contrast"], sort=False):
             sides = [_side(results, row) for row in records(rows)]
-            cards.append(
-                {
-                    "title": f"{cells.measure_title(measure)}, {contrast}",
-                    "found": any(side["found"] for side in sides),
-                    "sides": sides,
-                }
-            )
-    cards.sort(key=lambda card: not card["found"])
+            title = f"{cells.measure_title(measure)}, {contrast}"
+            share = max(side["share"] for side in sides)
+            cards.append({"title": title, "sides": sides, "share": share})
+    cards.sort(key=lambda card: -card["share"])
     settings = results.record.get("settings") or {}
     multiplicity = settings.get("multiplicity") or {}
+    scope = multiplicity.get("scope")
+    family = ["measure", "contrast", *(() if scope == "hemispheres" else ("hemi",))]
+    measures = results.table("measures")
     return {
-        "cards": cards,
-        "tested": len(results.table("measures")) > 0,
+        "n": len(cards),
+        "cards": [card for card in cards if card["share"] >= _LEAST_SHARE],
+        "few": [card for card in cards if 0 < card["share"] < _LEAST_SHARE],
+        "none": [card for card in cards if not card["share"]],
+        "least": _LEAST_SHARE,
+        "families": maps[family].drop_duplicates().shape[0] if len(maps) else 0,
+        "together": scope == "hemispheres",
+        "tested": len(measures),
+        "contrasts": measures["contrast"].nunique() if len(measures) else 0,
         "summaries": list(_summaries(results)),
         "classification": list(_classification(results)),
         "method": multiplicity.get("method"),
@@ -139,62 +146,54 @@ def _joint(settings: Mapping[str, Any]) -> dict[str, Any] | None:
 
 
 def _side(results: GroupResults, row: Mapping[str, Any]) -> dict[str, Any]:
-    points = results.table(str(row["file"]))
+    """Describe what survived in a map in one line."""
     peaks = results.everywhere("peaks")
     selected = (peaks["measure"] == row["measure"]) & (peaks["contrast"] == row["contrast"])
     candidates = peaks[selected & (peaks["hemi"] == row["hemi"])]
     n, total = int(row["n_significant"]), int(row["n_tests"])
-    title = cells.SIDES[row["hemi"]].capitalize()
+    title, share = cells.SIDES[row["hemi"]].capitalize(), n / total if total else 0.0
     if not len(candidates):
-        return {"title": title, "found": False, "text": "nothing could be tested.", "peak": ""}
-    if n:
-        counts = _where(results, row, points)
-        text = f"{n} of {total} points survive ({_percent(n / total)} of the map): {counts}."
-        first = records(candidates)[int(np.argmax(candidates["statistic"].abs()))]
-    else:
-        text = f"none of {total} points survives."
-        first = records(candidates)[0]
-    return {
-        "title": title,
-        "found": n > 0,
-        "text": text,
-        "peak": f"Strongest at {_peak(results, first, points)}.",
-    }
+        return {"title": title, "share": 0.0, "text": "nothing could be tested"}
+    if not n:
+        return {"title": title, "share": 0.0, "text": f"none of {total} points survives"}
+    points = results.table(str(row["file"]))
+    first = records(candidates)[int(np.argmax(candidates["statistic"].abs()))]
+    counts = "".join(_directions(results, row, points))
+    text = f"{n} of {total} points survive ({_percent(share)}){counts}"
+    return {"title": title, "share": share, "text": f"{text}; peak {_peak(results, first, points)}"}
 
 
 def _percent(share: float) -> str:
-    return f"{share:.0%}" if share >= 0.01 else "less than 1%"  # noqa: PLR2004
+    return f"{share:.0%}" if share >= _LEAST_SHARE else "less than 1%"
 
 
-def _where(results: GroupResults, row: Mapping[str, Any], points: pd.DataFrame) -> str:
-    """Count the points in each subfield, by direction."""
+def _directions(
+    results: GroupResults, row: Mapping[str, Any], points: pd.DataFrame
+) -> Iterator[str]:
+    """Name the directions of the points that survive; with two, count each."""
     significant = points[points["significant"] == True]  # noqa: E712  (may hold missing values)
-    signed = "cohen_d" in points and points["cohen_d"].notna().any()
-    parts = []
+    if "cohen_d" not in points or not points["cohen_d"].notna().any():
+        return
+    signs = np.sign(significant["statistic"])
     for sign in (1, -1):
-        rows = significant[np.sign(significant["statistic"]) == sign]
-        if not len(rows):
-            continue
-        shares = rows["subfield"].fillna("n/a").value_counts(normalize=True)
-        fields = [f"{name} {share:.0%}" for name, share in shares.items() if name != "n/a"]
-        words = [f"{len(rows)} points"]
-        if signed:
-            words.append(direction(results, str(row["contrast"]), str(row["hemi"]), sign))
-        parts.append(" ".join(words) + (f" ({', '.join(fields)})" if fields else ""))
-    return "; ".join(parts)
+        if count := int((signs == sign).sum()):
+            number = f"{count} " if count < len(significant) else ""
+            words = direction(results, str(row["contrast"]), str(row["hemi"]), sign)
+            yield f", {number}{words}"
 
 
 def _peak(results: GroupResults, peak: Mapping[str, Any], points: pd.DataFrame) -> str:
-    """Describe the position of a peak, its size and its significance."""
+    """Describe the position of a peak in words, its size and its significance."""
     corrected = f"corrected p {cells.p_text(peak['p_corrected'])}"
+    place = cells.position_text(peak).partition(" (x ")[0]
     if peak["measure"] == cells.JOINT:
-        return f"{cells.position_text(peak)}: {peak['measures']}; together {corrected}"
+        return f"{place}: {peak['measures']}; together {corrected}"
     point = point_of(peak, points)
     effects = [f"{cells.effect_name(peak['effect'])} {cells.number_text(peak['effect_size'])}"]
     if point is not None and np.isfinite(point["estimate"]):
         unit = map_unit(results, str(peak["measure"]))
-        effects.insert(0, f"estimate {cells.with_unit(cells.number_text(point['estimate']), unit)}")
-    return f"{cells.position_text(peak)}: {', '.join([*effects, corrected])}"
+        effects.insert(0, cells.with_unit(cells.number_text(point["estimate"]), unit))
+    return f"{place}: {', '.join([*effects, corrected])}"
 
 
 def map_unit(results: GroupResults, measure: str) -> str:
@@ -309,14 +308,17 @@ def summaries(results: GroupResults) -> Mapping[str, Any] | None:
     table = results.table("measures")
     if not len(table):
         return None
-    table = table[np.isfinite(table["statistic"])].sort_values("measure", kind="stable")
+    table = table[np.isfinite(table["statistic"])].sort_values(["p_fdr", "p"], kind="stable")
+    low = table["p_fdr"] < _ALPHA
     means = results.table("descriptives")
     models = table["model"].unique()
     return {
         "groups": list(means["group"].unique()) if len(means) else [],
         "means": {(row["measure"], row["hemi"], row["group"]): row for row in records(means)},
-        "rows": records(table),
+        "rows": records(table[low]),
+        "more": records(table[~low]),
         "alpha": _ALPHA,
+        "families": table["contrast"].nunique(),
         "letters": dict(zip(models, ascii_uppercase, strict=False)) if len(models) > 1 else {},
         "repeated": bool((table["visits"] > table["n"]).any()),
     }

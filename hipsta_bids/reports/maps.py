@@ -9,7 +9,7 @@ import re
 import shutil
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import cycle, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -50,6 +50,14 @@ _STYLE: Any = {
     "svg.fonttype": "none",
     "svg.hashsalt": "hipsta_bids",
 }
+
+_SVG_TAG = re.compile(rb"<svg[^>]*>")
+#: Style of drawings in a dark page. Lines on maps stay as they are: colors are behind them.
+_DARK = b"""<style>@media (prefers-color-scheme: dark) {
+text { fill: #e4e7ea } text[style*="fill: #4c4c4c"] { fill: #a7b0ba !important }
+[style*="fill: #ffffff"] { fill: #15191d !important }
+:is([id^="matplotlib.axis"], [id^="patch"], [id^="figure"] > [id^="line2d"])
+[style*="stroke: #000000"] { stroke: #e4e7ea !important } }</style>"""
 
 # Tiles: many small maps in one picture, of which a browser shows a part each.
 _COLUMNS = 20  # side by side
@@ -96,15 +104,26 @@ class Picture:
     caption: str
     width: int
     """CSS pixels at which its letters have their size."""
+    pins: tuple[tuple[float, float], ...] = ()
+    """Places in it, percent from its left and upper edge."""
 
     @property
     def address(self) -> str:
-        """Data address."""
-        return "data:image/svg+xml;base64," + base64.b64encode(self.content).decode()
+        """Data address; in a dark page, what is white is dark and what is black is light."""
+        content = _SVG_TAG.sub(rb"\g<0>" + _DARK, self.content, count=1)
+        return "data:image/svg+xml;base64," + base64.b64encode(content).decode()
 
 
-def draw_map(kind: MapKind, hemispheres: Sequence[Hemisphere]) -> Picture:
-    """Draw one map of both hemispheres, unfolded, side by side on one color scale."""
+def draw_map(
+    kind: MapKind,
+    hemispheres: Sequence[Hemisphere],
+    *,
+    pins: Sequence[tuple[float, float, float]] = (),
+) -> Picture:
+    """Draw one map of hemispheres, unfolded, side by side on one color scale.
+
+    ``pins`` are points, RAS mm, whose nearest columns in the first map become pins.
+    """
     height = 3.1 if hemispheres[0].sheet.ends is None else 4.6
     figure, axes = _new_figure(1, len(hemispheres), (2.6 * len(hemispheres) + 0.9, height))
     low, high = scale_of(kind, [h.sheet.columns[kind.column] for h in hemispheres])
@@ -121,12 +140,28 @@ def draw_map(kind: MapKind, hemispheres: Sequence[Hemisphere]) -> Picture:
         f"{h.side} mean {np.nanmean(h.sheet.columns[kind.column]):.{kind.digits}f}"
         for h in hemispheres
     )
-    return _encode(
+    picture = _encode(
         figure,
         alt=f"{kind.title} on the unfolded sheet, {means} {kind.unit}, colors from {low:.3g} to"
         f" {high:.3g} {kind.unit}",
         caption=kind.title,
     )
+    if not pins:
+        return picture
+    return replace(picture, pins=tuple(_pins(axes[0, 0], hemispheres[0].sheet, pins)))
+
+
+def _pins(
+    axis: "Axes", sheet: SheetTable, points: Sequence[tuple[float, float, float]]
+) -> Iterator[tuple[float, float]]:
+    """Find the columns nearest to points in a map that was drawn, percent of its figure."""
+    corners = axis.collections[0].get_coordinates()  # type: ignore[attr-defined]  # of a mesh
+    to_shares = axis.transData - axis.figure.transFigure
+    for point in points:
+        gaps = np.linalg.norm(sheet.points["midthickness"] - np.array(point), axis=-1)
+        i, j = np.unravel_index(np.nanargmin(gaps), gaps.shape)
+        x, y = to_shares.transform(corners[j : j + 2, i : i + 2].mean(axis=(0, 1)))
+        yield round(100 * float(x), 1), round(100 * (1 - float(y)), 1)
 
 
 def draw_profiles(
@@ -257,17 +292,17 @@ def _draw_ends(axis: "Axes", sheet: SheetTable, y: Float) -> None:
 
 
 def _hatch(axis: "Axes", nodes: NDArray[np.bool_], x: Float, y: Float, hatch: str) -> None:
-    from matplotlib.collections import PolyCollection  # noqa: PLC0415  (slow to load)
+    from matplotlib.patches import PathPatch  # noqa: PLC0415  (slow to load)
+    from matplotlib.path import Path as Outline  # noqa: PLC0415
 
     x_edges, y_edges = _edges(x), _edges(y)
     cells = [
         [(x_edges[i], y_edges[j]), (x_edges[i + 1], y_edges[j]),
-         (x_edges[i + 1], y_edges[j + 1]), (x_edges[i], y_edges[j + 1])]
+         (x_edges[i + 1], y_edges[j + 1]), (x_edges[i], y_edges[j + 1]), (x_edges[i], y_edges[j])]
         for i, j in np.argwhere(nodes)
     ]  # fmt: skip
-    axis.add_collection(
-        PolyCollection(cells, facecolors="none", edgecolors="black", linewidths=0, hatch=hatch)
-    )
+    area = Outline.make_compound_path(*(Outline(cell, closed=True) for cell in cells))
+    axis.add_patch(PathPatch(area, facecolor="none", edgecolor="black", linewidth=0, hatch=hatch))
 
 
 def _edges(nodes: Float) -> Float:
@@ -278,7 +313,8 @@ def _edges(nodes: Float) -> Float:
 
 def _draw_borders(axis: "Axes", names: NDArray[np.str_], x: Float, y: Float) -> None:
     """Draw the borders between subfields along cell edges, and their names."""
-    from matplotlib.collections import LineCollection  # noqa: PLC0415  (slow to load)
+    from matplotlib.collections import PathCollection  # noqa: PLC0415  (slow to load)
+    from matplotlib.path import Path as Outline  # noqa: PLC0415
 
     x_edges, y_edges = _edges(x), _edges(y)
     named = names != ""
@@ -288,8 +324,12 @@ def _draw_borders(axis: "Axes", names: NDArray[np.str_], x: Float, y: Float) -> 
         *(((x_edges[i + 1], y_edges[j]), (x_edges[i + 1], y_edges[j + 1])) for i, j in across),
         *(((x_edges[i], y_edges[j + 1]), (x_edges[i + 1], y_edges[j + 1])) for i, j in along),
     ]
-    axis.add_collection(LineCollection(lines, colors="white", linewidths=2.2))
-    axis.add_collection(LineCollection(lines, colors="black", linewidths=1.0))
+    # Lines apart from each other are one path, so that pages stay small.
+    borders = [Outline.make_compound_path(*map(Outline, lines))] if lines else []
+    for color, width in (("white", 2.2), ("black", 1.0)):
+        lines_of_color = PathCollection(borders, edgecolors=color, facecolors="none")
+        lines_of_color.set_linewidth(width)
+        axis.add_collection(lines_of_color)
     fields = np.unique(names[named])
     staggered = 0.07 * (y[-1] - y[0]) if named.any() and not named.all() else 0.0
     for name, side in zip(fields, cycle((-1, 1)), strict=False):

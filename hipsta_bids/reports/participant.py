@@ -1,6 +1,6 @@
 """The page about one visit: is this hemisphere usable, and what went wrong."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cached_property
@@ -23,7 +23,6 @@ from hipsta_bids.reports.display import (
     THICKNESS,
     UNCERTAINTY,
     colors_of,
-    gradient_of,
     palette,
     scale_of,
     subfield_title,
@@ -39,12 +38,12 @@ from hipsta_bids.reports.results import (
     input_path,
     read_views,
 )
-from hipsta_bids.reports.slices import point_panels, section_panels, slice_panels, stack_of
+from hipsta_bids.reports.slices import stack_of
 from hipsta_bids.reports.verdict import RATINGS
 from hipsta_bids.types import Decision, Float
 
 #: Finer masks of failed hemispheres are thinned to about this edge before they are drawn, mm.
-_EDGE = 0.6
+_EDGE = 0.9
 
 
 def scene_of(hemisphere: Hemisphere, views: Views | None, names: Sequence[str]) -> dict[str, Any]:
@@ -98,7 +97,6 @@ def scales_of(hemispheres: Sequence[Hemisphere]) -> dict[str, Any]:
 def _sheet_scene(hemisphere: Hemisphere, names: Sequence[str]) -> dict[str, Any]:
     sheet = hemisphere.sheet
     index = {name: n for n, name in enumerate(names)}
-    ends = [hemisphere.metrics.get(f"{end}_plane") for end in ("posterior", "anterior")]
     return {
         "shape": sheet.shape,
         "parts": sheet.parts,
@@ -113,12 +111,21 @@ def _sheet_scene(hemisphere: Hemisphere, names: Sequence[str]) -> dict[str, Any]
         "subfield": [index.get(str(name), -1) for name in sheet.subfield.ravel()],
         "valid": sheet.valid.astype(int).ravel().tolist(),
         "repaired": sheet.repaired.astype(int).ravel().tolist(),
-        "planes": [
-            {"point": plane["point_ras_mm"], "normal": plane["normal_ras"], "end": end}
-            for end, plane in enumerate(ends)
-            if isinstance(plane, Mapping)
-        ],
+        "planes": list(_planes(hemisphere)),
     }
+
+
+def _planes(hemisphere: Hemisphere) -> Iterator[dict[str, Any]]:
+    """Describe the end planes by their points nearest to the middle of the sheet's end."""
+    sheet = hemisphere.sheet
+    rows = sheet.ends or (0, -1)
+    for end, (name, row) in enumerate(zip(("posterior", "anterior"), rows, strict=True)):
+        plane = hemisphere.metrics.get(f"{name}_plane")
+        if isinstance(plane, Mapping):
+            point, normal = (np.array(plane[key]) for key in ("point_ras_mm", "normal_ras"))
+            center = np.nanmean(sheet.points["midthickness"][:, row], axis=0)
+            center += ((point - center) @ normal) * normal
+            yield {"point": center.round(2).tolist(), "normal": normal.tolist(), "end": end}
 
 
 def subfields_of(hemispheres: Sequence[Hemisphere]) -> list[str]:
@@ -149,8 +156,8 @@ def _body(mask: NDArray[np.bool_], views: Views) -> tuple[Float, NDArray[np.int6
     return points, triangles
 
 
-#: Points that messages name are all listed; this many are shown in slices.
-_POINTS_SHOWN = 4
+#: What a message says of the columns concerned, which the headline says of the same finding.
+_CONCERNS = "; it concerns"
 
 #: Rows of the quality table that hold words, and the keys of the quality record.
 _FACTS = (
@@ -323,47 +330,38 @@ def _origin_of(hemisphere: Hemisphere, cohort: Cohort) -> tuple[str | None, str]
     return None, f"{datetime.fromtimestamp(written, UTC):%Y-%m-%d %H:%M} UTC"
 
 
-def _status(series: Series) -> Mapping[str, Any]:
-    cards = [card_of(h, series.cohort, series.view(h)) for h in series.hemispheres]
-    return {"cards": cards, "ratings": RATINGS}
-
-
-def _points(series: Series) -> Mapping[str, Any] | None:
-    """Slices through the points that messages name."""
-    groups = []
+def _sides(series: Series) -> Mapping[str, Any]:
+    """Collect what decides about each hemisphere: slices, map, findings and rating."""
+    cards = []
     for hemisphere in series.hemispheres:
         view = series.view(hemisphere)
+        card = card_of(hemisphere, series.cohort, view)
         points = _points_of(hemisphere)
-        if view is None or not points:
-            continue
-        panels = [
-            {
-                "findings": findings,
-                "urgent": any(finding.kind != "repair" for finding in findings),
-                "panels": point_panels(hemisphere, view, point),
-            }
-            for point, findings in list(points.items())[:_POINTS_SHOWN]
-        ]
-        remaining = list(points.values())[_POINTS_SHOWN:]
-        groups.append({"side": hemisphere.side, "points": panels, "more": remaining})
-    return {"groups": groups, "legend": _legend(series)} if groups else None
+        placeless = [f for f in hemisphere.findings if f.point is None]
+        reason = card["verdict"].reason.rstrip(".").lower()
 
+        def message(finding: Finding, reason: str = reason) -> str:
+            head = finding.message.partition(_CONCERNS)[0]
+            return head if reason.startswith(head.lower()) else finding.message
 
-def _input(series: Series) -> Mapping[str, Any]:
-    groups = []
-    for hemisphere in series.hemispheres:
-        view = series.view(hemisphere)
-        panels = slice_panels(hemisphere, view) if view else []
-        groups.append(
+        cards.append(
             {
+                **card,
+                "points": [
+                    (min(f.kind for f in found), "; ".join(map(message, found)))
+                    for found in points.values()
+                ],
+                "rest": [(f.kind, message(f)) for f in placeless],
+                "map": draw_map(THICKNESS, [hemisphere], pins=list(points))
+                if hemisphere.measured
+                else None,
                 "hemisphere": hemisphere,
                 "path": input_path(hemisphere),
                 "view": view,
-                "panels": panels,
-                "stack": stack_of(view) if panels and view else None,
+                "stack": stack_of(hemisphere, view) if view else None,
             }
         )
-    return {"groups": groups, "legend": _legend(series), "whole": series.whole}
+    return {"cards": cards, "ratings": RATINGS, "legend": _legend(series), "whole": series.whole}
 
 
 def _legend(series: Series) -> Mapping[str, str]:
@@ -381,7 +379,7 @@ def _sheets(series: Series) -> Mapping[str, Any] | None:
     if not measured:
         return None
     uncertain = [h for h in measured if UNCERTAINTY.column in h.sheet.columns]
-    pictures = [draw_map(kind, measured) for kind in MAP_KINDS]
+    pictures = [draw_map(kind, measured) for kind in MAP_KINDS if kind != THICKNESS]
     pictures += [draw_map(UNCERTAINTY, uncertain)] if uncertain else []
     return {
         "pictures": pictures,
@@ -411,19 +409,6 @@ def _view(series: Series) -> Mapping[str, Any] | None:
         return None
     data = {"scenes": scenes, "scales": scales_of(series.measured)}
     return {"data": data, "measured": bool(series.measured)}
-
-
-def _sections(series: Series) -> Mapping[str, Any] | None:
-    measured = series.measured
-    if not measured:
-        return None
-    scale = scale_of(THICKNESS, [h.sheet.columns["thickness"] for h in measured])
-    colors = colors_of(THICKNESS.colors)
-    return {
-        "groups": [(h.side, section_panels(h, colors, scale)) for h in measured],
-        "scale": scale,
-        "gradient": gradient_of(colors),
-    }
 
 
 def _profiles(series: Series) -> Mapping[str, Any] | None:
@@ -459,13 +444,10 @@ def _origin(series: Series) -> Mapping[str, Any]:
 SECTIONS: tuple[Section[Series], ...] = tuple(
     Section(key=key, title=title, template=f"sections/{key}.html", build=build)
     for key, title, build in (
-        ("status", "Verdict", _status),
-        ("points", "Where to look", _points),
+        ("status", "Hemispheres", _sides),
         ("numbers", "Key numbers", _key_numbers),
-        ("input", "Labels and body", _input),
         ("sheet", "Unfolded maps", _sheets),
         ("view", "Three dimensions", _view),
-        ("sections", "Cross-sections", _sections),
         ("profiles", "Profiles", _profiles),
         ("quality", "Quality", _quality_numbers),
         ("correct", "How to correct it", _correct),

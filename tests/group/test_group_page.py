@@ -117,7 +117,66 @@ def test_findings_are_those_of_the_tables(out, page):
     peaks = table(out / "group" / MODEL / "peaks.tsv")
     first = peaks[(peaks.measure == "thickness") & (peaks.hemi == "L")].iloc[0]
     assert f"d {first.effect_size:.3g}" in page
-    assert "points larger in CN" in page
+    assert "%), larger in CN; peak CA1, " in page
+
+
+def found(page):
+    """Titles of what was found, with the lines of the sides, and the folded rest."""
+    part = re.search(r'<section id="group-found".*?</section>', page, re.DOTALL)[0]
+    cards = re.findall(r'<div class="card yes">\n<h3>(.*?)</h3>(.*?)</div>', part, re.DOTALL)
+    return part, [(title, re.findall(r"</b> (.*?)</li>", lines)) for title, lines in cards]
+
+
+def test_a_map_with_few_points_is_no_finding_of_the_same_rank(copy):
+    folder = copy / "group" / MODEL
+    change_table(folder / "maps.tsv", "n_tests", lambda content: ["861"] * len(content))
+
+    def counts(content):
+        return [{"thickness": 225, "curvature": 1}[m.split("_")[0]] for m in content["measure"]]
+
+    change_table(folder / "maps.tsv", "n_significant", counts)
+    part, cards = found(group_page(folder))
+    assert cards[0][0] == "Thickness, CN-AD"
+    assert all(title.startswith("Thickness") for title, _ in cards)
+    assert "225 of 861 points survive (26%)" in cards[0][1][0]
+    folded = part.index("contrasts of maps survive in less than 1% of a map</summary>")
+    assert part.index("1 of 861 points survive (less than 1%)") > folded
+    n = len(pd.read_csv(folder / "maps.tsv", sep="\t"))
+    assert f"{n} families of points were tested" in part
+
+
+def test_the_largest_part_of_a_map_comes_first(copy):
+    folder = copy / "group" / MODEL
+    change_table(
+        folder / "maps.tsv",
+        "n_significant",
+        lambda content: [30 if m == "curvature" else 15 for m in content["measure"]],
+    )
+    _, cards = found(group_page(folder))
+    assert cards[0][0] == "Curvature, CN-AD"
+
+
+def test_summaries_are_in_the_order_of_corrected_p_and_folded_above_the_level(copy):
+    path = copy / "group" / MODEL / "measures.tsv"
+    ps = []
+
+    def values(content):
+        ps.extend(
+            f"{0.001 + 0.09 * (n * 7 % len(content)) / len(content):.4f}"
+            for n in range(len(content))
+        )
+        return ps
+
+    change_table(path, "p_fdr", values)
+    text = group_page(copy / "group" / MODEL)
+    rows = [rows_of(text, label)[1] for label in ("Summary measures", "Other summary measures")]
+    shown = [[float(row["p, FDR"]) for row in part] for part in rows]
+    assert shown[0] + shown[1] == sorted(round(float(p), 3) for p in ps)
+    assert max(shown[0]) < 0.05 <= min(shown[1])
+    assert text.index(
+        "<details><summary>", text.index('aria-label="Summary measures"')
+    ) < text.index('aria-label="Other summary measures"')
+    assert f"{len(ps)} tests, by corrected p; {len(shown[0])} are below 0.05" in text
 
 
 def test_maps_are_those_of_the_tables(out, page):
@@ -194,7 +253,7 @@ def rows_of(page, label):
     return titles, [dict(zip(titles, row, strict=True)) for row in rows]
 
 
-@pytest.mark.parametrize("label", ["Summary measures", "Classification"])
+@pytest.mark.parametrize("label", ["Other summary measures", "Classification"])
 def test_what_decides_comes_before_what_may_be_cut_off(page, label):
     titles, rows = rows_of(page, label)
     assert titles.index("p") == 2
@@ -358,22 +417,61 @@ def test_texts_can_be_read_in_both_themes(visit, theme):
     assert found == []
 
 
-@pytest.mark.parametrize("label", ["Clusters and peaks", "Summary measures", "Classification"])
+@pytest.mark.parametrize(
+    "label", ["Clusters and peaks", "Other summary measures", "Classification"]
+)
 def test_no_column_is_cut_off(visit, label):
-    table_of = one(visit(), f"[aria-label='{label}']")
+    browser = visit()
+    table_of = one(browser, f"[aria-label='{label}']")
+    browser.execute_script("arguments[0].closest('details, main').open = true", table_of)
     assert int(table_of.get_property("scrollWidth")) <= int(table_of.get_property("clientWidth"))
 
 
 def test_figures_are_few_and_the_page_is_short(visit):
-    """Of four measures here; the figure of curves is missing, of about 300 pixels."""
+    """Of four measures here; two figures, of a column's width in print, have 2,200 pixels."""
     browser = visit()
     assert len(texts(browser, "figure")) <= 15
-    assert browser.execute_script("return document.documentElement.scrollHeight") < 6000
+    assert browser.execute_script("return document.documentElement.scrollHeight") < 7000
     shown = [e for e in browser.find_elements("css selector", ".plate") if e.is_displayed()]
     assert len(shown) == 2  # more measures are folded
     for picture in shown:
         browser.execute_script("arguments[0].scrollIntoView({block: 'center'})", picture)
         assert colored(pixels(picture)) > 0.1
+
+
+@pytest.mark.parametrize(("width", "printed"), [(1280, 680), (1280, 320), (390, 680)])
+def test_figures_fill_the_page(visit, width, printed):
+    """Up to twice their size in print; on a phone they scroll, so that they can be read."""
+    browser = visit(width)
+    plate = one(browser, ".plate")
+    browser.execute_script(f"arguments[0].style.setProperty('--width', '{printed}px')", plate)
+    room = one(browser, "main").size["width"] - (32 if width > 800 else 28)
+    assert plate.size["width"] == pytest.approx(min(max(room, 640), 2 * printed), abs=1)
+    assert one(browser, ".plate img").size["width"] == plate.size["width"]
+
+
+def test_what_was_found_is_a_line_for_each_side(visit):
+    browser = visit()
+    lines = browser.find_elements("css selector", "#group-found .card li")
+    assert len(lines) >= 2
+    assert max(line.size["height"] for line in lines) < 30
+
+
+def test_figures_have_no_white_boxes_in_the_dark_theme(visit):
+    browser = visit()
+    use_theme(browser, "dark")
+    plates = [e for e in browser.find_elements("css selector", ".plate") if e.is_displayed()]
+    browser.execute_script("arguments[0].scrollIntoView({block: 'center'})", plates[0])
+    picture = pixels(plates[0])
+    use_theme(browser, "light")
+    browser.execute_script("arguments[0].scrollIntoView({block: 'center'})", plates[0])
+    light = pixels(plates[0])
+    dark = (picture.max(axis=-1) < 60).mean()
+    assert dark > 0.4
+    assert (light > 240).all(axis=-1).mean() > 0.4
+    # Values have the colors that they have on white.
+    values = [shot[np.ptp(shot, axis=-1) > 80].mean(axis=0) for shot in (picture, light)]
+    assert np.abs(np.subtract(*values)).max() < 8
 
 
 def test_pointing_at_a_map_tells_its_values(visit, out):

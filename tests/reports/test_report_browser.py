@@ -118,15 +118,6 @@ def test_a_failed_hemisphere_shows_its_body_and_the_defect(visit):
     until(has_mark)
 
 
-def test_layers_of_the_slices_can_be_hidden(visit):
-    browser = visit("sub-01.html")
-    lines = browser.find_elements(By.CSS_SELECTOR, ".layers .line.mask")
-    shown = "return getComputedStyle(arguments[0]).display"
-    assert browser.execute_script(shown, lines[0]) != "none"
-    one(browser, ".t-mask").click()
-    assert browser.execute_script(shown, lines[0]) == "none"
-
-
 def rows(browser):
     return texts(browser, "#table tbody tr td:first-child")
 
@@ -204,7 +195,7 @@ def ratings(browser):
     """Participant, side, rating and note of the rows that are shown."""
     return browser.execute_script(
         "return [...document.querySelectorAll('#table tbody tr')].map(row => [...row.cells])"
-        ".map(([who, side, , , rating]) => [who.textContent, side.textContent,"
+        ".map(([who, , side, , rating]) => [who.textContent, side.textContent,"
         " rating.querySelector('.rate').textContent.replace('none', ''),"
         " rating.querySelector('.remark').textContent])"
     )
@@ -270,7 +261,7 @@ def test_links_follow_the_table_as_it_was_left_or_severity_without_it(review, vi
     browser.execute_script("localStorage.clear()")
     visit("sub-02.html")
     link = one(browser, "[data-key=sub-02_hemi-L_seg-freesurfer] .next")
-    assert link.text == "next: sub-01 right: use →"
+    assert link.text == "sub-01 right: use →"
     assert link.get_attribute("href").endswith("sub-01.html#sub-01_hemi-R_seg-freesurfer")
 
 
@@ -341,17 +332,39 @@ def test_the_command_that_opens_the_files_is_copied(visit):
     remark.clear()
 
 
-def test_all_of_hundreds_of_rows_are_shown_and_sorted(visit, out, tmp_path):
+def change_table(out, folder, change):
+    """Write the page of all hemispheres with other rows."""
     text = (out / "report.html").read_text()
     found = re.search(r'id="data">(.*?)</script>', text, re.DOTALL)
     data = json.loads(found[1])
-    data["rows"] = [
-        {**data["rows"][n % 4], "key": f"k{n}", "participant": f"sub-{n:03d}", "volume": n}
-        for n in range(200)
-    ]
-    page = tmp_path / "report.html"
+    change(data)
+    page = folder / "report.html"
     page.write_text(text.replace(found[1], json.dumps(data)))
-    browser = visit(page)
+    return page
+
+
+def test_maps_of_several_protocols_are_named_by_them(visit, out, tmp_path):
+    def change(data):
+        data["columns"].insert(3, {"key": "seg", "title": "Protocol"})
+        data["rows"] += [{**row, "seg": "ashsPMC", "key": f"{row['key']}2"} for row in data["rows"]]
+
+    browser = visit(change_table(out, tmp_path, change), 390)
+    names = texts(browser, "#tiles .name")
+    assert {"01 R freesurfer", "01 R ashsPMC"} <= {*names}
+    assert len(names) == len({*names}) == 8
+    badges = browser.find_elements(By.CSS_SELECTOR, "#table .badge:is(.use, .look, .refuse)")
+    assert len(badges) == 8
+    assert max(badge.rect["x"] + badge.size["width"] for badge in badges) <= 390
+
+
+def test_all_of_hundreds_of_rows_are_shown_and_sorted(visit, out, tmp_path):
+    def change(data):
+        data["rows"] = [
+            {**data["rows"][n % 4], "key": f"k{n}", "participant": f"sub-{n:03d}", "volume": n}
+            for n in range(200)
+        ]
+
+    browser = visit(change_table(out, tmp_path, change))
     until(lambda: len(rows(browser)) == 200)
     one(browser, "[data-key=volume] button").click()
     assert rows(browser)[0] == "sub-199"

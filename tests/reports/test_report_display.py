@@ -56,7 +56,6 @@ def test_a_page_without_any_map_has_bodies_and_says_where_slices_are_empty(copy)
     # The right body is interrupted in the middle, where the third of its slices is.
     captions = re.findall(r"<figcaption>(coronal, 50%.*?)</figcaption>", text)
     assert ["nothing of the body" in caption for caption in captions] == [False, True]
-    assert text.count('class="empty"') == 1
 
 
 def test_labels_without_the_protocols_codes_cost_the_slices_only(copy):
@@ -160,9 +159,14 @@ def test_a_color_means_the_same_on_every_page(out):
     assert first == second
     ends = (first["thickness"]["low"], first["thickness"]["high"])
     bar = r'<p class="colorbar[^>]*><span>≤ ([-\d.]+)</span>.*?<span>≥ ([-\d.]+) mm</span>'
-    for name in ("sub-01.html", "sub-02.html", "report.html"):
-        found = re.search(bar, (out / name).read_text())
-        assert (float(found[1]), float(found[2])) == ends
+    drawn = r'alt="Thickness on the unfolded sheet, [^"]*, colors from ([\d.]+) to ([\d.]+) mm"'
+    for name, said, maps in (
+        ("sub-01.html", drawn, 2),
+        ("sub-02.html", drawn, 1),
+        ("report.html", bar, 1),
+    ):
+        found = re.findall(said, (out / name).read_text())
+        assert [tuple(map(float, pair)) for pair in found] == [ends] * maps
 
 
 def effects_of_noise(kind="t", n=24, points=861):

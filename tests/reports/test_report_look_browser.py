@@ -1,4 +1,4 @@
-"""Slices, the view in three dimensions, themes and paper in a real browser; see :mod:`browsing`."""
+"""Touch, the view in three dimensions, themes and paper in a real browser; see :mod:`browsing`."""
 
 import base64
 import re
@@ -7,21 +7,22 @@ import shutil
 import numpy as np
 import pytest
 from browsing import (
+    center,
     colored,
+    enlarge,
     faint,
     fits,
     one,
     open_page,
     pixels,
+    show_layers,
     texts,
     until,
     use_theme,
     watched,
 )
 from selenium import webdriver
-from selenium.webdriver.common.actions.wheel_input import ScrollOrigin
 from selenium.webdriver.common.by import By
-from selenium.webdriver.common.keys import Keys
 
 from hipsta_bids.reports.cohort import read_cohort
 from hipsta_bids.reports.participant import participant_page
@@ -35,110 +36,8 @@ def visit(browser, shown):
         yield lambda name, width=1280: open_page(browser, shown / name, width)
 
 
-def center(browser, element):
-    browser.execute_script("arguments[0].scrollIntoView({block: 'center'})", element)
-    return element
-
-
-def enlarge(browser, selector):
-    """Click a slice, and wait for the large one."""
-    button = center(browser, one(browser, selector))
-    button.click()
-    until(lambda: texts(browser, "dialog[open] .facts"))
-    return button
-
-
 def level(browser):
     return int(re.match(r"Slice (\d+) of", texts(browser, "dialog .facts")[0])[1])
-
-
-def press(browser, *keys):
-    browser.switch_to.active_element.send_keys(*keys)
-
-
-def test_a_slice_enlarges_moves_and_closes_by_keys(visit):
-    browser = visit("sub-01.html")
-    button = one(browser, "[id$=-input] .enlarge")
-    browser.execute_script("arguments[0].focus()", button)
-    press(browser, Keys.ENTER)
-    until(lambda: texts(browser, "dialog[open] .facts"))
-    first = level(browser)
-    assert first == int(button.get_attribute("data-level")) + 1
-    assert "norm.mgz" in texts(browser, "dialog .facts")[0]
-    canvas = one(browser, "dialog canvas")
-    assert canvas.size["width"] > 2.5 * button.size["width"]
-    assert colored(pixels(canvas)) > 0.01
-    before = pixels(canvas)
-    press(browser, Keys.ARROW_UP, Keys.ARROW_UP, Keys.ARROW_LEFT)
-    assert level(browser) == first + 1
-    assert (pixels(canvas) != before).any(axis=-1).mean() > 0.05
-    press(browser, Keys.PAGE_UP)
-    assert level(browser) == first + 6
-    # It ends with the first and last slice.
-    last = int(texts(browser, "dialog .facts")[0].split(" of ")[1].split(",")[0])
-    press(browser, Keys.END, Keys.ARROW_UP)
-    assert level(browser) == last
-    press(browser, Keys.HOME, Keys.ARROW_DOWN)
-    assert level(browser) == 1
-    press(browser, Keys.ESCAPE)
-    assert browser.find_elements(By.CSS_SELECTOR, "dialog[open]") == []
-    assert browser.switch_to.active_element == button
-
-
-def test_a_slice_moves_by_wheel_and_buttons_and_hides_its_layers(visit):
-    browser = visit("sub-01.html")
-    enlarge(browser, "[id$=-input] .panel:nth-of-type(3) .enlarge")
-    canvas, first = one(browser, "dialog canvas"), level(browser)
-    origin = ScrollOrigin.from_element(canvas)
-    webdriver.ActionChains(browser).scroll_from_origin(origin, 0, 120).perform()
-    until(lambda: level(browser) == first - 3)
-    one(browser, "dialog [aria-label='Next slice']").click()
-    assert level(browser) == first - 2
-    one(browser, "dialog [aria-label='Previous slice']").click()
-    assert level(browser) == first - 3
-    whole = pixels(canvas)
-    one(browser, "dialog [value=labels]").click()
-    plain = pixels(canvas)
-    assert colored(whole) > 0.01 > colored(plain)
-    one(browser, "dialog [value=anatomy]").click()
-    # Letters, a ruler and the outline on white are left.
-    white = (pixels(canvas) > 250).all(axis=-1).mean()
-    assert white > 0.8 > (plain > 250).all(axis=-1).mean() + 0.5
-    one(browser, "dialog [value=body]").click()
-    assert (pixels(canvas) > 250).all(axis=-1).mean() > white + 0.005
-    one(browser, "dialog [aria-label=Close]").click()
-    assert browser.find_elements(By.CSS_SELECTOR, "dialog[open]") == []
-
-
-def test_labels_in_the_large_slice_have_the_colors_of_the_small_one(visit):
-    browser = visit("sub-02.html")  # without an image behind, on white
-    button = center(browser, one(browser, "[id$=-input] .panel:nth-of-type(3) .enlarge"))
-    for name in ("mask", "surfaces", "plane"):
-        center(browser, one(browser, f".t-{name}")).click()
-    center(browser, button)
-
-    def common(picture):
-        colors, counts = np.unique(picture.reshape(-1, 3), axis=0, return_counts=True)
-        most = colors[counts > 0.004 * counts.sum()]
-        return {tuple(color) for color in most.tolist() if max(color) - min(color) > 20}
-
-    small = common(pixels(button))
-    enlarge(browser, "[id$=-input] .panel:nth-of-type(3) .enlarge")
-    one(browser, "dialog [value=body]").click()
-    large = common(pixels(one(browser, "dialog canvas")))
-    assert len(large) >= 3
-    assert all(min(np.abs(np.subtract(a, b)).max() for b in small) <= 2 for a in large)
-
-
-def test_the_slice_of_a_point_has_its_cross(visit):
-    browser = visit("sub-02.html")
-    enlarge(browser, "[id$=-points] details[open] .enlarge")
-    canvas = one(browser, "dialog canvas")
-    one(browser, "dialog [value=labels]").click()
-    there = colored(pixels(canvas))
-    press(browser, Keys.PAGE_UP)
-    assert there > 0.002
-    assert colored(pixels(canvas)) == 0
 
 
 def touch(browser, kind, *points):
@@ -165,14 +64,14 @@ def phone(browser):
 @pytest.mark.usefixtures("phone")
 def test_slices_and_the_view_work_by_touch_on_a_phone(visit):
     browser = visit("sub-01.html", 390)
-    button = center(browser, one(browser, "[id$=-input] .panel:nth-of-type(3) .enlarge"))
+    button = center(browser, one(browser, ".panel:nth-of-type(3) .enlarge"))
     drag(browser, button, 0, 0)
     until(lambda: texts(browser, "dialog[open] .facts"))
     assert fits(browser, 390)
-    canvas, first = one(browser, "dialog canvas"), level(browser)
+    canvas, start = one(browser, "dialog canvas"), level(browser)
     assert canvas.size["width"] <= 390
     drag(browser, canvas, 0, -60)
-    until(lambda: level(browser) == first + 4)
+    until(lambda: level(browser) == start + 4)
     close = one(browser, "dialog [aria-label=Close]")
 
     def closed():
@@ -217,13 +116,13 @@ def test_a_click_on_a_point_opens_what_is_said_about_it(visit):
     solid = view(browser)
     one(browser, ".sides label:nth-of-type(2) input").click()
     until(lambda: texts(browser, ".pins button"))
-    entry = one(browser, "[id$=-points-right-1]")
-    assert entry.get_attribute("open") is None
+    entry = one(browser, "[id$=-status-right-1]")
+    assert not entry.is_displayed()
     one(browser, ".pins button").click()
-    assert entry.get_attribute("open") is not None
-    assert browser.switch_to.active_element == entry.find_element(By.TAG_NAME, "summary")
+    assert entry.is_displayed()
+    assert browser.switch_to.active_element == entry
     # The ball itself does the same, and no point of the sheet is picked.
-    browser.execute_script("arguments[0].open = false", entry)
+    browser.execute_script("arguments[0].closest('details').open = false", entry)
     view(browser)
     pin = one(browser, ".pins button")
     left, top = (
@@ -234,8 +133,17 @@ def test_a_click_on_a_point_opens_what_is_said_about_it(visit):
     webdriver.ActionChains(browser).move_to_element_with_offset(
         solid, round((left - 0.5) * size["width"]), round((top - 0.5) * size["height"])
     ).click().perform()
-    until(lambda: entry.get_attribute("open") is not None)
+    until(entry.is_displayed)
     assert texts(browser, ".values dt") == []
+
+
+@pytest.mark.parametrize("width", [1280, 390])
+def test_the_sheet_in_three_dimensions_is_clear_of_its_frame(visit, width):
+    browser = visit("sub-01.html", width)
+    browser.execute_script("document.querySelector('.pins').hidden = true")
+    picture = pixels(view(browser))
+    for edge in (picture[:6], picture[-6:], picture[:, :6], picture[:, -6:]):
+        assert colored(edge) == 0
 
 
 #: Pixels of the sheet, and the colors that its legend has for the nodes there.
@@ -300,23 +208,34 @@ def test_texts_can_be_read_in_both_themes(visit, name, theme):
     for details in browser.find_elements(By.CSS_SELECTOR, "details"):
         browser.execute_script("arguments[0].open = true", details)
     if name != "report.html":
-        enlarge(browser, "[id$=-input] .enlarge")
+        enlarge(browser, ".enlarge")
     seen, found = faint(browser)
     assert seen > 30
     assert found == []
 
 
-def test_pictures_are_on_white_in_the_dark_theme(visit):
+def test_the_dark_theme_has_no_white_boxes_and_the_same_colors_of_values(visit):
     browser = visit("sub-02.html")
-    light = [pixels(e) for e in browser.find_elements(By.CSS_SELECTOR, ".picture img")]
-    use_theme(browser, "dark")
-    dark = [pixels(e) for e in browser.find_elements(By.CSS_SELECTOR, ".picture img")]
+    selectors = (".beside img", ".pictures img", ".panel canvas", ".solid")
+
+    def shots(theme):
+        use_theme(browser, theme)
+        view(browser)
+        until(lambda: one(browser, ".compass").is_displayed())
+        elements = [e for s in selectors for e in browser.find_elements(By.CSS_SELECTOR, s)]
+        return [pixels(center(browser, element)) for element in elements]
+
+    show_layers(browser, "columns")
+    light, dark = shots("light"), shots("dark")
+    assert len(light) > 10
     for a, b in zip(light, dark, strict=True):
-        # Their places differ by parts of a pixel.
-        assert abs(a.mean() - b.mean()) < 2
-        assert (b > 250).all(axis=-1).mean() > 0.2
-    panel = one(browser, "[id$=-input] .panel svg")
-    assert (pixels(center(browser, panel)) > 240).all(axis=-1).mean() > 0.2
+        # White at zero is left on maps of curvature.
+        assert (a > 240).all(axis=-1).mean() - (b > 200).all(axis=-1).mean() > 0.2
+        assert (b[:4] > 200).all(axis=-1).mean() == (b[-4:] > 200).all(axis=-1).mean() == 0
+    maps = len(texts(browser, ".beside img, [id$=-sheet] img"))
+    for a, b in zip(light[:maps], dark[:maps], strict=True):
+        values = [picture[np.ptp(picture, axis=-1) > 80].mean(axis=0) for picture in (a, b)]
+        assert np.abs(np.subtract(*values)).max() < 8  # places differ by parts of a pixel
 
 
 def printed(browser):
@@ -348,13 +267,13 @@ def test_paper_has_pictures_and_legends_but_no_controls(visit):
     browser = visit("sub-01.html")
     printed(browser)  # as the view has not been looked at, it is drawn for this
     use_theme(browser, "light", "print")
-    for selector in ("nav", ".controls", ".toggles", ".solid", ".pins"):
+    for selector in ("nav", ".controls", ".toggles", ".rating", ".solid", ".pins"):
         elements = browser.find_elements(By.CSS_SELECTOR, selector)
         assert elements
         assert not any(element.is_displayed() for element in elements)
     still = center(browser, one(browser, ".still"))
     assert colored(pixels(still)) > 0.02
-    for selector in ("[id$=-input] .legend", ".bar .gradient", "[id$=-input] svg", ".picture img"):
+    for selector in (".beside .legend", ".bar .gradient", ".panel canvas", ".picture img"):
         assert one(browser, selector).is_displayed()
     exact = "return getComputedStyle(arguments[0]).printColorAdjust"
     assert browser.execute_script(exact, one(browser, ".swatch")) == "exact"

@@ -15,6 +15,7 @@ from hipsta_bids.cli import main
 from hipsta_bids.derivatives.names import DATASET_FILES
 from hipsta_bids.participant import pages as reporting
 from hipsta_bids.reports import participant as participant_module
+from hipsta_bids.reports.cells import FILTERS
 from hipsta_bids.reports.cohort import cohort_page, read_cohort
 from hipsta_bids.reports.page import Section
 from hipsta_bids.reports.participant import participant_page
@@ -50,7 +51,9 @@ def test_a_page_is_made_for_all_readers(page):
 def test_decisions_are_said_with_what_to_do(out):
     first, second = ((out / f"sub-0{n}.html").read_text() for n in (1, 2))
     verdicts = [
-        re.findall(r'<p class="verdict">(.*?)</p>\n<p><b>(.*?)</b></p>', text)
+        re.findall(
+            r'<span class="verdict">\w+: (.*?)</span></h4>\n<p class="why"><b>(.*?)</b>', text
+        )
         for text in (first, second)
     ]
     assert [title for page in verdicts for title, _ in page] == [
@@ -61,6 +64,28 @@ def test_decisions_are_said_with_what_to_do(out):
     assert "the body is interrupted at RAS" in second
     assert "fill in missing slices" in second
     assert "sub-02_hemi-R_seg-freesurfer_desc-edited_mask.nii.gz" in second
+
+
+def test_backticks_of_messages_become_code_and_tags_in_them_stay_text():
+    marked = FILTERS["code"]("try `--scheme <A>`, or `--force`")
+    assert marked == "try <code>--scheme &lt;A&gt;</code>, or <code>--force</code>"
+    assert FILTERS["code"]("a & b") == "a &amp; b"
+
+
+def test_a_finding_has_one_share(copy):
+    """That of the headline, where the headline is about it alone."""
+    concerns = "; it concerns 3.0% of the columns: were they as those around them"
+    path = next((copy / "sub-01/anat").glob("*hemi-R*_metrics.json"))
+    (repair,) = json.loads(path.read_text())["repairs"]
+    repair = repair.split(";")[0]
+    spoil(path, lambda record: record.update(repairs=[repair + concerns]))
+    listed = r'<span class="kind">repair</span> (.*?)</li>'
+    alone = participant_page(copy, "01", None, read_cohort(copy))
+    assert re.findall(listed, alone) == [repair]
+    other = f"filled a cavity of 5 grid nodes at RAS 20.0 -20.0 -20.0 mm (CA1){concerns}"
+    spoil(path, lambda record: record["repairs"].append(other))
+    both = participant_page(copy, "01", None, read_cohort(copy))
+    assert re.findall(listed, both) == [repair + concerns, other]
 
 
 def scenes(text):
@@ -161,7 +186,7 @@ def test_labels_that_are_gone_cost_the_labels_only(copy):
     spoil(copy / DATASET_FILES["description"], lambda d: d.update(DatasetLinks=gone))
     text = participant_page(copy, "01", None, read_cohort(copy))
     assert "is not there any more" in text
-    assert 'class="line mask"' in text
+    assert text.count('"body": true') == 2
 
 
 @pytest.mark.parametrize("name", ["sub-01.html", "sub-02.html"])

@@ -83,14 +83,17 @@ class View:
         return _thick(line, width) & self.seen
 
     def picture(self, colors: Float, lines: Bool) -> NDArray[np.uint8]:
-        """(height, width, 3) lit colors (pixels, 3), 0 to 1, and lines in black, on white."""
-        image = np.ones((*self.triangle.shape, 3), np.float32)  # a third of the time
-        image[self.seen] = colors * self.light[:, None]
-        image[self.outline] = _EDGE
-        image[lines] = 0.0
+        """(height, width, 4) lit colors (pixels, 3), 0 to 1, and lines in black, else clear."""
+        image = np.zeros((*self.triangle.shape, 4), np.float32)  # a third of the time
+        image[self.seen, :3] = colors * self.light[:, None]
+        image[self.outline, :3] = _EDGE
+        image[lines, :3] = 0.0
+        image[self.seen, 3] = 1.0
         rows, columns = (n // _FINER for n in self.triangle.shape)
-        parts = image.reshape(rows, _FINER, columns, _FINER, 3)
-        small = sum(parts[:, i, :, j] for i, j in product(range(_FINER), repeat=2)) / _FINER**2
+        parts = image.reshape(rows, _FINER, columns, _FINER, 4)
+        total = sum(parts[:, i, :, j] for i, j in product(range(_FINER), repeat=2))
+        small = np.asarray(total) / _FINER**2
+        small[..., :3] /= np.where(small[..., 3:] > 0, small[..., 3:], 1.0)
         # Files are half as large without the steps that nobody sees.
         darkness = _STEP * np.round(255 / _STEP * (1 - small))
         return np.asarray(255 - np.minimum(darkness, 255), dtype=np.uint8)

@@ -60,7 +60,7 @@
       const tile = make("span", { className: row.tile === null ? "tile none" : "tile" });
       if (row.tile === null) tile.textContent = "no map";
       else tile.style.backgroundPosition = `${-(row.tile % grid.columns) * width}px ${-Math.floor(row.tile / grid.columns) * height}px`;
-      const title = make("span", { className: "name", textContent: `${row.participant.slice(4)}${row.session ? ` ${row.session.slice(4)}` : ""} ${row.hemi}` });
+      const title = make("span", { className: "name", textContent: `${row.participant.slice(4)}${row.session ? ` ${row.session.slice(4)}` : ""} ${row.hemi}${several ? ` ${row.seg}` : ""}` });
       const link = make("a", { href: `${row.page}#${row.key}`, title: `${whose(row)}: ${row.verdict}`, ariaLabel: `${whose(row)}, ${row.verdict}` }, tile, title);
       const far = row.distance > apart ? " apart" : "";
       row.item = make("li", { className: row.decision + far }, link);

@@ -11,6 +11,13 @@
     for (const other of cards) other.classList.toggle("current", other === card && cards.length > 1);
   }
 
+  // Keys are about the card whose rating is in view: that which fills most of the window.
+  function follow() {
+    const seen = cards.map((card) => { const { top, bottom } = card.getBoundingClientRect(); return Math.min(bottom, innerHeight) - Math.max(top, 0); });
+    const most = Math.max(...seen);
+    if (most > 0 && seen[cards.indexOf(current)] < most) choose(cards[seen.indexOf(most)]);
+  }
+
   function show(card) {
     const { rating = "", note = "", input_hash = "" } = kept.read(card.dataset.key) ?? {};
     const earlier = rating && input_hash !== card.dataset.hash;
@@ -56,8 +63,7 @@
       const { rating = "", input_hash = card.dataset.hash } = kept.read(card.dataset.key) ?? {};
       keep(card, { rating, note: event.target.value.trim(), input_hash });
     });
-    const copy = card.querySelector(".copy");
-    if (copy) copy.addEventListener("click", () => {
+    for (const copy of card.querySelectorAll(".copy")) copy.addEventListener("click", () => {
       getSelection().selectAllChildren(copy.previousElementSibling);
       copy.textContent = document.execCommand("copy") ? "Copied" : "Selected: press Ctrl+C";
     });
@@ -65,6 +71,7 @@
   lead();
   choose(named() ?? cards[0]);
   addEventListener("hashchange", () => choose(named() ?? current));
+  addEventListener("scroll", follow, { passive: true });
   addEventListener("storage", () => { cards.forEach(show); lead(); });
   addEventListener("keydown", (event) => {
     if (event.ctrlKey || event.altKey || event.metaKey || event.repeat) return;

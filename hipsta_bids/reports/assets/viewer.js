@@ -120,7 +120,6 @@
         return;
       }
       this.gl = this.renderer.gl;
-      this.gl.clearColor(0.961, 0.969, 0.976, 1);
       this.pins = this.root.querySelector(".pins");
       this.camera = new OGL.Camera(this.gl, { fov: 28, near: 1, far: 500 });
       // The wheel scrolls the page until the view has been clicked.
@@ -153,7 +152,10 @@
         this.pick(Math.max(0, Math.min(nx - 1, i + step[0])), Math.max(0, Math.min(ny - 1, j + step[1])));
       });
       if (!this.renderer) return;
-      window.addEventListener("beforeprint", () => this.still());
+      // Paper is white, whatever the screen is; see slices.js.
+      window.addEventListener("beforeprint", () => { this.redraw(); this.still(); });
+      window.addEventListener("afterprint", () => this.redraw());
+      matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.redraw());
       let down = null;
       this.solid.addEventListener("pointerdown", (event) => { down = [event.clientX, event.clientY]; this.solid.focus({ preventScroll: true }); });
       this.solid.addEventListener("pointerup", (event) => {
@@ -208,7 +210,8 @@
     look() {
       if (!this.renderer) return;
       // From above, behind and lateral, so that the sheet's length and bend both show.
-      const side = this.scene.hemi === "L" ? -1 : 1, far = 3.4 * this.radius;
+      const side = this.scene.hemi === "L" ? -1 : 1, { clientWidth, clientHeight } = this.root.querySelector(".scene");
+      const far = Math.max(3.4, (4.2 * clientHeight) / clientWidth) * this.radius; // clear of a narrow frame, too
       const d = new OGL.Vec3(side * 0.55, 0.75, 0.7).normalize().multiply(far);
       this.orbit.target.set(...this.center);
       this.camera.position.set(this.center[0] + d.x, this.center[1] + d.y, this.center[2] + d.z);
@@ -261,7 +264,9 @@
     redraw() {
       if (this.scene.surfaces) this.drawFlat();
       if (!this.renderer) return;
-      const scene = this.scene;
+      const scene = this.scene, style = getComputedStyle(document.documentElement);
+      const [wash, ink] = ["wash", "ink"].map((name) => rgb(style.getPropertyValue(`--${name}`)));
+      this.gl.clearColor(...wash, 1);
       this.world = new OGL.Transform();
       this.middle = null;
       this.labels = [];
@@ -275,7 +280,7 @@
           EDGES.forEach((text, n) => {
             const line = this.row("midthickness", n ? scene.shape[0] - 1 : 0);
             const { points, index } = tube(line, 0.16);
-            this.mesh(points, index, n ? [0.84, 0.37, 0.0] : [0.1, 0.12, 0.15]);
+            this.mesh(points, index, n ? [0.84, 0.37, 0.0] : ink);
             this.label(line[Math.floor(line.length / 2)], text);
           });
           for (const j of scene.ends) {
@@ -337,7 +342,7 @@
 
     // The list says what is wrong at a point.
     open({ number }) {
-      const entry = document.getElementById(`${this.root.dataset.key.replace(/view$/, "points")}-${this.scene.side}-${number}`);
+      const entry = document.getElementById(`${this.root.dataset.key.replace(/view$/, "status")}-${this.scene.side}-${number}`);
       if (!entry) return;
       for (let up = entry; up; up = up.parentElement) if (up.tagName === "DETAILS") up.open = true;
       entry.scrollIntoView({ block: "start" });
