@@ -73,7 +73,7 @@ def verdict_of(hemisphere: Hemisphere) -> Verdict:
             decision=decision,
             reason=_sentence(finding.message.split("; it concerns")[0]),
             consequence=_of_flag(hemisphere, finding),
-            advice="Look at the places below; then use it, correct the labels, or leave it out.",
+            advice="Look at the numbered places; then use it, correct the labels, or leave it out.",
             change=finding.change,
             share=finding.share,
         )

@@ -10,6 +10,8 @@ from selenium import webdriver
 from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
 
+from hipsta_bids.io import files
+
 
 @pytest.fixture
 def visit(browser, out):
@@ -124,16 +126,13 @@ def rows(browser):
 
 def test_the_table_is_filtered_and_sorted_with_the_maps(visit):
     browser = visit("report.html")
-    # At first by severity, and equal ones by name.
+    # At first failed ones, then those to look at, and equal ones by name.
     assert rows(browser) == ["sub-02", "sub-02", "sub-01", "sub-01"]
-    assert one(browser, "[data-key=severity]").get_attribute("aria-sort") == "descending"
-    assert texts(browser, "#table .badge.refuse, #table .badge.look, #table .badge.use") == [
-        *("Do not use", "Look before use", "Use", "Use")
-    ]
+    assert not browser.find_elements(By.CSS_SELECTOR, "#table [aria-sort]")
+    assert texts(browser, "#table .badge") == ["failed", "look", "use", "use"]
     assert len(texts(browser, "#tiles li")) == 4
-    one(browser, "[name=status][value=failed]").click()
-    status = "#table .badge:is(.ok, .repaired, .flagged, .failed)"
-    assert texts(browser, status) == ["flagged", "repaired", "ok"]
+    one(browser, "[name=decision][value=failed]").click()
+    assert texts(browser, "#table .badge") == ["look", "use", "use"]
     one(browser, "#search").send_keys("large-repair")
     assert rows(browser) == ["sub-02"]
     assert texts(browser, "#tiles li") == ["02 L"]
@@ -195,28 +194,28 @@ def ratings(browser):
     """Participant, side, rating and note of the rows that are shown."""
     return browser.execute_script(
         "return [...document.querySelectorAll('#table tbody tr')].map(row => [...row.cells])"
-        ".map(([who, , side, , rating]) => [who.textContent, side.textContent,"
+        ".map(([who, , side, rating]) => [who.textContent, side.textContent,"
         " rating.querySelector('.rate').textContent.replace('none', ''),"
         " rating.querySelector('.remark').textContent])"
     )
 
 
-def test_keys_lead_by_severity_and_rate(review, visit):
+def test_keys_lead_by_decision_and_rate(review, visit):
     browser = review("sub-02.html")
     # The table was left in its first order, so links are the same with it and without.
-    one(browser, "a.badge.refuse").click()
+    one(browser, "a.badge.failed").click()
     until(lambda: card(browser) == "sub-02_hemi-R_seg-freesurfer")
     assert not one(browser, ".card.current .previous").is_displayed()
     press(browser, "3", "n")
     until(lambda: card(browser) == "sub-02_hemi-L_seg-freesurfer")
     press(browser, "2", "n")
     until(lambda: texts(browser, "h1") == ["sub-01"])
-    assert card(browser) == "sub-01_hemi-R_seg-freesurfer"
+    assert card(browser) == "sub-01_hemi-L_seg-freesurfer"
     press(browser, "1", "0", "n")
-    until(lambda: card(browser) == "sub-01_hemi-L_seg-freesurfer")
+    until(lambda: card(browser) == "sub-01_hemi-R_seg-freesurfer")
     assert not one(browser, ".card.current .next").is_displayed()
     press(browser, "1", "p")
-    until(lambda: card(browser) == "sub-01_hemi-R_seg-freesurfer")
+    until(lambda: card(browser) == "sub-01_hemi-L_seg-freesurfer")
     assert browser.find_elements(By.CSS_SELECTOR, ".card.current .rating :checked") == []
     # Digits in a note are words.
     remark = one(browser, ".card.current .remark")
@@ -225,17 +224,17 @@ def test_keys_lead_by_severity_and_rate(review, visit):
     assert ratings(browser) == [
         ["sub-02", "R", "exclude", ""],
         ["sub-02", "L", "unsure", ""],
-        ["sub-01", "R", "", "bridge 1 of 2"],
-        ["sub-01", "L", "use", ""],
+        ["sub-01", "L", "", "bridge 1 of 2"],
+        ["sub-01", "R", "use", ""],
     ]
     one(browser, "#rating option[value=unsure]").click()
     assert rows(browser) == ["sub-02"]
     one(browser, "#rating option[value=none]").click()
-    assert texts(browser, "#tiles li") == ["01 R"]
+    assert texts(browser, "#tiles li") == ["01 L"]
     assert "1 of 4 shown, 3 rated" in one(browser, "#shown").text
 
 
-def test_links_follow_the_table_as_it_was_left_or_severity_without_it(review, visit, browser):
+def test_links_follow_the_table_as_it_was_left_or_decisions_without_it(review, visit, browser):
     review("report.html")
     one(browser, "[data-key=volume] button").click()
     order = browser.execute_script(
@@ -248,7 +247,7 @@ def test_links_follow_the_table_as_it_was_left_or_severity_without_it(review, vi
         link = one(browser, f"{own} .{name}")
         assert link.get_attribute("href").endswith(f"{order[n]['page']}#{order[n]['key']}")
         assert order[n]["words"] in link.text
-    # Without an order, or with one that leads elsewhere, links go by severity.
+    # Without an order, or with one that leads elsewhere, links go by decision.
     browser.execute_script(
         "const [key] = Object.keys(localStorage).filter((key) => key.endsWith(' order'));"
         "const order = JSON.parse(localStorage[key]);"
@@ -257,12 +256,12 @@ def test_links_follow_the_table_as_it_was_left_or_severity_without_it(review, vi
     )
     visit("sub-02.html")
     next_one = one(browser, "[data-key=sub-02_hemi-L_seg-freesurfer] .next")
-    assert next_one.get_attribute("href").endswith("sub-01.html#sub-01_hemi-R_seg-freesurfer")
+    assert next_one.get_attribute("href").endswith("sub-01.html#sub-01_hemi-L_seg-freesurfer")
     browser.execute_script("localStorage.clear()")
     visit("sub-02.html")
     link = one(browser, "[data-key=sub-02_hemi-L_seg-freesurfer] .next")
-    assert link.text == "sub-01 right: use →"
-    assert link.get_attribute("href").endswith("sub-01.html#sub-01_hemi-R_seg-freesurfer")
+    assert link.text == "sub-01 left: use →"
+    assert link.get_attribute("href").endswith("sub-01.html#sub-01_hemi-L_seg-freesurfer")
 
 
 def test_ratings_are_saved_loaded_and_taken_by_the_group_level(review, browser, out):
@@ -302,9 +301,25 @@ def test_ratings_are_saved_loaded_and_taken_by_the_group_level(review, browser, 
     assert ratings(browser) == before
 
 
+def test_the_table_is_saved_as_it_is_shown(review, browser):
+    review("report.html")
+    rate(browser, 3, "use")
+    one(browser, "#hemi option[value=L]").click()
+    one(browser, "#save-table").click()
+    path = browser.downloads / "hemispheres.tsv"
+    until(path.exists)
+    rows_of_table = files.read_tsv(path)
+    assert [(row["participant_id"], row["decision"]) for row in rows_of_table] == [
+        ("sub-02", "look"),
+        ("sub-01", "use"),
+    ]
+    assert [row["rating"] for row in rows_of_table] == ["n/a", "use"]
+    assert all(float(row["thickness_mean"]) > 1 for row in rows_of_table)
+
+
 def test_ratings_of_other_labels_are_marked(review, visit, browser):
     review("report.html")
-    rate(browser, 4, "use")
+    rate(browser, 3, "use")
     browser.execute_script(
         "const [k, v] = Object.entries(localStorage).find(([k]) => k.includes('hemi-L'));"
         "localStorage.setItem(k, JSON.stringify({...JSON.parse(v), input_hash: 'other'}))"
@@ -352,7 +367,7 @@ def test_maps_of_several_protocols_are_named_by_them(visit, out, tmp_path):
     names = texts(browser, "#tiles .name")
     assert {"01 R freesurfer", "01 R ashsPMC"} <= {*names}
     assert len(names) == len({*names}) == 8
-    badges = browser.find_elements(By.CSS_SELECTOR, "#table .badge:is(.use, .look, .refuse)")
+    badges = browser.find_elements(By.CSS_SELECTOR, "#table .badge:is(.use, .look, .failed)")
     assert len(badges) == 8
     assert max(badge.rect["x"] + badge.size["width"] for badge in badges) <= 390
 

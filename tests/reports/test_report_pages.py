@@ -73,19 +73,16 @@ def test_backticks_of_messages_become_code_and_tags_in_them_stay_text():
 
 
 def test_a_finding_has_one_share(copy):
-    """That of the headline, where the headline is about it alone."""
+    """That of the headline, where the headline is about it."""
     concerns = "; it concerns 3.0% of the columns: were they as those around them"
-    path = next((copy / "sub-01/anat").glob("*hemi-R*_metrics.json"))
-    (repair,) = json.loads(path.read_text())["repairs"]
-    repair = repair.split(";")[0]
-    spoil(path, lambda record: record.update(repairs=[repair + concerns]))
-    listed = r'<span class="kind">repair</span> (.*?)</li>'
-    alone = participant_page(copy, "01", None, read_cohort(copy))
-    assert re.findall(listed, alone) == [repair]
-    other = f"filled a cavity of 5 grid nodes at RAS 20.0 -20.0 -20.0 mm (CA1){concerns}"
-    spoil(path, lambda record: record["repairs"].append(other))
-    both = participant_page(copy, "01", None, read_cohort(copy))
-    assert re.findall(listed, both) == [repair + concerns, other]
+    heads = [f"a bump near RAS {x}.0 -20.0 -20.0 mm (CA1): look there" for x in (20, 25)]
+    flags = [{"reason": "a", "message": h + concerns, "columns_share": 0.03} for h in heads]
+    path = next((copy / "sub-02/anat").glob("*hemi-L*_metrics.json"))
+    spoil(path, lambda record: record.update(flags=flags, repairs=[]))
+    text = participant_page(copy, "02", None, read_cohort(copy))
+    listed = re.findall(r'<span class="kind">flag</span> (.*?)</li>', text)
+    assert listed == [heads[0], heads[1] + concerns]
+    assert "It concerns 3.0% of the map" in text
 
 
 def scenes(text):

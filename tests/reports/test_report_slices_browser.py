@@ -100,7 +100,7 @@ def test_no_verdict_is_cut_off_on_a_phone(visit, name, theme):
     use_theme(browser, theme)
     assert fits(browser, 390)
     ends = browser.execute_script(
-        "return [...document.querySelectorAll('.verdict, .badge:is(.use, .look, .refuse)')]"
+        "return [...document.querySelectorAll('.verdict, .badge:is(.use, .look, .failed)')]"
         ".map((element) => element.getBoundingClientRect().right)"
     )
     assert len(ends) >= 4
