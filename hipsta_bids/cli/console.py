@@ -162,9 +162,9 @@ class Progress:
 
 
 @contextmanager
-def searching(*, shown: bool) -> Iterator[None]:
+def searching(*, has_bar: bool) -> Iterator[None]:
     """Show that segmentations are sought; what is found has lines of its own."""
-    with Progress(0 if shown else -1) as progress:
+    with Progress(0 if has_bar else -1) as progress:
         progress.show(_SEARCH)
         yield
 

@@ -204,7 +204,7 @@ def _run(options: "Namespace", arguments: Sequence[str]) -> ExitCode:
 
     limit_memory(options.mem)
     requests = map_requests(options.map, options.map_sampling, options.map_interpolation)
-    with console.searching(shown=not (options.quiet or options.dry_run)):
+    with console.searching(has_bar=not (options.quiet or options.dry_run)):
         findings = _find(request, options.shard, say=console.echo if options.dry_run else None)
     if findings is None:
         console.echo(f"part {options.shard.name} of the dataset has nothing to process")

@@ -9,31 +9,16 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from hipsta_bids.derivatives.dataset import (
-    NOT_FINISHED,
-    RECORDED,
-    TABLES,
-    Row,
-    describe_columns,
-    name_of,
-    provenance_of,
-    read_status,
-)
-from hipsta_bids.derivatives.hemisphere import (
-    ResultPlace,
-    read_record,
-    read_summary_cells,
-    summary_definition,
-)
+from hipsta_bids.derivatives import dataset, hemisphere
 from hipsta_bids.derivatives.names import DATASET_FILES, HemisphereName
 from hipsta_bids.errors import InputError
 from hipsta_bids.io import files
 
 _ORIGIN = "labels_"
 _COLUMNS = {
-    **TABLES["measures"],
-    **{f"{_ORIGIN}{name}": about for name, about in TABLES["provenance"].items()},
-    **{name: TABLES["status"][name] for name in ("version", "settings_hash", "input_hash")},
+    **dataset.TABLES["measures"],
+    **{f"{_ORIGIN}{name}": about for name, about in dataset.TABLES["provenance"].items()},
+    **{name: dataset.TABLES["status"][name] for name in ("version", "settings_hash", "input_hash")},
 }
 #: Cells that identify a hemisphere, as in ``ratings.tsv``.
 _KEY = ("participant_id", "session_id", "hemi", "protocol", "region")
@@ -48,53 +33,56 @@ def identify(name: HemisphereName) -> dict[str, str]:
 
 def origin(record: Mapping[str, Any]) -> dict[str, str]:
     """Cells that say where the labels of a quality record come from."""
-    return {f"{_ORIGIN}{name}": cell for name, cell in provenance_of(record).items()}
+    return {f"{_ORIGIN}{name}": cell for name, cell in dataset.provenance_of(record).items()}
 
 
 def write_measures(root: Path) -> None:
     """Bring the table of a dataset and its sidecar up to date."""
     path = root / DATASET_FILES["measures"]
     with files.locked(root, path.name):
-        known = {_key(row): row for row in _read(path)}
+        earlier = {_key(row): row for row in _read(path)}
         rated = {_key(row): row for row in _read(root / DATASET_FILES["ratings"])}
-        rows = [row | {"rating": _rating(row, rated)} for row in _current_rows(root, known)]
+        rows = [row | {"rating": _rating(row, rated)} for row in _current_rows(root, earlier)]
         numbers = dict.fromkeys(name for row in rows for name in row if name not in _COLUMNS)
         columns = (*_COLUMNS, *numbers)
         cells = ([row.get(column, files.MISSING) for column in columns] for row in rows)
         files.write_tsv(path, columns, cells)
         files.write_json(
             root / DATASET_FILES["measures_sidecar"],
-            describe_columns(_COLUMNS) | {name: summary_definition(name) for name in numbers},
+            dataset.describe_columns(_COLUMNS)
+            | {name: hemisphere.summary_definition(name) for name in numbers},
         )
 
 
-def _current_rows(root: Path, known: Mapping[tuple[str, ...], Row]) -> Iterator[dict[str, str]]:
-    for status in read_status(root):
-        if status.get("reason") == NOT_FINISHED:
+def _current_rows(
+    root: Path, earlier: Mapping[tuple[str, ...], dataset.Row]
+) -> Iterator[dict[str, str]]:
+    for status in dataset.read_status(root):
+        if status.get("reason") == dataset.NOT_FINISHED:
             continue
-        name = name_of(status)
-        who = identify(name)
-        row = known.get(tuple(who.values()), {})
-        if any(row.get(column) != status.get(column) for column in RECORDED):
+        name = dataset.name_of(status)
+        identity = identify(name)
+        row = earlier.get(tuple(identity.values()), {})
+        if any(row.get(column) != status.get(column) for column in dataset.RECORDED):
             with suppress(InputError):  # its files are gone, or another run is at them
-                row = who | read_row(ResultPlace(root=root, name=name))
+                row = identity | read_row(hemisphere.ResultPlace(root=root, name=name))
         if row:
             yield dict(row)
 
 
-def read_row(result: ResultPlace) -> dict[str, str]:
+def read_row(result: hemisphere.ResultPlace) -> dict[str, str]:
     """Read cells of one hemisphere from its quality record and its summary table.
 
     InputError if there is no readable record, or no summary of a hemisphere that was measured.
     """
-    record = read_record(result)
+    record = hemisphere.read_record(result)
     cells = {
-        **{column: str(record.get(column) or files.MISSING) for column in RECORDED},
+        **{column: str(record.get(column) or files.MISSING) for column in dataset.RECORDED},
         "repairs": str(len(record.get("repairs") or ())),
         **origin(record),
     }
     is_measured = result.path("summary").exists()
-    return cells | (read_summary_cells(result) if is_measured else {})
+    return cells | (hemisphere.read_summary_cells(result) if is_measured else {})
 
 
 def _read(path: Path) -> list[dict[str, str]]:
@@ -106,12 +94,12 @@ def _read(path: Path) -> list[dict[str, str]]:
     return [row for row in rows if all(column in row for column in _KEY)]
 
 
-def _key(row: Row) -> tuple[str, ...]:
+def _key(row: dataset.Row) -> tuple[str, ...]:
     return tuple(row[column] for column in _KEY)
 
 
-def _rating(row: Row, rated: Mapping[tuple[str, ...], Row]) -> str:
+def _rating(row: dataset.Row, rated: Mapping[tuple[str, ...], dataset.Row]) -> str:
     """Rating of the same labels, if a person saved one beside the table."""
-    found = rated.get(_key(row), {})
-    is_current = found.get("input_hash") in {files.MISSING, None, row.get("input_hash")}
-    return found.get("rating", files.MISSING) if is_current else files.MISSING
+    rating = rated.get(_key(row), {})
+    is_current = rating.get("input_hash") in {files.MISSING, None, row.get("input_hash")}
+    return rating.get("rating", files.MISSING) if is_current else files.MISSING

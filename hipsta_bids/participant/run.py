@@ -530,15 +530,15 @@ def _measured(
 
 
 def _tell_titles(jobs: list[Job]) -> None:
-    name, others = jobs[-1].result.name, len(jobs) - 1
-    more = f" and {others} more" if others else ""
-    tell(STAGE, None, current=f"sub-{name.subject} {name.hemi}{more}")
+    name, count = jobs[-1].result.name, len(jobs) - 1
+    ending = f" and {count} more" if count else ""
+    tell(STAGE, None, current=f"sub-{name.subject} {name.hemi}{ending}")
 
 
 def _expected(table: StatusTable, plan: WorkerPlan, jobs: Sequence[Job]) -> timedelta:
     """Guess how long jobs take, from what others in the same folder took."""
-    each = table.usual_seconds() * (1 + jobs[0].copies if jobs else 1)
-    return timedelta(seconds=round(each * math.ceil(len(jobs) / plan.n_workers)))
+    seconds = table.usual_seconds() * (1 + jobs[0].copies if jobs else 1)
+    return timedelta(seconds=round(seconds * math.ceil(len(jobs) / plan.n_workers)))
 
 
 def _remove_unfinished(job: Job) -> None:

@@ -64,8 +64,8 @@ def _sizes(counts: Counter[str]) -> dict[str, str]:
     edges = {s: np.sort(pd.to_numeric((s.split(" x ") * 3)[:3], "coerce")) for s in counts}
     sizes: dict[str, str] = {}
     for size in sorted(counts, key=lambda size: (-counts[size], size)):
-        alike = (s for s in sizes.values() if np.allclose(edges[s], edges[size], _SAME_EDGE, 0.0))
-        sizes[size] = next(alike, size)
+        similar = (s for s in sizes.values() if np.allclose(edges[s], edges[size], _SAME_EDGE, 0.0))
+        sizes[size] = next(similar, size)
     return sizes
 
 
