@@ -2,6 +2,7 @@
 
 import contextlib
 import tempfile
+from collections import Counter
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
@@ -278,12 +279,13 @@ def run_groups(
 
 def refusal_notes(groups: Mapping[str, Sequence[Any]]) -> str:
     """List why maps are missing in Markdown, by name of the group; empty where none is."""
-    lines = [
+    counts = Counter(
         f"- {name}: {result}"
         for name, group in groups.items()
         for result in group
         if isinstance(result, Refusal)
-    ]
+    )
+    lines = [line + (f" ({n} times)" if n > 1 else "") for line, n in counts.items()]
     return "\n".join(["\nRefused:\n", *lines]) if lines else ""
 
 

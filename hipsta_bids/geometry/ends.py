@@ -55,10 +55,13 @@ class EndPlane(NamedTuple):
     uncertainty: float = 0.0
     """Standard error over the cues of the automatic rule, mm."""
 
-    def entry(self) -> dict[str, list[float]]:
-        """Describe the plane for the quality record."""
-        point, normal = self.point.round(3).tolist(), self.normal.round(4).tolist()
-        return {"point_ras_mm": point, "normal_ras": normal}
+    def entry(self, points: Float) -> dict[str, list[float]]:
+        """Describe the plane for the quality record, by a place beside one of points (N, 3)."""
+        place = np.array(self.moved("posterior", 0.0, points).point)
+        return {
+            "point_ras_mm": place.round(3).tolist(),
+            "normal_ras": self.normal.round(4).tolist(),
+        }
 
     def moved(self, end: End, shift: float, points: Float) -> GivenEnd:
         """Give the plane that lies ``shift`` mm anterior, by a place beside one of points (N, 3).

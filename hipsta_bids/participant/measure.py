@@ -246,7 +246,7 @@ def quality_metrics(evidence: Evidence) -> dict[str, Any]:
     """Numbers and words that say whether to trust the map, JSON-serializable."""
     solid, boundaries, surface = evidence.solid, evidence.boundaries, evidence.surface
     body, ends, valid = evidence.body, evidence.body.ends, evidence.sheet.valid
-    quality = tetra_quality(evidence.mesh)
+    quality, inside = tetra_quality(evidence.mesh), body.inside_points()[1]
     return {
         "region": body.region,
         "x_coordinate": evidence.settings.sheet.x_coordinate,
@@ -256,14 +256,14 @@ def quality_metrics(evidence: Evidence) -> dict[str, Any]:
         "cavities_mm3": len(body.cavities.all) * body.voxel_volume,
         "uncus_mm3": len(body.uncus) * body.voxel_volume,
         "end_voxels_inside": body.handed_over,
-        "body_length_mm": ends.length(body.inside_points()[1]),
+        "body_length_mm": ends.length(inside),
         "medial_offset_mm": evidence.side,
         "posterior_end_rule": ends.posterior.rule,
         "anterior_end_rule": ends.anterior.rule,
         "posterior_end_uncertainty_mm": ends.posterior.uncertainty,
         "anterior_end_uncertainty_mm": ends.anterior.uncertainty,
-        "posterior_plane": ends.posterior.entry(),
-        "anterior_plane": ends.anterior.entry(),
+        "posterior_plane": ends.posterior.entry(inside),
+        "anterior_plane": ends.anterior.entry(inside),
         "voxels_across": evidence.voxels_across,
         "euler_before": solid.euler_before,
         "euler_after": solid.euler_after,

@@ -182,8 +182,8 @@ def measure_whole(
                 "medial_offset_mm": side,
                 "posterior_end_rule": ends.posterior.rule,
                 "anterior_end_rule": ends.anterior.rule,
-                "posterior_plane": ends.posterior.entry(),
-                "anterior_plane": ends.anterior.entry(),
+                "posterior_plane": ends.posterior.entry(body.inside_points()[1]),
+                "anterior_plane": ends.anterior.entry(body.inside_points()[1]),
                 "flag_margins": flag_margins(findings),
             },
             flags=(

@@ -142,3 +142,10 @@ def test_metrics_are_json_and_complete(evidence):
     assert "mask_change" not in again  # no mask was edited
     assert again["thickness_expected_mm"] == pytest.approx(2.0, rel=0.05)  # rims
     assert np.linalg.norm(again["posterior_plane"]["normal_ras"]) == pytest.approx(1, abs=1e-3)
+    for plane in (evidence.body.ends.posterior, evidence.body.ends.anterior):
+        # As the planes found without labels, whose point may lie anywhere on them.
+        far = plane._replace(point=plane.point + 30 * np.linalg.svd(plane.normal[None])[2][1])
+        inside = evidence.body.inside_points()[1]
+        place = np.array(far.entry(inside)["point_ras_mm"])
+        assert abs((place - plane.point) @ plane.normal) < 0.01
+        assert np.linalg.norm(inside - place, axis=1).min() < 1
