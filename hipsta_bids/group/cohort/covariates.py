@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from hipsta_bids.derivatives.dataset import linked_path, read_links
-from hipsta_bids.errors import InputError, ModelError
+from hipsta_bids.errors import InputError, MissingFileError, ModelError
 from hipsta_bids.group.design.formula import as_factor, check_numbers, level_name, typed
 from hipsta_bids.group.design.model import FIRST_AGE, VisitTime
 from hipsta_bids.group.design.settings import GroupSettings
@@ -59,7 +59,7 @@ def read_covariates(visits: pd.DataFrame, bids_dir: Path, extra: Sequence[Path])
     tables = [main] if main.is_file() else []
     described: dict[str, object] = {}
     if not bids_dir.is_dir():
-        raise InputError(f"{bids_dir}: no such folder; check its name")
+        raise MissingFileError(f"{bids_dir}: no such folder; check its name")
     for path in (*tables, *sorted((bids_dir / "phenotype").glob("*.tsv")), *extra):
         table = _read(path)
         if path == main:
