@@ -71,7 +71,8 @@ class Measurement:
             f"  {row.name:<15} {with_unit(f'{self.summary[row.name]:.2f}', row.unit)}"
             for row in SUMMARY[:_TEXT_ROWS]
         ]
-        title = f"Measurement of a hemisphere ({name}): {self.decision} {self.message}".rstrip()
+        words = [self.decision, *([outputs.headline(self.message)] if self.message else [])]
+        title = f"Measurement of a hemisphere ({name}): {': '.join(words)}"
         return "\n".join([title, *numbers, f"  maps ({nx}, {ny}): {', '.join(self.maps)}"])
 
     def _repr_html_(self) -> str:

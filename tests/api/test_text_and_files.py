@@ -75,7 +75,7 @@ class TestText:
         assert repr(left).splitlines()[0].endswith("(left, freesurfer, body): use")
         volume = left.summary["volume"]
         assert re.search(rf"volume +{volume:.2f} mm³", repr(left))
-        assert repr(flagged).splitlines()[0].endswith(f"look {flagged.message}")
+        assert repr(flagged).splitlines()[0].endswith(f"look: {flagged.message}")
 
     def test_a_card_has_the_map(self, flagged, tmp_path):
         card = flagged._repr_html_()
