@@ -4,6 +4,7 @@ As in Jupyter, the value of a cell's last expression is shown, and figures that 
 are drawn. A warning is an error.
 
 .venv/bin/python tools/notebooks.py docs/notebooks/NAME.ipynb ...    runs them, stores the outputs
+.venv/bin/python tools/notebooks.py --check docs/notebooks/NAME.ipynb ...    compares them instead
 """
 
 import ast
@@ -12,8 +13,9 @@ import json
 import sys
 import tempfile
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import chdir, redirect_stdout
+from difflib import unified_diff
 from html import escape
 from io import BytesIO, StringIO
 from pathlib import Path
@@ -122,7 +124,27 @@ def _figures() -> Iterator[Output]:
     plt.close("all")
 
 
-if __name__ == "__main__":
-    for name in sys.argv[1:]:
-        store(Path(name), run_notebook(Path(name).resolve()))
+def check(path: Path) -> None:
+    """Compare the text of stored outputs with what the cells give now."""
+    notebooks = json.loads(path.read_text(encoding="utf-8")), run_notebook(path)
+    stored, now = ("".join(texts_of(notebook)).splitlines() for notebook in notebooks)
+    difference = "\n".join(unified_diff(stored, now, "stored", "now", lineterm=""))
+    if difference:
+        sys.exit(f"{path.name}: other outputs are stored; run tools/notebooks.py\n{difference}")
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Run notebooks, and store or compare what their cells show."""
+    for name in arguments:
+        if name == "--check":
+            continue
+        path = Path(name).resolve()
+        if "--check" in arguments:
+            check(path)
+        else:
+            store(path, run_notebook(path))
         sys.stdout.write(f"{name}\n")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
