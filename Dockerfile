@@ -24,7 +24,7 @@ RUN python -m venv /opt/hipsta_bids; \
 # makers (auditwheel), and strip damages such files.
 FROM packages AS slim
 RUN command -v strip || { apt-get update; apt-get install --yes --no-install-recommends binutils; }; \
-    /opt/hipsta_bids/bin/pip uninstall --yes imageio networkx pip plotly pygments setuptools tifffile; \
+    /opt/hipsta_bids/bin/pip uninstall --yes imageio networkx pip plotly pygments setuptools tifffile xarray; \
     find /opt/hipsta_bids/bin -type f ! -name dask -delete; \
     sed -i '1s/$/ -I/' /opt/hipsta_bids/bin/dask; \
     cd /opt/hipsta_bids/lib/python3*/site-packages; \

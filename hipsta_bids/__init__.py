@@ -1,7 +1,8 @@
 """Hippocampal thickness, curvature and shape maps from subfield segmentations.
 
-``import hipsta_bids as hb`` gives :func:`measure`, :func:`load`, :func:`group` and the functions
-``plot_sheet``, ``plot_surface`` and ``plot_group``. They are loaded when first used.
+``import hipsta_bids as hb`` gives :func:`measure`, :func:`load`, :func:`register`, :func:`group`,
+:func:`example`, and the functions ``plot_sheet``, ``plot_surface`` and ``plot_group``. They are
+loaded when first used.
 """
 
 __version__ = "0.1.0"
@@ -9,7 +10,9 @@ __version__ = "0.1.0"
 #: The Python interface, by the module that has it.
 _MODULES = {
     "measure": "hipsta_bids.api.maps",
-    "load": "hipsta_bids.api.maps",
+    "load": "hipsta_bids.api.datasets",
+    "example": "hipsta_bids.api.datasets",
+    "register": "hipsta_bids.group.questions.models",
     "plot_sheet": "hipsta_bids.api.plots",
     "plot_surface": "hipsta_bids.api.plots",
     "plot_group": "hipsta_bids.api.plots",
@@ -17,9 +20,10 @@ _MODULES = {
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
-    from hipsta_bids.api.maps import load, measure
+    from hipsta_bids.api.datasets import example, load
+    from hipsta_bids.api.maps import measure
     from hipsta_bids.api.plots import plot_group, plot_sheet, plot_surface
-    from hipsta_bids.group.questions.models import group
+    from hipsta_bids.group.questions.models import group, register
 else:
 
     def __getattr__(name: str) -> object:
@@ -36,4 +40,13 @@ else:
         return sorted({*globals(), *_MODULES, "group"})
 
 
-__all__ = ["group", "load", "measure", "plot_group", "plot_sheet", "plot_surface"]
+__all__ = [
+    "example",
+    "group",
+    "load",
+    "measure",
+    "plot_group",
+    "plot_sheet",
+    "plot_surface",
+    "register",
+]

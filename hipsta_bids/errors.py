@@ -5,7 +5,9 @@ A message says what is wrong, where, and what to try, on one line. Any exception
 """
 
 import difflib
-from collections.abc import Iterable
+import re
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from enum import IntEnum
 from signal import SIGINT, SIGTERM
 
@@ -58,6 +60,10 @@ class InputError(HipstaError):
     """A file or folder that the user gave cannot be used."""
 
 
+class MissingFileError(InputError, FileNotFoundError):
+    """A file or folder that the user gave does not exist."""
+
+
 class NothingToDoError(HipstaError):
     """No segmentation matches the request."""
 
@@ -74,8 +80,16 @@ class SettingsError(UsageError):
     """A setting is unknown or out of range."""
 
 
+class MissingSettingsError(SettingsError, MissingFileError):
+    """A file of settings does not exist."""
+
+
 class ProtocolError(HipstaError):
     """A segmentation protocol file is wrong, or does not fit the labels."""
+
+
+class MissingProtocolError(ProtocolError, MissingFileError):
+    """A protocol file does not exist."""
 
 
 class OutputError(HipstaError):
@@ -90,6 +104,22 @@ class GeometryError(HipstaError):
 
 class ModelError(HipstaError):
     """A statistical model cannot be fitted to these data."""
+
+
+#: Arguments of Python functions, by the options that messages name.
+_ARGUMENTS = {f"--{name}": f"{name}=" for name in ("correction", "formula", "settings")}
+_ARGUMENTS |= {"--scheme": "protocol=", "--contrast": "contrasts=", "--blocks": "blocks (setting)"}
+
+
+@contextmanager
+def in_python() -> Iterator[None]:
+    """Name arguments of Python functions, not options, in messages of foreseen errors."""
+    try:
+        yield
+    except HipstaError as error:
+        options = r"--[a-z][a-z-]*"
+        error.args = (re.sub(options, lambda o: _ARGUMENTS.get(o[0], o[0]), str(error)),)
+        raise
 
 
 def did_you_mean(words: Iterable[str], vocabulary: Iterable[str]) -> str:

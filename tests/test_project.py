@@ -94,7 +94,7 @@ def test_imports_are_the_declared_dependencies():
         "sklearn": "scikit-learn",
     }
     extras = PROJECT["optional-dependencies"]
-    requirements = (*PROJECT["dependencies"], *extras["arrow"], *extras["xarray"])
+    requirements = (*PROJECT["dependencies"], *extras["arrow"])
     declared = {canonical(requirement) for requirement in requirements}
     trees = (
         ast.parse(path.read_text(encoding="utf-8")) for path in (ROOT / "hipsta_bids").rglob("*.py")
@@ -135,11 +135,13 @@ def test_no_segmentations_or_other_large_files_are_tracked():
 
 
 @pytest.mark.parametrize("path", sorted(ROOT.glob("docs/notebooks/*.ipynb")), ids=lambda p: p.stem)
-def test_notebooks_hold_no_results(path):
+def test_notebooks_hold_their_outputs(path):
+    assert path.stat().st_size < 300_000
     cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
     code = [cell for cell in cells if cell["cell_type"] == "code"]
-    assert code
-    assert all(cell["outputs"] == [] and cell["execution_count"] is None for cell in code)
+    assert [cell["execution_count"] for cell in code] == list(range(1, len(code) + 1))
+    shown = [cell for cell in code if cell["outputs"]]
+    assert len(shown) >= len(code) - 1  # one cell of a notebook may write a file and show nothing
     assert f"notebooks/{path.stem}.md" in (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
 
 

@@ -1,121 +1,150 @@
-"""Runs a notebook of docs/ and writes it as a page: text, code, what the code prints, figures.
+"""Runs notebooks of docs/ and stores what their cells show; writes them as pages of the site.
 
-As in Jupyter, the value of a cell's last expression is shown, figures that are open at its end are
-drawn, and lines that begin with ``!`` go to the shell. A warning is an error.
+As in Jupyter, the value of a cell's last expression is shown, and figures that are open at its end
+are drawn. A warning is an error.
 
-.venv/bin/python tools/notebooks.py docs/notebooks/NAME.ipynb ...    runs them, and shows nothing
+.venv/bin/python tools/notebooks.py docs/notebooks/NAME.ipynb ...    runs them, stores the outputs
+.venv/bin/python tools/notebooks.py --check docs/notebooks/NAME.ipynb ...    compares them instead
 """
 
 import ast
+import base64
 import json
-import os
-import re
-import subprocess
 import sys
 import tempfile
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import chdir, redirect_stdout
+from difflib import unified_diff
 from html import escape
 from io import BytesIO, StringIO
 from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
-import pandas as pd
 
-_DPI = 90
-_SHELL_LINE = re.compile(r"^!(.*)$", re.MULTILINE)
+_DPI = 72
+
+Output = dict[str, Any]
+"""Of a cell, as nbformat 4 has it."""
 
 
-def run_notebook(path: Path) -> tuple[str, dict[str, bytes]]:
-    """Run all cells in a folder of their own; return the page in Markdown, and figures by name."""
+def run_notebook(path: Path) -> dict[str, Any]:
+    """Run all cells in a folder of their own; return the notebook with their outputs."""
     mpl.use("agg")
-    cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
-    names: dict[str, Any] = {"__name__": "__main__", "_shell": _shell}
-    parts: list[str] = []
-    figures: dict[str, bytes] = {}
+    notebook: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    names: dict[str, Any] = {"__name__": "__main__"}
+    cells = [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
     with tempfile.TemporaryDirectory() as folder, chdir(folder), warnings.catch_warnings():
         warnings.simplefilter("error")
         for number, cell in enumerate(cells, start=1):
-            text = "".join(cell["source"])
-            if cell["cell_type"] == "markdown":
-                parts.append(text)
-                continue
-            parts.append(f"```python\n{text}\n```")
+            cell["execution_count"] = number
             try:
-                parts += _outputs(text, names)
+                cell["outputs"] = [*_outputs("".join(cell["source"]), names, number), *_figures()]
             except Exception as error:
-                error.add_note(f"{path.name}, cell {number}")
+                error.add_note(f"{path.name}, code cell {number}")
                 raise
-            for content in _figures():
-                figures[f"{path.stem}-{len(figures) + 1}.png"] = content
-                parts.append(f"![Figure that the code above draws]({list(figures)[-1]})")
+    return notebook
+
+
+def store(path: Path, notebook: dict[str, Any]) -> None:
+    """Write a notebook as Jupyter does."""
+    text = json.dumps(notebook, indent=1, ensure_ascii=False)
+    path.write_text(f"{text}\n", encoding="utf-8")
+
+
+def texts_of(notebook: dict[str, Any]) -> list[str]:
+    """Return the text of all outputs, without pictures."""
+    outputs = [output for cell in notebook["cells"] for output in cell.get("outputs", ())]
+    texts = [output.get("text") or output["data"].get("text/plain") for output in outputs]
+    return ["".join(text) for text in texts if text]
+
+
+def notebook_page(path: Path) -> tuple[str, dict[str, bytes]]:
+    """Return a notebook with its stored outputs in Markdown, and figures by name."""
+    parts: list[str] = []
+    figures: dict[str, bytes] = {}
+    for cell in json.loads(path.read_text(encoding="utf-8"))["cells"]:
+        text = "".join(cell["source"])
+        parts.append(text if cell["cell_type"] == "markdown" else f"```python\n{text}\n```")
+        for output in cell.get("outputs", ()):
+            data = output.get("data", {"text/plain": output.get("text", "")})
+            if "image/png" in data:
+                name = f"{path.stem}-{len(figures) + 1}.png"
+                figures[name] = base64.b64decode(data["image/png"])
+                parts.append(f"![Figure that the code above draws]({name})")
+            elif "text/html" in data:
+                parts.append(f'<div class="output">{"".join(data["text/html"])}</div>')
+            else:
+                shown = escape("".join(data["text/plain"]).rstrip())
+                parts.append(f'<pre class="output">{shown}</pre>')
     return "\n\n".join(parts) + "\n", figures
 
 
-def notebook_text(path: Path) -> str:
-    """All cells as Markdown, without running them."""
-    cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
-    texts = ("".join(cell["source"]) for cell in cells)
-    shown = (
-        text if cell["cell_type"] == "markdown" else f"```python\n{text}\n```"
-        for cell, text in zip(cells, texts, strict=True)
-    )
-    return "\n\n".join(shown) + "\n"
-
-
-def _outputs(text: str, names: dict[str, Any]) -> Iterator[str]:
+def _outputs(text: str, names: dict[str, Any], number: int) -> Iterator[Output]:
     """Run a cell; yield what it printed, and the value of its last expression."""
-    tree = ast.parse(_SHELL_LINE.sub(lambda line: f"_shell({line[1]!r})", text))
+    tree = ast.parse(text)
     last = tree.body[-1] if tree.body else None
-    shown = isinstance(last, ast.Expr) and not text.rstrip().endswith(";")
+    is_shown = isinstance(last, ast.Expr) and not text.rstrip().endswith(";")
     value = None
     with redirect_stdout(StringIO()) as printed:
-        exec(compile(ast.Module(tree.body[:-1] if shown else tree.body, []), "cell", "exec"), names)  # noqa: S102  (our own notebooks)
-        if shown and isinstance(last, ast.Expr):
+        module = ast.Module(tree.body[:-1] if is_shown else tree.body, [])
+        exec(compile(module, "cell", "exec"), names)  # noqa: S102  (our own notebooks)
+        if is_shown and isinstance(last, ast.Expr):
             value = eval(compile(ast.Expression(last.value), "cell", "eval"), names)  # noqa: S307
     if printed.getvalue():
-        yield _block(printed.getvalue())
-    if isinstance(value, pd.DataFrame):
-        table = value.to_html(border=0).replace(' class="dataframe"', "")
-        yield f'<div class="output">{table}</div>'
-    elif value is not None:
-        yield _block(repr(value))
+        yield {"name": "stdout", "output_type": "stream", "text": _lines(printed.getvalue())}
+    if value is not None:
+        data = {"text/plain": _lines(repr(value))}
+        # Those of xarray differ each time, and are large.
+        if hasattr(value, "_repr_html_") and not type(value).__module__.startswith("xarray"):
+            data["text/html"] = _lines(value._repr_html_())
+        yield {
+            "data": data,
+            "execution_count": number,
+            "metadata": {},
+            "output_type": "execute_result",
+        }
 
 
-def _block(text: str) -> str:
-    return f'<pre class="output">{escape(text.rstrip())}</pre>'
+def _lines(text: str) -> list[str]:
+    return text.splitlines(keepends=True)
 
 
-def _shell(command: str) -> None:
-    """Run a line of a shell with the programs of this environment."""
-    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ.get('PATH', '')}"
-    done = subprocess.run(  # noqa: S602  (our own notebooks)
-        command,
-        shell=True,
-        check=False,
-        capture_output=True,
-        text=True,
-        env=os.environ | {"PATH": path},
-    )
-    if done.returncode:
-        raise RuntimeError(f"{command}: exit code {done.returncode}\n{done.stdout}{done.stderr}")
-    sys.stdout.write(done.stdout + done.stderr)
-
-
-def _figures() -> Iterator[bytes]:
+def _figures() -> Iterator[Output]:
     """Yield open figures as PNG, and close them."""
     from matplotlib import pyplot as plt  # noqa: PLC0415  (after the choice of the backend)
 
     for number in plt.get_fignums():
         content = BytesIO()
         plt.figure(number).savefig(content, format="png", dpi=_DPI, bbox_inches="tight")
-        yield content.getvalue()
+        code = base64.b64encode(content.getvalue()).decode()
+        data = {"image/png": code, "text/plain": ["<Figure>"]}
+        yield {"data": data, "metadata": {}, "output_type": "display_data"}
     plt.close("all")
 
 
-if __name__ == "__main__":
-    for name in sys.argv[1:]:
-        run_notebook(Path(name).resolve())
+def check(path: Path) -> None:
+    """Compare the text of stored outputs with what the cells give now."""
+    notebooks = json.loads(path.read_text(encoding="utf-8")), run_notebook(path)
+    stored, now = ("".join(texts_of(notebook)).splitlines() for notebook in notebooks)
+    difference = "\n".join(unified_diff(stored, now, "stored", "now", lineterm=""))
+    if difference:
+        sys.exit(f"{path.name}: other outputs are stored; run tools/notebooks.py\n{difference}")
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Run notebooks, and store or compare what their cells show."""
+    for name in arguments:
+        if name == "--check":
+            continue
+        path = Path(name).resolve()
+        if "--check" in arguments:
+            check(path)
+        else:
+            store(path, run_notebook(path))
         sys.stdout.write(f"{name}\n")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,9 +1,8 @@
-"""Hook of MkDocs: notebooks are run, and files that pages link to beside docs/ become pages."""
+"""Hook of MkDocs: notebooks, and files that pages link to beside docs/, become pages."""
 
 import re
 import sys
 from collections.abc import Iterator
-from functools import cache
 from pathlib import Path
 
 from mkdocs.config.defaults import MkDocsConfig
@@ -13,7 +12,7 @@ from mkdocs.structure.pages import Page
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "tools")]
 
-from notebooks import notebook_text, run_notebook  # noqa: E402
+from notebooks import notebook_page  # noqa: E402
 
 #: Folder of notebooks, below docs/.
 NOTEBOOKS = "notebooks"
@@ -39,18 +38,12 @@ def on_files(files: Files, *, config: MkDocsConfig) -> None:
     for name in sorted({*BESIDE, *linked} - {"README.md"}):
         files.append(File.generated(config, name, abs_src_path=str(ROOT / name)))
     for path in sorted((Path(config.docs_dir) / NOTEBOOKS).glob("*.ipynb")):
-        text, figures = _read(path, path.stat().st_mtime_ns, run=config.extra["run_notebooks"])
+        text, figures = notebook_page(path)
         link = f"[This notebook as a file]({path.name}), for Jupyter.\n"
         page = f"{NOTEBOOKS}/{path.stem}.md"
         files.append(File.generated(config, page, content=f"{text}\n{link}"))
         for name, content in figures.items():
             files.append(File.generated(config, f"{NOTEBOOKS}/{name}", content=content))
-
-
-@cache
-def _read(path: Path, _changed: int, *, run: bool) -> tuple[str, dict[str, bytes]]:
-    """Run a notebook once for each time that it was changed, while a server goes on."""
-    return run_notebook(path) if run else (notebook_text(path), {})
 
 
 def on_page_markdown(markdown: str, *, page: Page, config: MkDocsConfig, files: Files) -> str:

@@ -1,42 +1,46 @@
-"""Measures labels in memory, and reads an output dataset, as labeled arrays."""
+"""Measures labels in memory: one hemisphere as arrays, labeled arrays, surfaces and files."""
 
+from base64 import b64encode
 from collections.abc import Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
+from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pandas as pd
+import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
-from hipsta_bids.derivatives.hemisphere import POSITION, STATE, read_sheet, sheet_labels, verdict
-from hipsta_bids.derivatives.measures import identify, origin
-from hipsta_bids.errors import InputError, NothingToDoError
-from hipsta_bids.geometry.catalog import MAPS
+from hipsta_bids import __version__
+from hipsta_bids.derivatives import dataset as folders
+from hipsta_bids.derivatives import hemisphere as outputs
+from hipsta_bids.derivatives.hemisphere import POSITION, STATE
+from hipsta_bids.derivatives.measures import write_measures
+from hipsta_bids.derivatives.names import HemisphereName, output_name, write_shared
+from hipsta_bids.errors import InputError, in_python
+from hipsta_bids.geometry.catalog import MAPS, SUMMARY
 from hipsta_bids.geometry.sheet import is_left_handed, layer_depth
-from hipsta_bids.group.cohort.collect import grid_of
 from hipsta_bids.group.cohort.read import node_coordinates
 from hipsta_bids.inputs.labels import MARGIN, label_volume
 from hipsta_bids.io import files
 from hipsta_bids.io.gifti import sheet_triangles, write_surface
 from hipsta_bids.io.volumes import LabelImage, read_labels
+from hipsta_bids.io.xarrays import Variable, make_dataset
 from hipsta_bids.participant.measure import measure_hemisphere
 from hipsta_bids.protocols import body_ends
 from hipsta_bids.protocols.load import for_region, load_protocol
 from hipsta_bids.protocols.protocol import Protocol
-from hipsta_bids.reports.results import SIDES, Hemisphere, SheetTable, find_results
+from hipsta_bids.reports.cells import card, with_unit
+from hipsta_bids.reports.results import SIDES, SheetTable
 from hipsta_bids.settings import Settings, SheetSettings, load_settings
 from hipsta_bids.types import Flag, Float, HemisphereMaps, LabelVolume, Mesh
 
-if TYPE_CHECKING:
-    import xarray as xr
-
-    from hipsta_bids.io.xarrays import Variable
-
 #: Surfaces of the sheet, by their position among its layers.
 _LEVELS = {"interior": 0.0, "midthickness": 0.5, "exterior": 1.0}
+_TEXT_ROWS = 8  # summary measures in the text of a measurement
 #: What is no column of the sheet's table: definition and unit.
 _EXTRA_VARIABLES = {
     "position": ["position, scanner RAS", "mm"],
@@ -59,6 +63,29 @@ class Measurement:
     settings: Settings
     hemisphere: HemisphereMaps
     """All that was measured, as the stages of the method hand it on."""
+
+    def __repr__(self) -> str:
+        name = f"{SIDES[self.side]}, {self.protocol.name}, {self.settings.body.region}"
+        nx, ny = self.maps["thickness"].shape
+        numbers = [
+            f"  {row.name:<15} {with_unit(f'{self.summary[row.name]:.2f}', row.unit)}"
+            for row in SUMMARY[:_TEXT_ROWS]
+        ]
+        words = [self.decision, *([outputs.headline(self.message)] if self.message else [])]
+        title = f"Measurement of a hemisphere ({name}): {': '.join(words)}"
+        return "\n".join([title, *numbers, f"  maps ({nx}, {ny}): {', '.join(self.maps)}"])
+
+    def _repr_html_(self) -> str:
+        from matplotlib.figure import Figure  # noqa: PLC0415  (slow to load)
+
+        from hipsta_bids.api.plots import plot_sheet  # noqa: PLC0415  (it draws what is here)
+
+        figure, content = Figure(figsize=(3.4, 2.6), layout="constrained"), BytesIO()
+        plot_sheet(self, ax=figure.subplots())
+        figure.savefig(content, format="png", dpi=80)
+        code = b64encode(content.getvalue()).decode()
+        picture = f'<img alt="Thickness on the sheet" src="data:image/png;base64,{code}">'
+        return card(repr(self), picture)
 
     @property
     def maps(self) -> Mapping[str, Float]:
@@ -83,7 +110,7 @@ class Measurement:
     @property
     def message(self) -> str:
         """Why a person should look; empty if nobody need."""
-        return verdict(self.hemisphere)[2] or ""
+        return outputs.verdict(self.hemisphere)[2] or ""
 
     @cached_property
     def summary(self) -> pd.Series:
@@ -93,7 +120,7 @@ class Measurement:
     @cached_property
     def subfield(self) -> NDArray[np.str_]:
         """(x, y) abbreviations of subfields; empty where there is none."""
-        labels = sheet_labels(self.protocol)
+        labels = outputs.sheet_labels(self.protocol)
         names = {int(tissue): label.abbreviation for tissue, label in labels.items()}
         codes = self.hemisphere.subfield
         return np.array([names.get(c, "") for c in codes.ravel().tolist()]).reshape(codes.shape)
@@ -130,6 +157,71 @@ class Measurement:
             write_surface(Path(file), mesh, self.maps)
         return mesh
 
+    def to_gifti(self, folder: str | Path, participant: str, session: str | None = None) -> Path:
+        """Write surfaces (RAS mm), maps and subfields as GIFTI; labels as of :meth:`save`.
+
+        Values are in the order of ``maps[name].ravel()``, NaN where missing.
+        """
+        name = self._name(participant, session)
+        files.check_writable(Path(folder))
+        for key, content in outputs.gifti_files(self.hemisphere, self.protocol, self.side):
+            files.write_bytes(Path(folder) / output_name(name, key), content)
+        return Path(folder)
+
+    def save(self, out_dir: str | Path, participant: str, session: str | None = None) -> Path:
+        """Write all files into an output dataset, as the participant level does.
+
+        Parameters
+        ----------
+        out_dir : str or Path
+            Made if need be; :func:`hipsta_bids.load` and ``hipsta-bids ... group`` read it.
+        participant, session : str
+            Labels, such as ``"sub-01"`` and ``"ses-1"``; earlier files of these are replaced.
+
+        Returns
+        -------
+        Path
+            The output dataset.
+
+        Raises
+        ------
+        ValueError
+            If a label has other characters than letters and digits.
+        UsageError, OutputError
+            If the folder has results with other settings or of other software, or is not writable.
+        """
+        root, name = Path(out_dir), self._name(participant, session)
+        folders.check_own_dataset(root)
+        files.check_writable(root)
+        with files.locked(root, files.DATASET):
+            digest = folders.settle_settings(root, self.settings)
+            folders.write_description(root, {})
+            folders.write_sidecar(root)
+            write_shared(root)
+        common = {"version": __version__, "settings_hash": digest, "region": name.region}
+        about = {"scheme": name.seg, "scheme_title": self.protocol.title, "input_hash": None}
+        record = common | about | {"inputs": [], "edited": [], "notes": ["measured in Python"]}
+        place = outputs.ResultPlace(root=root, name=name)
+        outputs.write_results(place, self.hemisphere, self.protocol, record, write_meshes=False)
+        _, reason, message = outputs.verdict(self.hemisphere)
+        row = {"decision": self.decision, "repairs": str(len(self.hemisphere.repairs))}
+        row |= (
+            {"reason": reason, "message": outputs.headline(message)} if reason and message else {}
+        )
+        folders.update_status(root, [common | row | folders.identity(name)])
+        write_measures(root)
+        return root
+
+    def _name(self, participant: str, session: str | None) -> HemisphereName:
+        subject = participant.removeprefix("sub-")
+        visit = session.removeprefix("ses-") if session else None
+        if not all(label.isascii() and label.isalnum() for label in (subject, visit or subject)):
+            raise ValueError("labels of participant and session have letters and digits only")
+        region = self.settings.body.region
+        return HemisphereName(
+            subject=subject, session=visit, hemi=self.side, seg=self.protocol.name, region=region
+        )
+
     @cached_property
     def table(self) -> SheetTable:
         """The sheet as the pages draw it."""
@@ -144,7 +236,7 @@ class Measurement:
         )
 
     @cached_property
-    def dataset(self) -> "xr.Dataset":
+    def dataset(self) -> xr.Dataset:
         """The maps as a dataset of xarray.
 
         Coordinates are ``x`` (medial to lateral) and ``y`` (posterior to anterior), from -1 to 1,
@@ -153,8 +245,6 @@ class Measurement:
         ``depth`` (x, y, layer) in mm from the interior wall. Attributes hold units, definitions
         and sources of maps.
         """
-        from hipsta_bids.io.xarrays import make_dataset  # noqa: PLC0415  (an optional extra)
-
         sheet, layers = self.hemisphere.sheet, self.hemisphere.layers
         nz = sheet.points.shape[2]
         grid = ("x", "y")
@@ -195,6 +285,7 @@ def check_choice(name: str, value: object, choices: Mapping[str, object]) -> Non
         raise ValueError(f"{name} is {value!r}; choose {' or '.join(map(repr, choices))}")
 
 
+@in_python()
 def measure(
     labels: Any,  # noqa: ANN401  (nibabel's images have no types)
     side: str = "L",
@@ -228,12 +319,14 @@ def measure(
     Returns
     -------
     Measurement
-        ``maps`` as arrays, ``dataset`` with coordinates and units, ``summary``, ``status``.
+        ``maps`` as arrays, ``dataset`` with coordinates and units, ``summary``, ``decision``.
 
     Raises
     ------
     ValueError
         If side, protocol or affine are missing or wrong.
+    FileNotFoundError
+        If a file of labels, protocol or settings does not exist.
     InputError, ProtocolError
         If the labels cannot be read, or do not fit the protocol.
     GeometryError
@@ -315,160 +408,3 @@ def _read_volume(
         raise ValueError("affine has to be an invertible matrix (4, 4), voxel indices to RAS mm")
     image = LabelImage(data=data, start=(0, 0, 0), shape=data.shape, affine=matrix)
     return label_volume(image, protocol, side, region)
-
-
-class Results(NamedTuple):
-    """An output dataset."""
-
-    maps: "xr.Dataset"
-    """(participant, session, side, x, y), read when values are used."""
-    measures: pd.DataFrame
-    """One row per hemisphere, as in ``measures.tsv``: who, decision, reason, message, where the
-    labels come from (``labels_tool``, ``labels_version`` and so on), and the summary measures."""
-
-
-def load(out_dir: str | Path, *, protocol: str | None = None, region: str = "body") -> Results:
-    """Load an output dataset as a table of measures and one lazy dataset of xarray.
-
-    Nothing but the small records and summaries is read at once. Maps are read when their values
-    are used, and only those of the participants, sides and measures that are used: select first,
-    then compute. ``.load()`` reads all that is left.
-
-    Parameters
-    ----------
-    out_dir : str or Path
-        The output folder of ``hipsta-bids ... participant``.
-    protocol : str, optional
-        Name of the segmentation protocol, if the folder has results of several.
-    region : {"body", "extended", "entorhinal", "headbody", "whole"}
-        What was measured.
-
-    Returns
-    -------
-    Results
-        ``maps``: every map of the sheet, ``subfield``, ``valid``, ``repaired`` and ``position``
-        (RAS mm of the mid-surface); where they were made, SDs of ``--uncertainty``
-        (``thickness_sd``) and what ``--map`` sampled, by its name; by participant
-        (``sub-01``), session (``ses-1``; ``n/a`` in datasets without), side (``L``, ``R``), x and
-        y (-1 to 1 in the body), with units; NaN where there is no map. ``decision`` has
-        no x and y. ``measures``: one row per hemisphere, failed ones included, whose
-        ``participant_id`` is that of ``participants.tsv``.
-
-    Raises
-    ------
-    NothingToDoError
-        ``no-hemisphere``: no results are there, or none of this protocol and region.
-    InputError
-        ``several-protocols``: choose one.
-
-    Examples
-    --------
-    ::
-
-        maps, measures = hb.load("out")
-        thickness = maps.thickness.sel(side="L").mean(("participant", "session"))
-        hb.plot_sheet(maps.sel(participant="sub-01", side="L").squeeze("session"))
-    """
-    root = Path(out_dir)
-    hemispheres = list(find_results(root))
-    seg = _one_protocol(root, hemispheres, protocol, region)
-    selected = [
-        side
-        for side in hemispheres
-        if (side.result.name.seg, side.result.name.region) == (seg, region)
-    ]
-    table = pd.DataFrame([_row(side) for side in selected])
-    return Results(maps=_lazy_dataset(root, selected, table), measures=table)
-
-
-def _one_protocol(
-    root: Path, hemispheres: list[Hemisphere], protocol: str | None, region: str
-) -> str:
-    pairs = sorted({(side.result.name.seg, side.result.name.region) for side in hemispheres})
-    names = [seg for seg, pair_region in pairs if pair_region == region]
-    if not names or protocol not in {None, *names}:
-        available = ", ".join(f"{seg} (region {pair_region})" for seg, pair_region in pairs)
-        available = f"there is {available}" if available else "run the participant level first"
-        raise NothingToDoError(f"{root}: no such hemisphere; {available}")
-    if protocol is None and len(names) > 1:
-        raise InputError(
-            f"{root}: hemispheres of several protocols, {', '.join(names)}; choose one by protocol"
-        )
-    return protocol or names[0]
-
-
-def _row(side: Hemisphere) -> dict[str, object]:
-    return {
-        **identify(side.result.name),
-        "decision": side.decision.value,
-        "reason": side.record.get("reason") or "",
-        "message": side.message,
-        **origin(side.record),
-        **side.summary,
-    }
-
-
-def _lazy_dataset(root: Path, hemispheres: list[Hemisphere], table: pd.DataFrame) -> "xr.Dataset":
-    from hipsta_bids.io.xarrays import make_dataset, read_later  # noqa: PLC0415  (optional)
-
-    axes_of_nodes = node_axes(grid_of(root), table["region"].iloc[0])
-    nx, ny = (len(values) for _, values, _ in axes_of_nodes.values())
-    shape = nx, ny
-    labels = [sorted(table[column].unique()) for column in ("participant_id", "session_id", "hemi")]
-    outer = tuple(len(names) for names in labels)
-    axes = ("participant", "session", "side")
-    index = [
-        tuple(names.index(cell) for names, cell in zip(labels, cells, strict=True))
-        for cells in table[["participant_id", "session_id", "hemi"]].itertuples(index=False)
-    ]
-    decision = np.full(outer, "", dtype="<U8")
-    for at, word in zip(index, table["decision"], strict=True):
-        decision[at] = word
-    measured = {at: side for at, side in zip(index, hemispheres, strict=True) if side.measured}
-
-    extras = _beside_sheets(list(measured.values()))
-
-    def read(name: str, at: tuple[int, ...]) -> NDArray[Any] | None:
-        key, _ = extras.get(name, (("sheet",), {}))
-        if at not in measured or not (path := measured[at].result.path(*key)).is_file():
-            return None
-        if name == "position":
-            columns = read_sheet(path, tuple(POSITION), shape=shape)
-            return np.stack([columns[axis] for axis in POSITION], axis=-1)
-        if name in STATE:
-            words = read_sheet(path, (), (name,), shape)[name]
-            return words if name == "subfield" else words == "true"
-        return read_sheet(path, (name,), shape=shape)[name]
-
-    def variable(name: str) -> tuple[tuple[str, ...], Any, Mapping[str, str]]:
-        kind = {"subfield": np.object_, "valid": np.bool_, "repaired": np.bool_}
-        last = ("ras",) if name == "position" else ()
-        inner = (*shape, *(len(POSITION) for _ in last))
-        values = read_later(outer, inner, kind.get(name, np.float64), partial(read, name))
-        about = extras[name][1] if name in extras else attributes(name)
-        return (*axes, "x", "y", *last), values, about
-
-    names = (*(row.name for row in MAPS), *STATE, "position", *extras)
-    variables: dict[str, Any] = {name: variable(name) for name in names}
-    variables["decision"] = (axes, decision, {"long_name": "use, look or failed; empty: none"})
-    coordinates = {
-        **{name: ([name], values, {}) for name, values in zip(axes, labels, strict=True)},
-        **axes_of_nodes,
-        "ras": (["ras"], list(POSITION), {}),
-    }
-    about = {"protocol": table["protocol"].iloc[0], "region": table["region"].iloc[0]}
-    return make_dataset(variables, coordinates, about)
-
-
-def _beside_sheets(measured: list[Hemisphere]) -> dict[str, tuple[tuple[str, ...], dict[str, str]]]:
-    """Columns of tables of SDs and of sampled maps: their table, and what they are."""
-    maps = {entry["name"] for one in measured for entry in one.record.get("maps") or ()}
-    variables = {}
-    for key in (("uncertainty",), *(("map_table", name) for name in sorted(maps))):
-        paths = (one.result.path(*key).with_suffix(".json") for one in measured)
-        path = next((path for path in paths if path.is_file()), None)
-        for name, about in files.read_json(path).items() if path else ():
-            if name.endswith("_sd") if key == ("uncertainty",) else name.partition("_")[0] in maps:
-                unit = {"units": about["Units"]} if "Units" in about else {}
-                variables[name] = key, {"long_name": about["Description"], **unit}
-    return variables

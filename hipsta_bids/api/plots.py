@@ -5,6 +5,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import xarray as xr
 from numpy.typing import NDArray
 
 from hipsta_bids.api.maps import Measurement, attributes, check_choice
@@ -31,7 +32,7 @@ _VIEW = {"L": (38.0, -140.0), "R": (38.0, -40.0)}
 
 
 def plot_sheet(
-    data: Any,  # noqa: ANN401  (a measurement, or a dataset of an optional library)
+    data: Measurement | xr.Dataset,
     measure: str = "thickness",
     *,
     ax: "Axes | None" = None,
@@ -70,14 +71,12 @@ def plot_sheet(
     --------
     >>> import hipsta_bids as hb
     >>> from matplotlib.figure import Figure
-    >>> from hipsta_bids.phantom import Phantom, PhantomSpec
-    >>> from hipsta_bids.protocols.load import load_protocol
-    >>> phantom = Phantom(PhantomSpec(kind="arc", thickness=2.0, length=10.0))
-    >>> left = hb.measure(phantom.label_volume(load_protocol("freesurfer")), side="L")
-    >>> ax = hb.plot_sheet(left, ax=Figure().subplots(), limits=(1.5, 2.5))
+    >>> left = hb.measure(hb.example().labels, side="L", protocol="freesurfer")
+    >>> ax = hb.plot_sheet(left, ax=Figure().subplots(), limits=(1.2, 2.4))
     >>> ax.get_title(), ax.get_xlabel()
     ('left', 'medial  ←  mm  →  lateral')
     """
+    data = _one_hemisphere(data)
     columns, side = _columns(data, measure)
     sheet = _sheet(data, columns)
     kind = _kind(measure)
@@ -92,7 +91,7 @@ def plot_sheet(
 
 
 def plot_surface(
-    data: Any,  # noqa: ANN401  (as above)
+    data: Measurement | xr.Dataset,
     measure: str = "thickness",
     *,
     level: str = "midthickness",
@@ -136,6 +135,7 @@ def plot_surface(
     from matplotlib.colors import Normalize  # noqa: PLC0415
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection  # noqa: PLC0415
 
+    data = _one_hemisphere(data)
     columns, side = _columns(data, measure)
     kind = _kind(measure)
     points = _points(data, level)
@@ -260,16 +260,25 @@ def plot_group(
     return ax
 
 
-def _columns(data: Any, measure: str) -> tuple[dict[str, Float], str]:  # noqa: ANN401
+def _one_hemisphere(data: Measurement | xr.Dataset) -> Measurement | xr.Dataset:
+    """Remove axes of length one."""
+    if isinstance(data, Measurement):
+        return data
+    return data.squeeze(
+        [name for name, n in data.sizes.items() if n == 1 and name not in {"x", "y"}]
+    )
+
+
+def _columns(data: Measurement | xr.Dataset, measure: str) -> tuple[dict[str, Float], str]:
     """Arrays (x, y) by name, the measure and extents, and the side."""
     if isinstance(data, Measurement):
         check_choice("measure", measure, data.maps)
         return dict(data.maps), data.side
     check_choice("measure", measure, dict.fromkeys(map(str, data.data_vars)))
-    if sorted(data[measure].dims) != ["x", "y"]:
+    if set(data[measure].dims) != {"x", "y"}:
         raise ValueError(
             f"{measure} has the axes {', '.join(map(str, data[measure].dims))}; select one"
-            " participant, session and side"
+            " protocol, participant, session, side and layer"
         )
     names = [name for name in (measure, "extent_x", "extent_y") if name in data]
     columns = {name: data[name].transpose("x", "y").to_numpy() for name in names}
@@ -283,7 +292,7 @@ def _current_axes() -> "Axes":
     return plt.gca()
 
 
-def _sheet(data: Any, columns: dict[str, Float]) -> SheetTable:  # noqa: ANN401
+def _sheet(data: Measurement | xr.Dataset, columns: dict[str, Float]) -> SheetTable:
     if isinstance(data, Measurement):
         return data.table
     state = {name: data[name].transpose("x", "y").to_numpy() for name in STATE if name in data}
@@ -309,7 +318,7 @@ def _bare_sheet(
     )
 
 
-def _points(data: Any, level: str) -> Float:  # noqa: ANN401
+def _points(data: Measurement | xr.Dataset, level: str) -> Float:
     """(x, y, 3) RAS mm."""
     if isinstance(data, Measurement):
         shape = data.maps["thickness"].shape

@@ -257,7 +257,7 @@ def write_results(
     _write_summary(result, maps.summary)
     _write_profile(result, maps)
     _write_sections(result, maps.sections)
-    for key, content in _gifti_files(maps, protocol, result.name.hemi):
+    for key, content in gifti_files(maps, protocol, result.name.hemi):
         files.write_bytes(result.path(key), content)
     files.write_bytes(result.path("body_mask"), mask_bytes(maps.body_mask))
     if write_meshes:
@@ -374,9 +374,7 @@ def headline(message: str) -> str:
     return f"{' '.join(head)}..."
 
 
-def _gifti_files(
-    maps: HemisphereMaps, protocol: Protocol, hemi: str
-) -> Iterator[tuple[str, bytes]]:
+def gifti_files(maps: HemisphereMaps, protocol: Protocol, hemi: str) -> Iterator[tuple[str, bytes]]:
     """Encode the surfaces and the maps on them.
 
     Vertices are the sheet's columns, y fastest, as the rows of the sheet table are. Surfaces

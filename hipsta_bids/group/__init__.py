@@ -4,19 +4,37 @@ Called as a function, ``hipsta_bids.group(maps, table, formula)``, it fits a mod
 :func:`hipsta_bids.group.questions.models.group`.
 """
 
+import inspect
 import sys
 from types import ModuleType
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from hipsta_bids.group.questions.models import GroupFit
+
+
+def _function() -> "Callable[..., GroupFit]":
+    from hipsta_bids.group.questions.models import group  # noqa: PLC0415  (most imports need no model)
+
+    return group
 
 
 class _Package(ModuleType):
-    """A package that can be called: a function of its name would be hidden by it."""
+    """A package with the call, signature and text of the function that it hides by its name."""
 
-    def __call__(self, *arguments: Any, **named: Any) -> Any:  # noqa: ANN401  (of what is called)
+    def __call__(self, *arguments: Any, **named: Any) -> "GroupFit":  # noqa: ANN401  (of the function)
         """Fit a model to arrays, see :func:`hipsta_bids.group.questions.models.group`."""
-        from hipsta_bids.group.questions.models import group  # noqa: PLC0415  (most imports need no model)
+        return _function()(*arguments, **named)
 
-        return group(*arguments, **named)
+    @property
+    def __signature__(self) -> inspect.Signature:
+        return inspect.signature(_function())
+
+    @property
+    def __doc__(self) -> str | None:  # type: ignore[override]  # a plain attribute of other modules
+        return _function().__doc__
 
 
 sys.modules[__name__].__class__ = _Package

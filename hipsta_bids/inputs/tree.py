@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 
-from hipsta_bids.errors import InputError
+from hipsta_bids.errors import InputError, MissingFileError
 from hipsta_bids.io.files import is_missing, read_tsv
 from hipsta_bids.types import Visit
 
@@ -138,7 +138,7 @@ def list_folder(path: Path) -> tuple[list[str], list[str]]:
                 if not entry.name.startswith("."):
                     (folders if _is_folder(entry) else files).append(entry.name)
     except FileNotFoundError as error:
-        raise InputError(f"{path}: no such folder; check the path") from error
+        raise MissingFileError(f"{path}: no such folder; check the path") from error
     except NotADirectoryError as error:
         raise InputError(f"{path}: is a file, but a folder is needed") from error
     except OSError as error:

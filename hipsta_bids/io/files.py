@@ -28,7 +28,7 @@ import numpy as np
 from pydantic import AfterValidator, Field, ValidationError
 
 from hipsta_bids import opening
-from hipsta_bids.errors import InputError, OutputError
+from hipsta_bids.errors import InputError, MissingFileError, OutputError
 from hipsta_bids.protocols.toml import Table, first_mistake
 
 LOGS = "logs"
@@ -242,7 +242,9 @@ def read_json(path: Path, limit: float = opening.TABLE) -> dict[str, Any]:
         if _HALF_LETTERS in text.lower():  # can be read, but not be written
             json.dumps(value, ensure_ascii=False).encode()
     except FileNotFoundError as error:
-        raise InputError(f"{path}: no such file; check its name", reason="bad-json") from error
+        raise MissingFileError(
+            f"{path}: no such file; check its name", reason="bad-json"
+        ) from error
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(
             f"{path}: not readable as JSON ({error}); restore or delete it",
@@ -270,7 +272,7 @@ def read_tsv(path: Path) -> list[dict[str, str]]:
     try:
         text = opening.read_text(path, encoding="utf-8-sig")
     except FileNotFoundError as error:
-        raise InputError(f"{path}: no such file; check its name") from error
+        raise MissingFileError(f"{path}: no such file; check its name") from error
     except UnicodeDecodeError as error:
         raise InputError(
             f"{path}: not readable as a table: no UTF-8 text; save it as that (not as Excel's"

@@ -18,7 +18,7 @@ from nibabel.spatialimages import HeaderDataError
 from nibabel.wrapstruct import WrapStructError
 from numpy.typing import NDArray
 
-from hipsta_bids.errors import InputError
+from hipsta_bids.errors import InputError, MissingFileError
 from hipsta_bids.geometry.digital import Box, box, to_ras
 from hipsta_bids.geometry.sampling import ScalarVolume
 from hipsta_bids.opening import open_regular
@@ -306,6 +306,10 @@ def _opened(path: Path) -> Iterator[Any]:
             stream.seek(0)
             # Mapped files would break under the reader if someone replaced them.
             yield kind.from_file_map(kind.make_file_map({"image": stream}), mmap=False)
+    except FileNotFoundError as error:
+        raise MissingFileError(
+            f"{path}: no such file; check its name", reason="unreadable-image"
+        ) from error
     except _READ_ERRORS as error:
         message = " ".join(str(error).split()) or type(error).__name__
         raise InputError(

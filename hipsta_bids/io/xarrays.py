@@ -1,4 +1,4 @@
-"""Labeled arrays of xarray (an optional extra), also such that are read when their values are used.
+"""Labeled arrays of xarray, also arrays that are read when their values are used.
 
 The latter follow https://docs.xarray.dev/en/stable/internals/how-to-add-new-backend.html
 """
@@ -7,16 +7,10 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+import xarray as xr
 from numpy.typing import NDArray
-
-try:
-    import xarray as xr
-    from xarray.backends import BackendArray
-    from xarray.core import indexing
-except ImportError as error:  # pragma: no cover -- the environment of the tests has it
-    raise ImportError(
-        "labeled arrays need xarray; install it, or hipsta_bids with it: hipsta_bids[xarray]"
-    ) from error
+from xarray.backends import BackendArray
+from xarray.core import indexing
 
 Variable = tuple[Sequence[str], Any, Mapping[str, Any]]
 """Names of the axes, values, and attributes."""

@@ -12,7 +12,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from hipsta_bids import opening
-from hipsta_bids.errors import ProtocolError
+from hipsta_bids.errors import MissingProtocolError, ProtocolError
 from hipsta_bids.protocols import EXPERIMENTAL
 from hipsta_bids.protocols.protocol import (
     CORE,
@@ -133,7 +133,8 @@ def _load_file(path: Path) -> Protocol:
     try:
         table = tomllib.loads(opening.read_text(path, opening.SETTINGS))
     except OSError as error:
-        raise ProtocolError(
+        is_missing = isinstance(error, FileNotFoundError)
+        raise (MissingProtocolError if is_missing else ProtocolError)(
             f"{path}: cannot read the protocol ({error.strerror}); check the path"
         ) from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:

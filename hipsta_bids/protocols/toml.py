@@ -22,7 +22,7 @@ from pydantic import (
 )
 
 from hipsta_bids import opening
-from hipsta_bids.errors import SettingsError
+from hipsta_bids.errors import MissingSettingsError, SettingsError
 
 _LINE = 96
 
@@ -139,7 +139,8 @@ def read_settings(path: Path | None, kind: type[Table]) -> Table:
     try:
         values = tomllib.loads(opening.read_text(path, opening.SETTINGS))
     except OSError as error:
-        raise SettingsError(
+        is_missing = isinstance(error, FileNotFoundError)
+        raise (MissingSettingsError if is_missing else SettingsError)(
             f"{path}: settings cannot be read ({error.strerror}); check the path"
         ) from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:

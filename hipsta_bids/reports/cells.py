@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
+from markupsafe import escape
 
 from hipsta_bids.io import files
 from hipsta_bids.protocols.protocol import Tissue
@@ -54,6 +55,12 @@ def with_brackets(title: str, unit: str) -> str:
 def with_unit(text: str, unit: str) -> str:
     """Append a unit to a number."""
     return f"{text} {unit_of(unit)}".rstrip()
+
+
+def card(text: str, *parts: str) -> str:
+    """Show an object in a notebook: a bold line, lines below it, and parts that are HTML."""
+    title, _, lines = str(escape(text)).partition("\n")
+    return f"<div><b>{title}</b><pre>{lines}</pre>{''.join(parts)}</div>"
 
 
 def statistic_text(row: Mapping[str, Any]) -> str:

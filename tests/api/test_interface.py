@@ -1,6 +1,7 @@
 """``import hipsta_bids as hb``: what it offers, that it loads nothing, and that examples hold."""
 
 import doctest
+import inspect
 import subprocess
 import sys
 from importlib import import_module
@@ -9,7 +10,11 @@ import pytest
 
 import hipsta_bids as hb
 
-MODULES = ("hipsta_bids.api.maps", "hipsta_bids.api.plots", "hipsta_bids.group.questions.models")
+MODULES = (
+    *(f"hipsta_bids.api.{name}" for name in ("maps", "datasets", "plots")),
+    "hipsta_bids.group.questions.models",
+)
+LIBRARIES = ("xarray", "matplotlib.pyplot")
 
 
 @pytest.mark.parametrize("module", MODULES)
@@ -28,13 +33,35 @@ def test_import_loads_no_other_module():
     assert done.stdout.strip() == "['hipsta_bids']"
 
 
-def test_a_measurement_needs_no_xarray():
-    program = "import sys; import hipsta_bids as hb; hb.measure; hb.group; hb.load; hb.plot_sheet"
-    program += "; print('xarray' in sys.modules, 'matplotlib.pyplot' in sys.modules)"
+def loaded(program):
+    program = f"import sys; {program}; print(*(m in sys.modules for m in {LIBRARIES}))"
     done = subprocess.run(
         [sys.executable, "-c", program], check=True, capture_output=True, text=True
     )
-    assert done.stdout.strip() == "False False"
+    return dict(zip(LIBRARIES, done.stdout.split(), strict=True))
+
+
+def test_the_command_line_needs_no_xarray():
+    """Images do without it."""
+    modules = ("cli.main", "participant.run", "group.questions.compare", "group.questions.trials")
+    names = ", ".join(f"hipsta_bids.{name}" for name in modules)
+    assert loaded(f"import {names}")["xarray"] == "False"
+
+
+def test_the_interface_opens_no_window_system():
+    assert loaded("import hipsta_bids as hb; hb.load; hb.plot_sheet") == {
+        "xarray": "True",
+        "matplotlib.pyplot": "False",
+    }
+
+
+def test_group_has_the_signature_and_text_of_its_function():
+    function = import_module("hipsta_bids.group.questions.models").group
+    assert inspect.signature(hb.group) == inspect.signature(function)
+    assert list(inspect.signature(hb.group).parameters)[:3] == ["maps", "table", "formula"]
+    assert inspect.getdoc(hb.group) == inspect.getdoc(function)
+    with pytest.raises(TypeError, match="missing 2 required positional arguments"):
+        hb.group(None)
 
 
 @pytest.mark.parametrize("name", hb.__all__)
@@ -42,9 +69,8 @@ def test_every_name_is_there_and_documented(name):
     found = getattr(hb, name)
     assert name in dir(hb)
     assert callable(found)
-    target = import_module("hipsta_bids.group.questions.models").group if name == "group" else found
     for section in ("Parameters", "Returns", "Raises", "Examples"):
-        assert f"\n    {section}\n    ---" in target.__doc__
+        assert f"\n    {section}\n    ---" in found.__doc__
 
 
 def test_other_names_are_refused():

@@ -6,9 +6,11 @@ import meshio
 import nibabel as nib
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from measured_phantoms import measured, spiral
 
 import hipsta_bids as hb
+from hipsta_bids.api import datasets
 from hipsta_bids.api import maps as api_maps
 from hipsta_bids.derivatives import dataset
 from hipsta_bids.derivatives.hemisphere import (
@@ -18,7 +20,13 @@ from hipsta_bids.derivatives.hemisphere import (
     write_spread,
 )
 from hipsta_bids.derivatives.names import HemisphereName
-from hipsta_bids.errors import GeometryError, HipstaError, InputError, ProtocolError
+from hipsta_bids.errors import (
+    GeometryError,
+    HipstaError,
+    InputError,
+    NothingToDoError,
+    ProtocolError,
+)
 from hipsta_bids.geometry.sampling import SampledMap
 from hipsta_bids.inputs.scan import MapSource
 from hipsta_bids.io import files
@@ -166,11 +174,11 @@ class TestLoad:
     def test_maps_are_those_that_were_written(self, out):
         maps, table = hb.load(out)
         assert dict(maps.thickness.sizes) == {
-            "participant": 3, "session": 1, "side": 2, "x": 41, "y": 21,
+            "protocol": 1, "participant": 3, "session": 1, "side": 2, "x": 41, "y": 21,
         }  # fmt: skip
         for side in "LR":
             case = phantom(side)
-            own = maps.sel(participant="sub-01", side=side).squeeze("session")
+            own = maps.sel(participant="sub-01", side=side).squeeze()
             np.testing.assert_allclose(own.thickness, case.maps.thickness, atol=6e-5)
             middle = case.maps.sheet.points[:, :, case.maps.sheet.middle]
             np.testing.assert_allclose(own.position, middle, atol=6e-5)
@@ -194,7 +202,7 @@ class TestLoad:
         write_map(place, source, SampledMap(values=values, outside=0, unknown=0), {"Name": "bold"})
         record = files.read_json(place.path("qc"))
         files.write_json(place.path("qc"), record | {"maps": [{"name": "bold"}]})
-        found = hb.load(tmp_path).maps.sel(side="L").squeeze("session")
+        found = hb.load(tmp_path).maps.sel(side="L").squeeze()
         known = found.sel(participant="sub-02")
         np.testing.assert_allclose(known.bold_2, -maps.thickness, rtol=1e-6)
         np.testing.assert_allclose(known.thickness_sd, 0.1 + 0 * maps.thickness, atol=1e-9)
@@ -220,13 +228,13 @@ class TestLoad:
 
     def test_only_what_is_used_is_read(self, out, monkeypatch):
         read = []
-        original = api_maps.read_sheet
+        original = datasets.read_sheet
 
         def counted(path, *given, **named):
             read.append(path.name)
             return original(path, *given, **named)
 
-        monkeypatch.setattr(api_maps, "read_sheet", counted)
+        monkeypatch.setattr(datasets, "read_sheet", counted)
         maps, _ = hb.load(out)
         chosen = maps.thickness.sel(participant=["sub-01", "sub-03"], side="L")
         assert read == []
@@ -250,13 +258,25 @@ class TestLoad:
         assert maps.session.to_numpy().tolist() == ["ses-1", "ses-2"]
         assert table.session_id.tolist() == ["ses-1", "ses-2"]
 
-    def test_one_protocol_has_to_be_chosen(self, tmp_path):
+    def test_protocols_are_an_axis(self, tmp_path):
         dataset.settle_settings(tmp_path, Settings())
-        for seg in ("freesurfer", "other"):
-            write(tmp_path, "01", "L", seg=seg)
-        with pytest.raises(InputError, match="freesurfer, other; choose"):
-            hb.load(tmp_path)
-        assert hb.load(tmp_path, protocol="other").maps.attrs["protocol"] == "other"
+        write(tmp_path, "01", "L", seg="freesurfer")
+        write(tmp_path, "01", "R", seg="other")
+        maps, table = hb.load(tmp_path)
+        assert maps.protocol.to_numpy().tolist() == ["freesurfer", "other"]
+        assert table["protocol"].tolist() == ["freesurfer", "other"]
+        left, right = (maps.thickness.sel(side=side).squeeze() for side in "LR")
+        np.testing.assert_allclose(left[0], phantom("L").maps.thickness, atol=6e-5)
+        np.testing.assert_allclose(right[1], phantom("R").maps.thickness, atol=6e-5)
+        assert np.isnan(left[1]).all()
+        other = hb.load(tmp_path, protocol="other")
+        assert other.maps.protocol.to_numpy().tolist() == ["other"]
+        assert other.measures["hemi"].tolist() == ["R"]
+        with pytest.raises(ValueError, match="one protocol, one session"):
+            hb.group(maps.thickness, table, "1")
+        assert hb.plot_sheet(maps.sel(side="R", protocol="other"), ax=Figure().subplots())
+        with pytest.raises(NothingToDoError, match=r"there is freesurfer \(region body\), other"):
+            hb.load(tmp_path, protocol="ashs")
 
     def test_an_empty_folder_is_refused(self, tmp_path):
         with pytest.raises(HipstaError, match="run the participant level first"):

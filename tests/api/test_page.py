@@ -3,39 +3,32 @@
 import matplotlib as mpl
 import pytest
 from matplotlib import pyplot as plt
-from measured_phantoms import measured, spiral
 from python_figures import blocks
 
-from hipsta_bids.derivatives import dataset
-from hipsta_bids.derivatives.hemisphere import ResultPlace, write_results
-from hipsta_bids.derivatives.names import HemisphereName
-from hipsta_bids.settings import Settings
+import hipsta_bids as hb
 
 
 @pytest.fixture
-def demo(tmp_path, monkeypatch):
-    """Two participants where the page looks for them, and no screen."""
-    root = tmp_path / "demo" / "out"
-    root.mkdir(parents=True)
-    dataset.settle_settings(root, Settings())
-    for hemi in "LR":
-        case = measured(spiral(), hemi=hemi, voxel=0.5)
-        for subject in ("01", "02"):
-            name = HemisphereName(subject=subject, session=None, hemi=hemi, seg="freesurfer")
-            place = ResultPlace(root=root, name=name)
-            write_results(place, case.maps, case.volume.protocol, {}, write_meshes=False)
+def folder(tmp_path, monkeypatch):
+    """An empty folder, and no screen."""
     monkeypatch.chdir(tmp_path)
     with mpl.rc_context({"backend": "agg"}):
-        yield
+        yield tmp_path
     plt.close("all")
 
 
-@pytest.mark.usefixtures("demo")
-def test_code_of_the_page_runs():
+def test_code_of_the_page_runs(folder):
     names = {}
     for code in blocks():
         exec(code, names)  # noqa: S102  (our own page)
     assert names["left"].decision == "use"
-    assert names["measures"]["participant_id"].nunique() == 2
-    assert names["fit"].significant[0, 0, 12:22, :10].mean() > 0.5
+    assert names["measures"]["participant_id"].nunique() == 10
+    # Thinner in the anterior CA1, by .3 mm.
+    anterior = names["left"].subfield[:, -8:] == "CA1"
+    estimate = names["fit"].maps["estimate"][0, 0]
+    assert 0.15 < estimate[:, -8:][anterior].mean() < 0.45
+    assert names["fit"].significant[0, 0, :, -8:][anterior].mean() > 0.2
     assert len(plt.get_fignums()) == 3
+    assert hb.load(folder / "measured").measures["decision"].tolist() == ["use"]
+    assert len(list((folder / "statistics").glob("*.gii"))) == 3
+    assert len(list((folder / "surfaces").glob("*.gii"))) == 16

@@ -57,7 +57,7 @@ class TestSheet:
     def test_wrong_data_are_refused(self):
         with pytest.raises(ValueError, match="measure is 'depht'; choose 'thickness' or"):
             hb.plot_sheet(found("L"), "depht", ax=Figure().subplots())
-        with pytest.raises(ValueError, match="select one participant"):
+        with pytest.raises(ValueError, match="select one protocol, participant, session, side and"):
             hb.plot_sheet(found("L").dataset, "depth", ax=Figure().subplots())
 
 

@@ -241,7 +241,6 @@ BROKEN = {
     "nothing.nii": lambda path: path.touch(),
     "nothing.mgz": lambda path: path.touch(),
     "pipe.nii": os.mkfifo,
-    "absent.nii": lambda _: None,
     "folder.nii": lambda path: path.mkdir(),
     "truncated.nii.gz": lambda path: truncated(path, 500),
     "truncated.nii": lambda path: truncated(path, 20000),
@@ -249,6 +248,7 @@ BROKEN = {
     "truncated.mgz": lambda path: truncated(path, 200),
     "no-size.mgh": without_size,
     "corrupt.nii.gz": corrupt,
+    "absent.nii": lambda _: None,
     "4d.nii": lambda path: save(path, np.stack([make_labels()] * 2, axis=-1)),
     "2d.nii": lambda path: save(path, make_labels()[20]),
     "interpolated.nii": lambda path: save(path, make_labels(np.float32) * np.float32(0.75)),
@@ -262,7 +262,8 @@ BROKEN = {
 @pytest.mark.parametrize(
     ("name", "reason", "message"),
     [
-        *((name, "unreadable-image", "copy or make the file again") for name in list(BROKEN)[:13]),
+        *((name, "unreadable-image", "copy or make the file again") for name in list(BROKEN)[:12]),
+        ("absent.nii", "unreadable-image", "no such file; check its name"),
         ("4d.nii", "not-3d", "60 x 50 x 40 x 2"),
         ("2d.nii", "not-3d", "50 x 40"),
         ("interpolated.nii", "non-integer-labels", "nearest neighbor"),

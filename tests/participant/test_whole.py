@@ -352,9 +352,8 @@ def test_page_names_the_parts_and_what_has_no_value(out: Path) -> None:
 
 
 def test_interface_loads_the_whole_sheet(out: Path) -> None:
-    pytest.importorskip("xarray")
     maps, table = hb.load(out, region="whole")
-    one = maps.sel(participant="sub-01", side="L").squeeze("session")
+    one = maps.sel(participant="sub-01", side="L").squeeze()
     assert one.y.to_numpy()[[0, 10, 30, -1]] == pytest.approx([-2, -1, 1, 3])
     assert table.region.tolist() == ["whole"]
     sheet = sheet_of(out).thickness.to_numpy().reshape(41, 51)
@@ -366,7 +365,6 @@ def test_interface_loads_the_whole_sheet(out: Path) -> None:
 
 
 def test_interface_measures_head_and_body(maps: HemisphereMaps) -> None:
-    pytest.importorskip("xarray")
     measured = Measurement(
         side="L", protocol=load_protocol("cobralab"), settings=WHOLE, hemisphere=maps
     )

@@ -12,7 +12,7 @@ import pandas as pd
 from hipsta_bids.derivatives import hemisphere
 from hipsta_bids.derivatives.dataset import NOT_FINISHED, name_of, provenance_of, read_status
 from hipsta_bids.derivatives.names import DATASET_FILES, HemisphereName
-from hipsta_bids.errors import InputError, NothingToDoError
+from hipsta_bids.errors import InputError, MissingFileError, NothingToDoError
 from hipsta_bids.group.cohort.covariates import relocate
 from hipsta_bids.group.cohort.exclusions import SHOWN, Choices, Condition, fulfilled
 from hipsta_bids.group.design.formula import listed
@@ -122,7 +122,7 @@ def collect_sheets(request: GroupRequest, *, may_lack: bool = False) -> Collecti
     """Find all complete hemispheres of one protocol, made with the same settings."""
     for folder in request.segmentations:
         if not folder.is_dir():
-            raise InputError(f"{folder}: no such folder; check --segmentations")
+            raise MissingFileError(f"{folder}: no such folder; check --segmentations")
     roots = [root for root in request.roots if root.is_dir() or not may_lack]
     results = [result for root in roots for result in _wanted_results(root, request)]
     places = [result for result in results if result.name.region == request.region]
@@ -204,7 +204,7 @@ def wanted_by(request: GroupRequest) -> Callable[[str, str | None, str], bool]:
 
 def _wanted_results(root: Path, request: GroupRequest) -> list[hemisphere.ResultPlace]:
     if not root.is_dir():
-        raise InputError(f"{root}: no such folder; run the participant level first")
+        raise MissingFileError(f"{root}: no such folder; run the participant level first")
     return [
         result
         for result in hemisphere.list_results(root)

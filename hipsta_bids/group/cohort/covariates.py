@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from hipsta_bids.derivatives.dataset import linked_path, read_links
-from hipsta_bids.errors import InputError, ModelError
+from hipsta_bids.errors import InputError, MissingFileError, ModelError
 from hipsta_bids.group.design.formula import as_factor, check_numbers, level_name, listed, typed
 from hipsta_bids.group.design.model import FIRST_AGE, VisitTime
 from hipsta_bids.group.design.settings import GroupSettings
@@ -68,7 +68,7 @@ def read_covariates(
     spelled: Spellings = Counter()
     absent: frozenset[str] = frozenset()
     if not bids_dir.is_dir():
-        raise InputError(f"{bids_dir}: no such folder; check its name")
+        raise MissingFileError(f"{bids_dir}: no such folder; check its name")
     for path in (*tables, *sorted((bids_dir / "phenotype").glob("*.tsv")), *extra):
         table, sidecar = _read(path), _sidecar(path.with_suffix(".json"))
         if path == main:

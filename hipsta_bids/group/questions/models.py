@@ -1,30 +1,38 @@
-"""The models of the group level on arrays, without files: ``hipsta_bids.group``."""
+"""Registration and models of the group level on arrays, without files."""
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import pandas as pd
+import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
+from hipsta_bids.errors import in_python
 from hipsta_bids.group.cohort.covariates import Spellings, mark_missing, spelled_note
+from hipsta_bids.group.cohort.read import leave_rare
 from hipsta_bids.group.design.formula import with_factors
 from hipsta_bids.group.design.model import Design, ModelRequest, build_design, choose_model
 from hipsta_bids.group.design.settings import GroupSettings, load_group_settings
+from hipsta_bids.group.output.write import stats_of, write_stats
+from hipsta_bids.group.stats import registration
 from hipsta_bids.group.stats.arrays import Bool, Float, SideMaps
 from hipsta_bids.group.stats.glm import FittedMaps, PointTest, RowModel, fit_maps
 from hipsta_bids.group.stats.inference import Discoveries, MapKey, check_permutations, correct
+from hipsta_bids.group.stats.warps import warp_labels, warp_values
+from hipsta_bids.io.files import check_writable
+from hipsta_bids.io.xarrays import make_dataset
+from hipsta_bids.reports.cells import card
+from hipsta_bids.reports.display import parts_of
 from hipsta_bids.types import PARTICIPANT, Mesh
-
-if TYPE_CHECKING:
-    import xarray as xr
 
 _Number = TypeVar("_Number", np.float64, np.bool_)
 _GRID, _VERTICES = 3, 2  # axes of the maps of a side, participants included
+_TEXT_ROWS = 8  # rows of a table in the text of a fit
 #: Arrays of the results: what they hold, and whether in the unit of the maps.
 _ARRAYS = {
     "estimate": ("value of the contrast; of several rows (F) missing", True),
@@ -50,6 +58,15 @@ class GroupFit:
     found: Mapping[MapKey, Discoveries]
     axes: Mapping[str, Float]
     """Coordinates of the points, by axis; empty where they are not known."""
+
+    def __repr__(self) -> str:
+        text = f"GroupFit of {self.measure} by {', '.join(self.design.columns)}"
+        arrays = f"  maps {self.significant.shape}: {', '.join(_ARRAYS)}"
+        return f"{text}\n{self.table.to_string(index=False, max_rows=_TEXT_ROWS)}\n{arrays}"
+
+    def _repr_html_(self) -> str:
+        table = self.table.to_html(index=False, max_rows=_TEXT_ROWS, border=0)
+        return card(repr(self).partition("\n")[0], table)
 
     @property
     def sides(self) -> tuple[str, ...]:
@@ -125,10 +142,8 @@ class GroupFit:
         return pd.DataFrame(rows)
 
     @cached_property
-    def dataset(self) -> "xr.Dataset":
+    def dataset(self) -> xr.Dataset:
         """The maps as a dataset of xarray, by side, contrast and points."""
-        from hipsta_bids.io.xarrays import make_dataset  # noqa: PLC0415  (an optional extra)
-
         inner = ("x", "y") if self.significant.ndim > _GRID else ("vertex",)
         axes = ("side", "contrast", *inner)
         variables: dict[str, Any] = {
@@ -145,9 +160,24 @@ class GroupFit:
         coordinates |= {name: ([name], values, {}) for name, values in self.axes.items()}
         return make_dataset(variables, coordinates, {"measure": self.measure})
 
+    def to_gifti(self, folder: str | Path) -> Path:
+        """Write statistics, effect sizes and corrected p-values as GIFTI, of both sides as CIFTI-2.
 
+        Values are in the order of ``maps[name].ravel()``, NaN where nothing is tested.
+        """
+        check_writable(Path(folder))
+        tested = (
+            (MapKey(self.measure, test.contrast.name, side), test, self._found(side, test))
+            for side in self.sides
+            for test in self._tests(side)
+        )
+        write_stats(Path(folder), stats_of(tested))
+        return Path(folder)
+
+
+@in_python()
 def group(
-    maps: Any,  # noqa: ANN401  (arrays, or labeled arrays of an optional library)
+    maps: xr.DataArray | Mapping[str, ArrayLike] | ArrayLike,
     table: pd.DataFrame,
     formula: str,
     *,
@@ -160,7 +190,7 @@ def group(
     """Fit one linear model at every point of maps, and correct for the number of points.
 
     The model is that of ``hipsta-bids ... group``, with one row per participant. Maps are taken as
-    they are: registration, repeated visits, exclusions and the classification are the command's.
+    they are, see :func:`register`; repeated visits and the classification are the command's.
 
     Parameters
     ----------
@@ -168,7 +198,8 @@ def group(
         (participants, x, y) on the sheet, or (participants, vertices) on another surface, NaN for
         missing; a mapping of such arrays by side, which are corrected together or not as the
         setting ``multiplicity.scope`` says; or an array of xarray with the axes ``participant``,
-        perhaps ``side``, and x and y or vertices, as :func:`hipsta_bids.load` gives.
+        perhaps ``side``, and x and y or vertices, of one session and protocol, as
+        :func:`hipsta_bids.load` gives.
     table : DataFrame
         One row per participant, in the order of the maps. With an array of xarray, rows are found
         by the column ``participant_id``, and may be in any order. Cells that spell a missing value
@@ -197,6 +228,8 @@ def group(
     ------
     ValueError
         If maps and table do not fit.
+    FileNotFoundError
+        If the file of settings does not exist.
     ModelError
         With the reason why the model cannot be fitted.
 
@@ -258,7 +291,7 @@ def group(
 
 
 def _arranged(
-    maps: Any,  # noqa: ANN401  (as above)
+    maps: xr.DataArray | Mapping[str, ArrayLike] | ArrayLike,
     table: pd.DataFrame,
     triangles: ArrayLike | None,
 ) -> tuple[dict[str, Float], dict[str, Float], pd.DataFrame, str, str]:
@@ -267,7 +300,7 @@ def _arranged(
     measure, unit = "maps", "1"
     if isinstance(maps, Mapping):
         sides = {str(side): np.asarray(values, np.float64) for side, values in maps.items()}
-    elif hasattr(maps, "dims"):
+    elif isinstance(maps, xr.DataArray):
         sides, axes, names = _of_labeled(maps)
         measure, unit = str(maps.name or measure), str(maps.attrs.get("units", unit))
         if names is not None and PARTICIPANT in table:
@@ -295,16 +328,16 @@ def _arranged(
 
 
 def _of_labeled(
-    maps: Any,  # noqa: ANN401  (of xarray)
+    maps: xr.DataArray,
 ) -> tuple[dict[str, Float], dict[str, Float], list[str] | None]:
     """Arrays by side, coordinates, and names of participants of an array of xarray."""
-    single = [name for name in ("session", "side") if maps.sizes.get(name) == 1]
+    single = [name for name in ("protocol", "session", "side") if maps.sizes.get(name) == 1]
     side = str(maps.coords["side"].to_numpy().ravel()[0]) if "side" in maps.coords else "both"
     maps = maps.squeeze(single, drop=True)
-    if "participant" not in maps.dims or "session" in maps.dims:
+    if "participant" not in maps.dims or {"protocol", "session"} & set(maps.dims):
         raise ValueError(
             f"maps have the axes {', '.join(map(str, maps.dims))}; they need participant, one"
-            " session, and points"
+            " protocol, one session, and points"
         )
     names = maps.coords["participant"].to_numpy().tolist() if "participant" in maps.coords else None
     if "side" in maps.dims:
@@ -312,7 +345,7 @@ def _of_labeled(
         arrays = {one: maps.sel(side=one) for one in side_names}
     else:
         arrays = {side: maps}
-    order = [name for name in ("x", "y") if name in maps.dims]
+    order: list[str] = [name for name in ("x", "y") if name in maps.dims]
     sides = {
         one: np.asarray(values.transpose("participant", *order, ...), dtype=np.float64)
         for one, values in arrays.items()
@@ -336,3 +369,104 @@ def _side(values: Float, measure: str, triangles: ArrayLike | None) -> SideMaps:
         summary=pd.DataFrame(index=range(count)),
         mesh=mesh,
     )
+
+
+@in_python()
+def register(
+    maps: xr.Dataset | Mapping[str, ArrayLike],
+    *,
+    settings: GroupSettings | str | Path | None = None,
+) -> xr.Dataset:
+    """Align sheets by their curvature, so that a grid node means the same position in all.
+
+    As in ``hipsta-bids ... group``: profiles of mean curvature along x are registered to a template
+    made of all sheets of a side and protocol, and all maps follow. Select maps first: all are read.
+
+    Parameters
+    ----------
+    maps : xarray.Dataset or mapping
+        Maps by name, among them ``curvature`` (1/mm): those of :func:`hipsta_bids.load`, or arrays
+        (participants, x, y) of one side, NaN for missing.
+    settings : GroupSettings, str or Path, optional
+        Settings of the group level, or a TOML file with some.
+
+    Returns
+    -------
+    xarray.Dataset
+        The maps at registered nodes; ``shift`` (participant, x), registered minus original
+        position in nodes, positive is lateral; ``explained_before`` and ``explained_after``, share
+        of the variance of profiles that the mean profile explains.
+
+    Raises
+    ------
+    ValueError
+        If there is no curvature with axes participant, x and y.
+    FileNotFoundError
+        If the file of settings does not exist.
+    ModelError
+        If there are too few sheets for a template (setting ``registration.min_subjects``), or a
+        sheet lacks too much of its profile.
+
+    Examples
+    --------
+    >>> import hipsta_bids as hb
+    >>> study = hb.example()
+    >>> maps = hb.load(study.out_dir).maps[["thickness", "curvature"]]
+    >>> aligned = hb.register(maps)
+    >>> bool((aligned.explained_after > aligned.explained_before).all())
+    True
+    >>> hb.group(aligned.thickness, study.participants, "group + age").contrasts
+    ('CN-AD',)
+    """
+    if isinstance(settings, str | Path) or settings is None:
+        settings = load_group_settings(None if settings is None else Path(settings))
+    if not isinstance(maps, xr.Dataset):
+        sheets = ("participant", "x", "y")
+        maps = xr.Dataset({name: (sheets, np.asarray(maps[name], np.float64)) for name in maps})
+    axes = tuple(maps["curvature"].dims) if "curvature" in maps else ()
+    if not {"participant", "x", "y"} <= set(axes):
+        raise ValueError("registration needs curvature with the axes participant, x and y")
+    rows = [axis for axis in ("participant", "session") if axis in axes]
+    outer = [axis for axis in axes if axis not in {*rows, "x", "y"}]
+    labeled = {
+        name: values.transpose(*outer, *rows, "x", "y", ...)
+        for name, values in maps.data_vars.items()
+        if set(axes) <= set(values.dims)
+    }
+    sizes = [int(np.prod([maps.sizes[axis] for axis in names])) for names in (outer, rows)]
+    shape = (*sizes, maps.sizes["x"], -1)
+    arrays = {name: values.to_numpy().reshape(shape).copy() for name, values in labeled.items()}
+    shifts, explained = np.full(shape[:3], np.nan), np.full((2, sizes[0]), np.nan)
+    has_rims = "y" in maps.coords and parts_of(maps["y"].to_numpy()) is not None
+    for part in range(sizes[0]):
+        sheets_here = np.isfinite(arrays["curvature"][part]).any(axis=(1, 2))
+        if not sheets_here.any():
+            continue
+        curvature = arrays["curvature"][part, sheets_here]
+        profiles = registration.mean_profiles(curvature, settings.registration)
+        result = registration.register(profiles, settings.registration)
+        shifts[part, sheets_here] = result.shifts
+        explained[:, part] = result.explained_before, result.explained_after
+        for values in arrays.values():
+            carried = _carried(values[part, sheets_here], result.warps)
+            if has_rims and carried.dtype.kind == "f":
+                leave_rare(carried)
+            values[part, sheets_here] = carried
+    results = {
+        name: values.copy(data=arrays[name].reshape(values.shape)).transpose(*maps[name].dims)
+        for name, values in labeled.items()
+    }
+    lengths = [maps.sizes[axis] for axis in (*outer, *rows, "x")]
+    about = {"long_name": "registered minus original position", "units": "nodes"}
+    results["shift"] = xr.DataArray(shifts.reshape(lengths), dims=(*outer, *rows, "x"), attrs=about)
+    for name, values in zip(("explained_before", "explained_after"), explained, strict=True):
+        results[name] = xr.DataArray(values.reshape(lengths[: len(outer)]), dims=outer)
+    return maps.assign(results)
+
+
+def _carried(values: NDArray[Any], warps: Float) -> NDArray[Any]:
+    """Carry numbers or labels (sheets, x, points) to registered nodes along x."""
+    if values.dtype.kind == "f":
+        return warp_values(values, warps)
+    names, codes = np.unique(values, return_inverse=True)
+    return np.asarray(names[warp_labels(codes.reshape(values.shape).astype(np.int8), warps)])
