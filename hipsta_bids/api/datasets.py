@@ -214,17 +214,23 @@ class Example(NamedTuple):
 
 
 @cache
+def _temporary_folder() -> str:
+    folder = tempfile.mkdtemp(prefix="hipsta_bids-example-")
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return folder
+
+
 def example(folder: str | Path | None = None) -> Example:
     """Make and measure a small synthetic study, without network; this takes some 20 seconds.
 
-    Five of ten participants are patients, whose wall is 0.3 mm thinner in the anterior CA1. A
-    session makes it once.
+    Five of ten participants are patients, whose wall is 0.3 mm thinner in the anterior CA1. It is
+    measured once.
 
     Parameters
     ----------
     folder : str or Path, optional
-        Where to write it, and from where another session takes what it has written; else a
-        temporary folder that is removed when Python ends.
+        Where to write it, and from where later sessions take it; else a temporary folder that is
+        removed when Python ends.
 
     Returns
     -------
@@ -247,10 +253,7 @@ def example(folder: str | Path | None = None) -> Example:
     >>> print(f"{left.summary['thickness_mean']:.1f} {left.units['thickness']}")
     1.8 mm
     """
-    if folder is None:
-        folder = tempfile.mkdtemp(prefix="hipsta_bids-example-")
-        atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    root, protocol = Path(folder), load_protocol("freesurfer")
+    root, protocol = Path(folder or _temporary_folder()), load_protocol("freesurfer")
     subjects = make_cohort(CohortPlan(n_subjects=10, groups=("CN", "AD")))
     present = {result.name.subject for result in list_results(root)}
     volumes: list[LabelVolume] = []
