@@ -26,7 +26,7 @@ from hipsta_bids.io.xarrays import make_dataset, read_later
 from hipsta_bids.phantom import Phantom, PhantomSpec, encode
 from hipsta_bids.phantom.cohort import CohortPlan, make_cohort
 from hipsta_bids.protocols.load import load_protocol
-from hipsta_bids.reports.cells import card
+from hipsta_bids.reports.cells import card, wrapped
 from hipsta_bids.reports.results import Hemisphere, find_results
 from hipsta_bids.types import PARTICIPANT, LabelVolume
 
@@ -50,13 +50,12 @@ class Results(NamedTuple):
     labels come from (``labels_tool``, ``labels_version`` and so on), and the summary measures."""
 
     def __repr__(self) -> str:
-        names = ", ".join(map(str, self.maps.data_vars))
-        places = [f"{axis} {len(self.maps[axis])}" for axis in _AXES]
+        places = ", ".join(f"{axis} {len(self.maps[axis])}" for axis in _AXES)
         decisions = counts_text(Counter(self.measures["decision"]))
         return (
             f"Output dataset of {len(self.measures)} hemispheres: {decisions}\n"
-            f"  maps      xarray.Dataset, {', '.join(places)}: {names}\n"
-            f"  measures  pandas.DataFrame, {' x '.join(map(str, self.measures.shape))}"
+            f"{wrapped(f'maps ({places})', self.maps.data_vars)}\n"
+            f"  measures: {' x '.join(map(str, self.measures.shape))}"
         )
 
     def _repr_html_(self) -> str:
