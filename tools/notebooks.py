@@ -10,6 +10,7 @@ are drawn. A warning is an error.
 import ast
 import base64
 import json
+import re
 import sys
 import tempfile
 import warnings
@@ -24,6 +25,8 @@ from typing import Any
 import matplotlib as mpl
 
 _DPI = 72
+#: How pandas styles tables; those of the site have a style of their own.
+_PANDAS = re.compile(r'<style scoped>.*?</style>| border="\d" class="dataframe"', re.DOTALL)
 
 Output = dict[str, Any]
 """Of a cell, as nbformat 4 has it."""
@@ -74,7 +77,8 @@ def notebook_page(path: Path) -> tuple[str, dict[str, bytes]]:
                 figures[name] = base64.b64decode(data["image/png"])
                 parts.append(f"![Figure that the code above draws]({name})")
             elif "text/html" in data:
-                parts.append(f'<div class="output">{"".join(data["text/html"])}</div>')
+                html = _PANDAS.sub("", "".join(data["text/html"])).strip()
+                parts.append(f'<div class="output">{html}</div>')
             else:
                 shown = escape("".join(data["text/plain"]).rstrip())
                 parts.append(f'<pre class="output">{shown}</pre>')

@@ -26,7 +26,7 @@ from hipsta_bids.io.xarrays import make_dataset, read_later
 from hipsta_bids.phantom import Phantom, PhantomSpec, encode
 from hipsta_bids.phantom.cohort import CohortPlan, make_cohort
 from hipsta_bids.protocols.load import load_protocol
-from hipsta_bids.reports.cells import card
+from hipsta_bids.reports.cells import card, wrapped
 from hipsta_bids.reports.results import Hemisphere, find_results
 from hipsta_bids.types import PARTICIPANT, LabelVolume
 
@@ -50,13 +50,12 @@ class Results(NamedTuple):
     labels come from (``labels_tool``, ``labels_version`` and so on), and the summary measures."""
 
     def __repr__(self) -> str:
-        names = ", ".join(map(str, self.maps.data_vars))
-        places = [f"{axis} {len(self.maps[axis])}" for axis in _AXES]
+        places = ", ".join(f"{axis} {len(self.maps[axis])}" for axis in _AXES)
         decisions = counts_text(Counter(self.measures["decision"]))
         return (
             f"Output dataset of {len(self.measures)} hemispheres: {decisions}\n"
-            f"  maps      xarray.Dataset, {', '.join(places)}: {names}\n"
-            f"  measures  pandas.DataFrame, {' x '.join(map(str, self.measures.shape))}"
+            f"{wrapped(f'maps ({places})', self.maps.data_vars)}\n"
+            f"  measures: {' x '.join(map(str, self.measures.shape))}"
         )
 
     def _repr_html_(self) -> str:
@@ -214,17 +213,23 @@ class Example(NamedTuple):
 
 
 @cache
+def _temporary_folder() -> str:
+    folder = tempfile.mkdtemp(prefix="hipsta_bids-example-")
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return folder
+
+
 def example(folder: str | Path | None = None) -> Example:
     """Make and measure a small synthetic study, without network; this takes some 20 seconds.
 
-    Five of ten participants are patients, whose wall is 0.3 mm thinner in the anterior CA1. A
-    session makes it once.
+    Five of ten participants are patients, whose wall is 0.3 mm thinner in the anterior CA1. It is
+    measured once.
 
     Parameters
     ----------
     folder : str or Path, optional
-        Where to write it, and from where another session takes what it has written; else a
-        temporary folder that is removed when Python ends.
+        Where to write it, and from where later sessions take it; else a temporary folder that is
+        removed when Python ends.
 
     Returns
     -------
@@ -247,10 +252,7 @@ def example(folder: str | Path | None = None) -> Example:
     >>> print(f"{left.summary['thickness_mean']:.1f} {left.units['thickness']}")
     1.8 mm
     """
-    if folder is None:
-        folder = tempfile.mkdtemp(prefix="hipsta_bids-example-")
-        atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    root, protocol = Path(folder), load_protocol("freesurfer")
+    root, protocol = Path(folder or _temporary_folder()), load_protocol("freesurfer")
     subjects = make_cohort(CohortPlan(n_subjects=10, groups=("CN", "AD")))
     present = {result.name.subject for result in list_results(root)}
     volumes: list[LabelVolume] = []

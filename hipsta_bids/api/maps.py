@@ -33,7 +33,7 @@ from hipsta_bids.participant.measure import measure_hemisphere
 from hipsta_bids.protocols import body_ends
 from hipsta_bids.protocols.load import for_region, load_protocol
 from hipsta_bids.protocols.protocol import Protocol
-from hipsta_bids.reports.cells import card, with_unit
+from hipsta_bids.reports.cells import card, with_unit, wrapped
 from hipsta_bids.reports.results import SIDES, SheetTable
 from hipsta_bids.settings import Settings, SheetSettings, load_settings
 from hipsta_bids.types import Flag, Float, HemisphereMaps, LabelVolume, Mesh
@@ -73,7 +73,7 @@ class Measurement:
         ]
         words = [self.decision, *([outputs.headline(self.message)] if self.message else [])]
         title = f"Measurement of a hemisphere ({name}): {': '.join(words)}"
-        return "\n".join([title, *numbers, f"  maps ({nx}, {ny}): {', '.join(self.maps)}"])
+        return "\n".join([title, *numbers, wrapped(f"maps ({nx}, {ny})", self.maps)])
 
     def _repr_html_(self) -> str:
         from matplotlib.figure import Figure  # noqa: PLC0415  (slow to load)

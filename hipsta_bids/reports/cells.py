@@ -1,7 +1,8 @@
 """The cells of pages: filters of templates that write a number, a measure or a position."""
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -55,6 +56,12 @@ def with_brackets(title: str, unit: str) -> str:
 def with_unit(text: str, unit: str) -> str:
     """Append a unit to a number."""
     return f"{text} {unit_of(unit)}".rstrip()
+
+
+def wrapped(label: str, names: Iterable[object]) -> str:
+    """List names in lines that fit a notebook."""
+    text = f"  {label}: {', '.join(map(str, names))}"
+    return fill(text, 88, subsequent_indent="    ", break_on_hyphens=False)
 
 
 def card(text: str, *parts: str) -> str:

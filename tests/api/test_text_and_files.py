@@ -188,8 +188,10 @@ class TestErrors:
 
 class TestExample:
     def test_it_is_made_once(self):
-        study = hb.example()
-        assert hb.example() is study
+        study, again = hb.example(), hb.example()
+        assert again.out_dir == study.out_dir
+        again.participants["group"] = "nobody's"
+        assert study.participants["group"].tolist() == ["CN", "AD"] * 5
         maps, measures = hb.load(study.out_dir)
         assert measures["participant_id"].tolist() == study.participants["participant_id"].tolist()
         means = measures.merge(study.participants).groupby("group")["thickness_mean_CA1"].mean()

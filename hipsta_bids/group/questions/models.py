@@ -452,15 +452,15 @@ def register(
             if has_rims and carried.dtype.kind == "f":
                 leave_rare(carried)
             values[part, sheets_here] = carried
-    results = {
-        name: values.copy(data=arrays[name].reshape(values.shape)).transpose(*maps[name].dims)
+    results: dict[str, Any] = {
+        str(name): values.copy(data=arrays[name].reshape(values.shape)).transpose(*maps[name].dims)
         for name, values in labeled.items()
     }
     lengths = [maps.sizes[axis] for axis in (*outer, *rows, "x")]
     about = {"long_name": "registered minus original position", "units": "nodes"}
-    results["shift"] = xr.DataArray(shifts.reshape(lengths), dims=(*outer, *rows, "x"), attrs=about)
-    for name, values in zip(("explained_before", "explained_after"), explained, strict=True):
-        results[name] = xr.DataArray(values.reshape(lengths[: len(outer)]), dims=outer)
+    results["shift"] = (*outer, *rows, "x"), shifts.reshape(lengths), about
+    for name, shares in zip(("explained_before", "explained_after"), explained, strict=True):
+        results[name] = outer, shares.reshape(lengths[: len(outer)])
     return maps.assign(results)
 
 
