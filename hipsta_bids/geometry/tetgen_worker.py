@@ -27,6 +27,9 @@ Float = NDArray[np.float64]
 Int = NDArray[np.int32]
 
 _HEADER = struct.Struct("<Q")
+_STARTS = 2
+"""A process that ends twice with one surface ends because of it. Once it may have been killed, or
+have lost the folder that it runs in; then another surface would be another map."""
 
 
 class TetgenClient:
@@ -40,17 +43,20 @@ class TetgenClient:
         self, vertices: Float, triangles: Int, options: dict[str, Any], timeout: float
     ) -> tuple[Float, NDArray[Any]] | str:
         """Return vertices (V, 3) and tetrahedra (T, 4) that fill a surface, or why none do."""
-        process = self._running()
-        try:
-            _write(_pipe(process.stdin), (vertices, triangles, options))
-            reply = _read(_pipe(process.stdout), deadline=time.monotonic() + timeout)
-        except (BrokenPipeError, EOFError):
-            code = self._stop()
-            return f"TetGen crashed (exit status {code})"
-        except TimeoutError:
-            self._stop()
-            return f"TetGen took longer than {timeout:g} s"
-        return reply if isinstance(reply, str) else (reply[0], reply[1])
+        code = None
+        for _ in range(_STARTS):
+            process = self._running()
+            try:
+                _write(_pipe(process.stdin), (vertices, triangles, options))
+                reply = _read(_pipe(process.stdout), deadline=time.monotonic() + timeout)
+            except (BrokenPipeError, EOFError):
+                code = self._stop()
+                continue
+            except TimeoutError:
+                self._stop()
+                return f"TetGen took longer than {timeout:g} s"
+            return reply if isinstance(reply, str) else (reply[0], reply[1])
+        return f"TetGen crashed (exit status {code})"
 
     def _running(self) -> subprocess.Popen[bytes]:
         if self._process is None or self._owner != os.getpid() or self._process.poll() is not None:

@@ -2,6 +2,8 @@
 
 import os
 import signal
+import subprocess
+import sys
 import threading
 import time
 
@@ -87,23 +89,41 @@ def assert_works():
     assert tetra_volumes(mesh.vertices, mesh.tetrahedra).sum() == pytest.approx(1.0)
 
 
-def kill_soon(client, *, after=0.2):
-    """Kill the client's process while it is at work."""
-    timer = threading.Timer(after, lambda: os.kill(client._process.pid, signal.SIGABRT))
-    timer.start()
-    return timer
-
-
-def test_a_crash_while_meshing_is_reported_and_the_next_call_works(client, arc):
-    assert_works()  # the process is up
+def test_a_process_killed_at_work_is_replaced_and_gives_the_same_mesh(client, arc):
+    """Nothing is changed about the surface for a lack of memory, say."""
+    expected = client.mesh(arc.surface.vertices, arc.surface.triangles, OPTIONS, 60.0)
     first = client._process.pid
-    timer = kill_soon(client)
-    busy = {"maxvolume": 1e-6, "fixedvolume": True, "nobisect": False}
-    answer = client.mesh(arc.surface.vertices, arc.surface.triangles, OPTIONS | busy, 60.0)
+    os.kill(first, signal.SIGSTOP)
+    timer = threading.Timer(0.2, os.kill, (first, signal.SIGKILL))
+    timer.start()
+    answer = client.mesh(arc.surface.vertices, arc.surface.triangles, OPTIONS, 60.0)
     timer.join()
-    assert answer == f"TetGen crashed (exit status {-signal.SIGABRT})"
-    assert_works()
     assert client._process.pid != first
+    for one, other in zip(answer, expected, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def start_python(code):
+    return subprocess.Popen(
+        [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    )
+
+
+@pytest.mark.usefixtures("client")
+def test_a_surface_that_ends_every_process_is_reported_and_the_next_call_works(arc):
+    started = []
+
+    class Ending(TetgenClient):
+        def _running(self):
+            started.append(1)
+            code = "import sys; sys.stdin.buffer.read(8); sys.exit(3)"
+            self._process, self._owner = start_python(code), os.getpid()
+            return self._process
+
+    answer = Ending().mesh(arc.surface.vertices, arc.surface.triangles, OPTIONS, 60.0)
+    assert answer.startswith("TetGen crashed (exit status ")
+    assert len(started) == 2
+    assert_works()
 
 
 def test_a_process_that_died_between_calls_is_replaced(client):
