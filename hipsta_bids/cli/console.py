@@ -208,7 +208,7 @@ def summary_line(outcome: "Outcome") -> str:
     return "  ".join(parts)
 
 
-def echo_result(result: "RunResult", out_dir: Path) -> None:
+def echo_result(result: "RunResult", out_dir: Path, *, has_pages: bool) -> None:
     """Print where the outputs are and what is to be done with how many hemispheres."""
     counts = ", ".join(f"{n} {decision}" for decision, n in sorted(result.counts.items()))
     missing = result.n_requested - len(result.outcomes)
@@ -219,7 +219,7 @@ def echo_result(result: "RunResult", out_dir: Path) -> None:
     echo(f"maps: {out_dir}")
     echo(f"table of all hemispheres: {out_dir / 'measures.tsv'}")
     page = out_dir / "report.html"
-    if page.exists():
+    if has_pages and page.exists():
         echo(f"report: {page}")
     for copy in result.copies[:_LISTED_ROWS]:
         warn(f"warning: {copy}")

@@ -367,6 +367,7 @@ def _run(parsed: argparse.Namespace, arguments: Sequence[str]) -> ExitCode:
     for note in result.notes:
         echo(f"note: {note}")
     left_out = f"{result.n_excluded} hemispheres or visits left out"
+    left_out += " (excluded.tsv says which and why)" if result.n_excluded else ""
     echo(f"{result.n_participants} participants in the model, {left_out}")
     echo(f"results: {result.folder}")
     echo(f"what was done and found: {result.page or result.folder / 'methods.md'}")

@@ -237,7 +237,7 @@ def _run(options: "Namespace", arguments: Sequence[str]) -> ExitCode:
         else:
             progress.show(STAGE, 0, len(items))
             result = run_participants(items, out, settings, run_options, progress.report)
-    console.echo_result(result, out)
+    console.echo_result(result, out, has_pages=run_options.reports)
     return result.exit_code
 
 

@@ -79,7 +79,7 @@ def verdict_of(hemisphere: Hemisphere) -> Verdict:
         )
     return Verdict(
         decision=decision,
-        reason="Nothing to look at first.",
+        reason="No check found anything to look at.",
         consequence=_of_repairs(hemisphere),
         advice="",
     )
@@ -95,8 +95,8 @@ def _of_repairs(hemisphere: Hemisphere) -> str:
     )
     mean = hemisphere.summary.get("thickness_mean", np.nan) - change
     return (
-        f"{count} repair{'s' if count > 1 else ''} of the labels, {share:.1%} of the map; with"
-        f" these columns as those around them the mean would be {mean:.2f} mm."
+        f"{count} repair{'s' if count > 1 else ''} of the labels, {share:.1%} of the map; were the"
+        f" repaired columns like their neighbors, the mean would be {mean:.2f} mm."
     )
 
 

@@ -184,7 +184,7 @@ def no_values(study):
     ("spoil", "options", "code", "words"),
     [
         (no_groups, [], 65, "no column tells groups"),
-        (no_table, [], 65, "BIDS_DIR has no participants.tsv"),
+        (no_table, [], 65, "no participants.tsv of BIDS_DIR has further columns"),
         (impossible_age, [], 65, "has sub-04 (1e+50) where half of the other values are"),
         (negative_age, [], 65, "sub-04 (-3), which nobody has"),
         (age_in_months, [], 65, "sub-04 (150), which nobody has"),

@@ -59,7 +59,7 @@ def test_decisions_are_said_with_what_to_do(out):
     assert [title for page in verdicts for title, _ in page] == [
         *("Use", "Use", "Look before use", "Do not use")
     ]
-    assert [reason for _, reason in verdicts[0]] == 2 * ["Nothing to look at first."]
+    assert [reason for _, reason in verdicts[0]] == 2 * ["No check found anything to look at."]
     assert verdicts[1][1][1].startswith("The body is interrupted at RAS")
     assert "the body is interrupted at RAS" in second
     assert "fill in missing slices" in second
@@ -209,7 +209,7 @@ def test_a_section_that_fails_costs_itself_only(out, monkeypatch, caplog):
     monkeypatch.setattr(participant_module, "SECTIONS", (broken, *participant_module.SECTIONS))
     text = participant_page(out, "01", None, read_cohort(out))
     assert "ZeroDivisionError: by zero" in text
-    assert "Nothing to look at first." in text
+    assert "No check found anything to look at." in text
     assert "section x" in caplog.text
 
 

@@ -78,11 +78,11 @@ def test_what_repairs_may_do_is_that_of_the_repaired_columns(out):
     mean = np.average(thickness, weights=area)
     other = np.average(smoothed(thickness, repaired), weights=area)
     verdict = verdict_of(found)
-    assert verdict.reason == "Nothing to look at first."
+    assert verdict.reason == "No check found anything to look at."
     assert found.metrics["repaired_change_mm"] == pytest.approx(mean - other, abs=1e-5)
     assert verdict.consequence == (
-        f"1 repair of the labels, {repaired.mean():.1%} of the map; with these columns as those"
-        f" around them the mean would be {other:.2f} mm."
+        f"1 repair of the labels, {repaired.mean():.1%} of the map; were the repaired"
+        f" columns like their neighbors, the mean would be {other:.2f} mm."
     )
     assert verdict_of(hemisphere(out, "01", "L")).consequence == "No label was repaired."
 

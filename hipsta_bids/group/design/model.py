@@ -271,7 +271,7 @@ def model_document(
         available = (
             f"there are {formulas.listed(columns)}"
             if columns
-            else "BIDS_DIR has no participants.tsv"
+            else "no participants.tsv of BIDS_DIR has further columns"
         )
         raise ModelError(
             f"no column tells groups ({', '.join(settings.model.group_columns)}) with two levels;"
