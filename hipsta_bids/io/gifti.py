@@ -13,6 +13,7 @@ VTU, VTK, PLY and OBJ are meshio's, which is slow to load, seldom needed, and wr
 import importlib
 import struct
 import tempfile
+import warnings
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -309,7 +310,8 @@ def _load(path: Path, kind: type[Image]) -> Image:
     format_name = "GIFTI" if kind is GiftiImage else "CIFTI"
     try:
         open_regular(path).close()  # a pipe would be waited for
-        image = nib.load(path)
+        with warnings.catch_warnings(action="ignore"):  # of what is checked below, or harmless
+            image = nib.load(path)
     except _DAMAGE as error:
         raise _unreadable(path, format_name, error) from error
     if not isinstance(image, kind):

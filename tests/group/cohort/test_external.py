@@ -219,6 +219,18 @@ def test_cifti_files_that_are_refused(tmp_path, kind, words):
         read_map(path, "x", "R")
 
 
+def test_warnings_of_nibabel_are_no_messages(tmp_path):
+    path = tmp_path / "x.dscalar.nii"
+    write_cifti(path, {"L": np.ones(50)})
+    content = bytearray(path.read_bytes())
+    size, start = (int.from_bytes(content[a:b], "little") for a, b in ((544, 548), (168, 176)))
+    content[544:548] = (size + 8).to_bytes(4, "little")  # no multiple of 16
+    content[168:176] = (start + 8).to_bytes(8, "little")
+    content[start:start] = bytes(8)
+    path.write_bytes(content)
+    assert read_map(path, "x", "L").values.tolist() == [1] * 50
+
+
 def test_half_a_file_is_refused(tmp_path):
     path = tmp_path / "x.shape.gii"
     write_map(path, np.arange(1000.0))
