@@ -2,6 +2,7 @@
 
 import contextlib
 import errno
+import logging
 import os
 import signal
 import sys
@@ -62,6 +63,8 @@ class _TerminatedError(BaseException):
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line."""
     arguments = list(sys.argv[1:] if argv is None else argv)
+    # What nibabel repairs in headers; what it cannot repair is an error that names the file.
+    logging.getLogger("nibabel.global").setLevel(logging.CRITICAL)
     try:
         with _terminable():
             return int(_dispatch(arguments))

@@ -21,6 +21,10 @@ from hipsta_bids.settings import BodySettings
 from hipsta_bids.types import Bool, EditedMask, End, Finding, Float, LabelVolume
 
 _END_REACH = 4.0  # mm behind an end plane over which the body's direction is taken
+_LAST_VOXEL = 3.0  # mm from an end plane to the voxel of the sheet that is nearest to it
+
+#: Sign of heights over an end plane that points to the other one.
+_SIGNS: dict[End, float] = {"posterior": 1.0, "anterior": -1.0}
 _LEAST_SLOPE = 0.34  # cosine of 70 degrees
 
 
@@ -100,8 +104,7 @@ class Body:
         pieces, _ = ndimage.label(self.inside[around], structure=digital.CUBE)
         number = pieces[tuple((index - digital.low_corner(around)).T)]
         ends, directions = self.ends, dict[End, Float]()
-        signs: tuple[tuple[End, float], ...] = (("posterior", 1.0), ("anterior", -1.0))
-        for end, sign in signs:
+        for end, sign in _SIGNS.items():
             depth = sign * ends.height(points, end)
             last = depth < min(_END_REACH, float(depth.max()))
             last &= number == np.bincount(number[last]).argmax()  # without an uncus beside it
@@ -180,6 +183,7 @@ def extract_body(volume: LabelVolume, settings: BodySettings, *, second: bool = 
             "check the head and tail labels",
             reason="body-too-short",
         )
+    _check_ends_reached(points, ends)
     if region != "body":
         check_reach(points, tissue[inside], ends, settings)
     tissue, added, gap = _mend(volume, tissue, inside, settings)
@@ -201,6 +205,18 @@ def extract_body(volume: LabelVolume, settings: BodySettings, *, second: bool = 
         gap=gap,
         mask_change=change,
     )
+
+
+def _check_ends_reached(points: Float, ends: EndPlanes) -> None:
+    """Refuse labels (N, 3), RAS mm, of which none lies near an end plane, as of a damaged file."""
+    for end, sign in _SIGNS.items():
+        gap = float((sign * ends.height(points, end)).min())
+        if gap > _LAST_VOXEL:
+            raise GeometryError(
+                f"the labels end {gap:.1f} mm before the {end} end plane: check these labels, "
+                "and those of head and tail",
+                reason="body-too-short",
+            )
 
 
 def _mend(

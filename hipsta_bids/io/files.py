@@ -46,6 +46,7 @@ _MISSING = re.compile(
 )
 _SIGNS = re.compile(r"[\s?!.*/\\|()\[\]_\u2010-\u2015\u2026\u2212-]+")
 
+_DEEPEST = 100  # lists and objects within each other in JSON
 _HALF_LETTERS = r"\ud"  # with two digits more, a half of a letter beyond the first plane
 
 _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
@@ -239,6 +240,7 @@ def read_json(path: Path, limit: float = opening.TABLE) -> dict[str, Any]:
     try:
         text = opening.read_text(path, limit)
         value = json.loads(text)
+        _check_depth(value)
         if _HALF_LETTERS in text.lower():  # can be read, but not be written
             json.dumps(value, ensure_ascii=False).encode()
     except FileNotFoundError as error:
@@ -253,6 +255,16 @@ def read_json(path: Path, limit: float = opening.TABLE) -> dict[str, Any]:
     if not isinstance(value, dict):
         raise InputError(f"{path}: not a JSON object; restore or delete it", reason="bad-json")
     return value
+
+
+def _check_depth(value: object) -> None:
+    """Refuse what could be read but not be written again, which takes more calls per level."""
+    level = [value] if isinstance(value, (dict, list)) else []
+    for _ in range(_DEEPEST):
+        entries = (part.values() if isinstance(part, dict) else part for part in level)
+        level = [v for values in entries for v in values if isinstance(v, (dict, list))]
+    if level:
+        raise ValueError(f"more than {_DEEPEST} lists within lists")
 
 
 def is_missing(cell: str) -> bool:

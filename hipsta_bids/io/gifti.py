@@ -11,8 +11,11 @@ VTU, VTK, PLY and OBJ are meshio's, which is slow to load, seldom needed, and wr
 """
 
 import importlib
+import os
+import re
 import struct
 import tempfile
+import warnings
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -39,7 +42,7 @@ from numpy.typing import ArrayLike, NDArray
 from hipsta_bids.errors import InputError, UsageError
 from hipsta_bids.io import files
 from hipsta_bids.io.files import entities
-from hipsta_bids.opening import open_regular
+from hipsta_bids.opening import TABLE, open_regular, read_bounded
 from hipsta_bids.types import Coordinates, Float, Int, Mesh, TetMesh
 
 #: Ending of the names of CIFTI files with one number per vertex.
@@ -65,6 +68,10 @@ _DAMAGE = (
     *(ImageFileError, HeaderDataError, Cifti2HeaderError, ExpatError, zlib.error, struct.error),
 )
 _MOST_VERTICES = 10_000_000  # of a surface that a file names but does not hold
+
+#: Where a GIFTI file names another with its numbers, and a CIFTI file how many it has of a part.
+_OTHER_FILE = re.compile(rb"ExternalFileName\s*=\s*[\"']([^\"']+)")
+_COUNT = re.compile(rb"IndexCount\s*=\s*[\"']\s*(\d+)")
 
 #: Unit of maps whose file names none.
 ARBITRARY = "arbitrary"
@@ -182,8 +189,11 @@ def cifti_sides(path: Path) -> list[str]:
 def _surface_models(path: Path, image: Cifti2Image) -> dict[str, Cifti2BrainModel]:
     """Find where the data of each hemisphere are, and of which vertices."""
     models: dict[str, Cifti2BrainModel] = {}
-    # The axes that nibabel makes of it would hold a word per vertex.
-    for model in image.header.get_index_map(image.ndim - 1).brain_models:
+    try:  # the axes that nibabel makes of it would hold a word per vertex
+        brain_models = list(image.header.get_index_map(image.ndim - 1).brain_models)
+    except _DAMAGE as error:
+        raise _unreadable(path, "CIFTI", error) from error
+    for model in brain_models:
         hemi = _CIFTI_SIDES.get(model.brain_structure.rpartition("_")[2])
         if hemi is None or not model.surface_number_of_vertices:
             continue
@@ -207,10 +217,12 @@ def _from_cifti(path: Path, hemi: str) -> PointMap:
         )
     first, count = model.index_offset, model.index_count
     try:
+        with np.errstate(all="ignore"):  # a wrong type or scale; what is infinite is missing
+            data = np.asarray(image.dataobj[0, first : first + count], dtype=np.float64)
         if model.surface_number_of_vertices > _MOST_VERTICES:
             raise ValueError(f"a surface of {model.surface_number_of_vertices} vertices")
         values = np.full(model.surface_number_of_vertices, np.nan)
-        values[list(model.vertex_indices)] = image.dataobj[0, first : first + count]
+        values[list(model.vertex_indices)] = data
     except _DAMAGE as error:
         raise _unreadable(path, "CIFTI", error) from error
     suffix = entities(path.name)["suffix"]
@@ -224,7 +236,7 @@ def read_map(path: Path, name: str, hemi: str) -> PointMap:
     if path.name.endswith(DENSE_SCALARS):
         return _from_cifti(path, hemi)
     image = _load(path, GiftiImage)
-    arrays = [array for array in image.darrays if array.data.dtype.kind in "fiu"]
+    arrays = [array for array in image.darrays if np.asarray(array.data).dtype.kind in "fiu"]
     arrays = [array for array in arrays if array.data.ndim == 1]
     if len(arrays) != 1:
         raise InputError(f"{path}: holds {len(arrays)} maps; give a file with one")
@@ -281,10 +293,13 @@ def read_mesh(path: Path) -> Mesh:
 
 def checked_mesh(path: Path, points: ArrayLike, triangles: ArrayLike) -> Mesh:
     """Return the surface of a file, or refuse triangles of vertices that it does not have."""
-    mesh = Mesh(
-        points=np.asarray(points, dtype=np.float64),
-        triangles=np.asarray(triangles, dtype=np.int64),
-    )
+    points, triangles = np.asarray(points), np.asarray(triangles)
+    kinds = points.dtype.kind in "fiu", triangles.dtype.kind in "iu"
+    if not all(kinds) or not points.shape[1:] == triangles.shape[1:] == (3,):
+        raise InputError(
+            f"{path}: its points or triangles are not three numbers each; write it again"
+        )
+    mesh = Mesh(points=points.astype(np.float64), triangles=triangles.astype(np.int64))
     if mesh.triangles.min(initial=0) < 0 or mesh.triangles.max(initial=-1) >= len(mesh.points):
         raise InputError(
             f"{path}: has triangles between vertices that do not exist; write it again"
@@ -305,11 +320,21 @@ def _unreadable(path: Path, format_name: str, error: Exception) -> InputError:
     return InputError(f"{path}: not readable as {format_name} ({first}); write it again")
 
 
+def _check_claims(path: Path) -> None:
+    """Refuse a file that names a pipe or a device, or more numbers than it holds."""
+    content = read_bounded(path, TABLE)
+    for name in _OTHER_FILE.findall(content):
+        open_regular(path.parent / os.fsdecode(name)).close()
+    if sum(map(int, _COUNT.findall(content))) > len(content):
+        raise ValueError("it counts more vertices than it holds")
+
+
 def _load(path: Path, kind: type[Image]) -> Image:
     format_name = "GIFTI" if kind is GiftiImage else "CIFTI"
     try:
-        open_regular(path).close()  # a pipe would be waited for
-        image = nib.load(path)
+        _check_claims(path)
+        with warnings.catch_warnings(action="ignore"):  # of what is checked below, or harmless
+            image = nib.load(path)
     except _DAMAGE as error:
         raise _unreadable(path, format_name, error) from error
     if not isinstance(image, kind):

@@ -2,6 +2,7 @@
 
 import contextlib
 import math
+import warnings
 import zlib
 from collections.abc import Iterator, Sequence
 from contextvars import ContextVar
@@ -305,7 +306,9 @@ def _opened(path: Path) -> Iterator[Any]:
             kind = _format(path, stream.read(4))
             stream.seek(0)
             # Mapped files would break under the reader if someone replaced them.
-            yield kind.from_file_map(kind.make_file_map({"image": stream}), mmap=False)
+            with warnings.catch_warnings(action="ignore"):  # of extensions, which are not read
+                image = kind.from_file_map(kind.make_file_map({"image": stream}), mmap=False)
+            yield image
     except FileNotFoundError as error:
         raise MissingFileError(
             f"{path}: no such file; check its name", reason="unreadable-image"

@@ -203,6 +203,17 @@ def test_memory_decides_what_is_read(good, tmp_path, capsys):
     assert read_status(out)[1]["reason"] == "unreadable-image"
 
 
+def test_repairs_of_headers_are_no_messages(tmp_path, caplog):
+    hemisphere = Hemisphere(subject="good", hemi="L", spec=GOOD)
+    write_dataset(tmp_path, [hemisphere], layouts=("ashs",), voxel_size=(0.5, 0.5, 0.5))
+    (path,) = tmp_path.rglob("*_usegray.nii.gz")
+    content = bytearray(gzip.decompress(path.read_bytes()))
+    content[:4] = bytes(4)  # the size of the header, which nibabel puts right and tells
+    path.write_bytes(gzip.compress(bytes(content)))
+    assert main.main([str(tmp_path), str(tmp_path / "out"), "participant", "--dry-run"]) == 0
+    assert not caplog.records
+
+
 def test_all_inputs_unusable_is_bad_data(good, tmp_path, capsys):
     bids_dir = spoiled(good, tmp_path / "bids", ["empty", "noimage"])
     wanted = ("--participant-label", "empty", "noimage", "--n-procs", "1")

@@ -11,7 +11,7 @@ from hypothesis.extra import numpy as arrays
 from scipy import ndimage
 
 from hipsta_bids.errors import GeometryError
-from hipsta_bids.geometry.body import _merge_layer, check_side, extract_body
+from hipsta_bids.geometry.body import _check_ends_reached, _merge_layer, check_side, extract_body
 from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.protocols.protocol import Part, Tissue
 from hipsta_bids.settings import BodySettings
@@ -159,6 +159,18 @@ def test_short_bodies_are_refused(length, refused):
         return
     with pytest.raises(GeometryError, match=r"mm long, 5 mm are needed") as caught:
         extract_body(volume, BodySettings())
+    assert caught.value.reason == "body-too-short"
+
+
+@pytest.mark.parametrize("end", ["posterior", "anterior"])
+def test_labels_that_end_before_an_end_plane_are_refused(end):
+    body = extract_body(short_phantom(length=14.0).label_volume(FREESURFER), BodySettings())
+    points = body.inside_points()[1]
+    _check_ends_reached(points, body.ends)
+    depth = np.abs(body.ends.height(points, end))
+    _check_ends_reached(points[depth > 2], body.ends)
+    with pytest.raises(GeometryError, match=rf"mm before the {end} end plane") as caught:
+        _check_ends_reached(points[depth > 4], body.ends)
     assert caught.value.reason == "body-too-short"
 
 

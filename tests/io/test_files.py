@@ -112,7 +112,10 @@ def test_json_is_strict_and_knows_numpy(tmp_path):
     assert files.read_json(path)["count"] == 3
 
 
-@pytest.mark.parametrize("content", ["{", "[1]", r'{"name": "\ud800"}'])
+DEEP = "[" * 400 + "]" * 400
+
+
+@pytest.mark.parametrize("content", ["{", "[1]", r'{"name": "\ud800"}', f'{{"a": {DEEP}}}'])
 def test_bad_json_is_named(tmp_path, content):
     path = tmp_path / "a.json"
     path.write_text(content)

@@ -41,6 +41,9 @@ INTERCEPT = "Intercept"
 _NAMED = 8
 #: Two values are the same on a line and as a factor.
 _LEAST_LINE = 3
+#: Smallest and largest size of a weight: products of weights and variables have to be finite.
+_WEIGHTS = (1e-9, 1e9)
+
 #: Whole numbers as spreadsheets may write them, and dates.
 _WHOLE = re.compile(r"(-?\d+)\.0+")
 _DATE = re.compile(r"\d{4}-\d{1,2}-\d{1,2}\b.*|\d{1,2}[./]\d{1,2}[./]\d{2,4}")
@@ -208,7 +211,9 @@ def _parse_contrast(contrast: Mapping[str, Any]) -> ContrastSpec:
         rows = given if given and isinstance(given[0], list) else [given]
         weights = tuple(tuple(map(_number, row)) for row in rows)
     except (TypeError, ValueError, LookupError, ZeroDivisionError):
-        raise _refusal(f"has contrast {name!r} without lists of names and numbers") from None
+        limits = f"{_WEIGHTS[0]:g} to {_WEIGHTS[1]:g}, or 0"
+        problem = f"has contrast {name!r} without lists of names and numbers (sizes {limits})"
+        raise _refusal(problem) from None
     if not conditions or any(len(row) != len(conditions) for row in weights):
         raise _refusal(f"has contrast {name!r} with {len(conditions)} conditions and other weights")
     if test == "t" and len(weights) > 1:
@@ -220,7 +225,7 @@ def _number(value: object) -> float:
     """Weights may be fractions such as ``1/3``."""
     above, _, below = str(value).partition("/")
     number = float(above) / float(below or 1)
-    if not np.isfinite(number):
+    if number and not _WEIGHTS[0] <= abs(number) <= _WEIGHTS[1]:  # NaN, too
         raise ValueError(number)
     return number
 

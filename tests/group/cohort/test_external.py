@@ -1,5 +1,8 @@
 """Other programs' maps: whose they are, what they hold, and the surface that they lie on."""
 
+import os
+import re
+
 import numpy as np
 import pytest
 from hippunfold_like import (
@@ -217,6 +220,66 @@ def test_cifti_files_that_are_refused(tmp_path, kind, words):
     spoiled_cifti(path, kind)
     with pytest.raises(InputError, match=words):
         read_map(path, "x", "R")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        (b'MatrixDimension="1"', b'MatrixDimension="7"', "not readable as CIFTI"),
+        (b'IndexCount="50"', b'IndexCount="90000000"', "more vertices than it holds"),
+    ],
+)
+def test_texts_in_cifti_files_are_checked(tmp_path, old, new, words):
+    path = tmp_path / "x.dscalar.nii"
+    write_cifti(path, {"L": np.ones(50)})
+    head, text, data = cifti_parts(path.read_bytes())
+    assert old in text
+    path.write_bytes(cifti_joined(head, text.replace(old, new), data))
+    with pytest.raises(InputError, match=words):
+        read_map(path, "x", "L")
+
+
+def cifti_parts(content):
+    """Header, text and data of a CIFTI file."""
+    size, start = (int.from_bytes(content[a:b], "little") for a, b in ((544, 548), (168, 176)))
+    return content[:544], content[552 : 544 + size].rstrip(b"\0"), content[start:]
+
+
+def cifti_joined(head, text, data, extra=0):
+    """Join the parts again; the text takes a multiple of 16 bytes, and some more."""
+    text += bytes(-(len(text) + 8) % 16 + extra)
+    start = len(head) + 8 + len(text)
+    head = head[:168] + start.to_bytes(8, "little") + head[176:]
+    return head + (len(text) + 8).to_bytes(4, "little") + (32).to_bytes(4, "little") + text + data
+
+
+@pytest.mark.parametrize("kind", ["map", "surface"])
+def test_gifti_arrays_without_numbers_are_refused(tmp_path, kind):
+    path = tmp_path / "x.shape.gii"
+    if kind == "map":
+        write_map(path, np.zeros(12))
+    else:
+        write_surface(path, POINTS, TRIANGLES)
+    path.write_bytes(re.sub(rb"<Data>[^<]*</Data>", b"", path.read_bytes()))
+    with pytest.raises(InputError, match=r"holds 0 maps|not three numbers"):
+        read_map(path, "x", "L") if kind == "map" else read_mesh(path)
+
+
+def test_gifti_files_read_no_pipe_that_they_name(tmp_path):
+    path = tmp_path / "x.shape.gii"
+    write_map(path, np.zeros(12))
+    os.mkfifo(tmp_path / "pipe")
+    content = path.read_bytes().replace(b"GZipBase64Binary", b"ExternalFileBinary")
+    path.write_bytes(content.replace(b'ExternalFileName=""', b'ExternalFileName="pipe"'))
+    with pytest.raises(InputError, match="no regular file"):
+        read_map(path, "x", "L")
+
+
+def test_warnings_of_nibabel_are_no_messages(tmp_path):
+    path = tmp_path / "x.dscalar.nii"
+    write_cifti(path, {"L": np.ones(50)})
+    path.write_bytes(cifti_joined(*cifti_parts(path.read_bytes()), extra=8))  # not in 16s
+    assert read_map(path, "x", "L").values.tolist() == [1] * 50
 
 
 def test_half_a_file_is_refused(tmp_path):

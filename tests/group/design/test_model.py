@@ -236,6 +236,8 @@ def test_refuses_models_that_say_something_else():
         document(glm | {"Contrasts": [{"Name": "c", "ConditionList": ["a"], "Weights": ["1/0"]}]}),
         document(glm | {"Contrasts": [{"Name": "c", "ConditionList": ["a"], "Weights": [np.nan]}]}),
         document(glm | {"Contrasts": [{"Name": "c", "ConditionList": ["a"], "Weights": 1.0}]}),
+        document(glm | {"Contrasts": [{"Name": "c", "ConditionList": ["a"], "Weights": [1e308]}]}),
+        document(glm | {"Contrasts": [{"Name": "c", "ConditionList": ["a"], "Weights": [1e-320]}]}),
         document(glm | {"Contrasts": [{"Name": "c", "ConditionList": 7}]}),
         document(glm | {"Contrasts": [{"Name": "c", "ConditionList": ["a"]}] * 2}),
         document(glm | {"Contrasts": None}),

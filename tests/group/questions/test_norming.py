@@ -9,12 +9,13 @@ import pytest
 from hippunfold_like import flat_surface, write_map, write_surface
 from norm_cohorts import write_people
 from pyarrow import parquet
+from pydantic import ValidationError
 from scipy import stats
 from small_cohorts import NODES, place_of, read_participants, table, write_participants
 
 from hipsta_bids.cli.main import main
 from hipsta_bids.group.design.settings import RegistrationSettings
-from hipsta_bids.group.output.saved import _digest, load_norms, templates_from_json
+from hipsta_bids.group.output.saved import NormArrays, _digest, load_norms, templates_from_json
 from hipsta_bids.group.output.tables import COLUMNS
 from hipsta_bids.group.questions import norming
 from hipsta_bids.group.stats.registration import mean_profiles, register_to
@@ -349,3 +350,10 @@ def test_maps_of_other_programs_without_sheets_or_sites(tmp_path, capsys):
     assert whole.participant_id.tolist() == ["sub-116", "sub-117"]
     assert (whole.z < -3).all()
     assert "2 low, 0 high of 2</td>" in group_page(out / "group" / "scores_AD")
+
+
+def test_counts_beyond_floats_are_refused():
+    values = {name: [[0.1], [0.1]] for name in ("mean", "spread", "shape", "shift", "scale")}
+    assert NormArrays.model_validate({**values, "n": [[7]]}).n == [[7]]
+    with pytest.raises(ValidationError, match="less than or equal to 1000000000"):
+        NormArrays.model_validate({**values, "n": [[10**400]]})
