@@ -119,7 +119,7 @@ def damaged(source: str, problem: str) -> ModelError:
 _LARGEST = 1_000_000_000
 _Age = Annotated[files.Number, Field(ge=-1000, le=1000)]  # charts have a row for each year
 
-_MOST = 10**9  # participants, which have to fit in a float
+_MAX_PARTICIPANTS = 10**9  # participants, which have to fit in a float
 
 
 class NormArrays(TomlTable):
@@ -130,7 +130,7 @@ class NormArrays(TomlTable):
     shape: Annotated[list[files.FileNumbers], Field(min_length=2, max_length=2)]
     shift: list[files.FileNumbers]
     scale: list[list[Annotated[files.Number, Field(gt=0)] | None]]
-    n: list[list[Annotated[int, Field(ge=0, le=_MOST)]]]
+    n: list[list[Annotated[int, Field(ge=0, le=_MAX_PARTICIPANTS)]]]
 
 
 class NormsFile(TomlTable):
