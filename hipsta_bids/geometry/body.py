@@ -183,9 +183,9 @@ def extract_body(volume: LabelVolume, settings: BodySettings, *, second: bool = 
             "check the head and tail labels",
             reason="body-too-short",
         )
-    _check_ends_reached(points, ends)
     if region != "body":
         check_reach(points, tissue[inside], ends, settings)
+    _check_ends_reached(points, ends)
     tissue, added, gap = _mend(volume, tissue, inside, settings)
     if len(added):
         inside, _ = completion.between(tissue > 0, volume.affine, ends)

@@ -5,7 +5,7 @@ import sys
 import pytest
 from stand_ins import stand_in_job
 
-from hipsta_bids.api.maps import load
+from hipsta_bids.api.datasets import load
 from hipsta_bids.cli import main
 from hipsta_bids.errors import ExitCode
 from hipsta_bids.io import files
@@ -147,7 +147,7 @@ def test_where_labels_come_from(tmp_path, capsys):
     names = ("tool", "version", "analysis", "atlas", "hierarchy", "space", "design")
     rows = {row["path"]: row for row in files.read_tsv(out / "inputs.tsv")}
     records = [files.read_json(path)["provenance"] for path in out.rglob("*_desc-qc_metrics.json")]
-    frame = load(out, protocol="freesurfer").table.set_index("participant_id")
+    frame = load(out, protocol="freesurfer").measures.set_index("participant_id")
     for place, expected in places.items():
         row = rows[f"derivatives/fs/{place}"]
         cells = [row[name] for name in names]
@@ -156,7 +156,9 @@ def test_where_labels_come_from(tmp_path, capsys):
         assert (row["edited"], row["voxel_size"]) == ("n/a", "0.4 x 0.4 x 1.2")
         assert {name: row[name] for name in records[0]} in records
         if row["seg"] == "freesurfer":
-            assert [frame.loc[row["subject"], name] for name in names] == [row[n] for n in names]
+            assert [frame.loc[row["subject"], f"labels_{name}"] for name in names] == [
+                row[n] for n in names
+            ]
 
 
 def said_of(capsys, *arguments, code=ExitCode.OK):

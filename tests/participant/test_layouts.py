@@ -239,7 +239,7 @@ def test_hsf_in_the_mode_that_is_named(tmp_path, mode):
     assert float(found.summary["thickness_mean"]) == pytest.approx(1.8, abs=0.05)  # as above
     other = {"hsf": "hsfCA23", "hsfCA23": "hsf"}[mode]
     assert main.main([*arguments, "--protocol", other]) == ExitCode.BAD_DATA
-    wrong = results(tmp_path / "out", "h", "R", other).row
+    wrong = results(tmp_path / "out", "h", "R", other).metrics
     assert wrong["reason"] in {"unknown-labels", "wrong-scheme"}
     assert f"the labels fit {mode}" in wrong["message"].replace("hippunfold and ", "")
 

@@ -177,7 +177,7 @@ def test_results_without_sheets_are_complete(alone):
         assert "vertex" in json.loads(path.read_text())
     page = group_page(alone)
     assert "could not be made" not in page
-    assert "Strongest at vertex " in page
+    assert "peak vertex " in page
     assert "Hipp: means, effects and significance" in page
 
 
@@ -389,7 +389,7 @@ def test_cifti_files_give_what_gifti_files_give_and_go_together(study, alone):
         assert joint.significant[thinned(hemi)].mean() > 0.8
         assert joint.significant[~thinned(hemi)].mean() < 0.1
         np.testing.assert_allclose(joint.p_dense, expected.p, rtol=1e-6)
-    assert "Strongest at vertex " in group_page(folder)
+    assert "peak vertex " in group_page(folder)
 
 
 def test_joint_maps_have_to_lie_on_one_surface(study, capsys):
