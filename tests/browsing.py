@@ -170,3 +170,8 @@ def show_layers(browser, *layers):
     for box in browser.find_elements(By.CSS_SELECTOR, ".card:first-of-type .toggles input"):
         if box.is_selected() != (box.get_attribute("value") in layers):
             box.click()
+
+
+def level(browser):
+    """Number of the slice that is shown enlarged."""
+    return int(re.match(r"Slice (\d+) of", texts(browser, "dialog .facts")[0])[1])

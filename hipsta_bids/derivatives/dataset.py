@@ -394,13 +394,13 @@ def read_status(root: Path) -> list[dict[str, str]]:
     ]
 
 
-def read_table(path: Path) -> list[dict[str, str]]:
-    """Read one table; empty if there is none, or if it is unreadable."""
+def read_table(path: Path, key: Sequence[str] = KEY) -> list[dict[str, str]]:
+    """Read rows with all cells of a key; none if there is no table, or if it is unreadable."""
     try:
         rows = files.read_tsv(path)
     except InputError:
         return []
-    return [row for row in rows if all(key in row for key in KEY)]
+    return [row for row in rows if all(column in row for column in key)]
 
 
 def _current(root: Path, rows: Sequence[dict[str, str]]) -> dict[str, str]:

@@ -40,8 +40,9 @@ def write_measures(root: Path) -> None:
     """Bring the table of a dataset and its sidecar up to date."""
     path = root / DATASET_FILES["measures"]
     with files.locked(root, path.name):
-        earlier = {_key(row): row for row in _read(path)}
-        rated = {_key(row): row for row in _read(root / DATASET_FILES["ratings"])}
+        earlier = {_key(row): row for row in dataset.read_table(path, _KEY)}
+        ratings = dataset.read_table(root / DATASET_FILES["ratings"], _KEY)
+        rated = {_key(row): row for row in ratings}
         rows = [row | {"rating": _rating(row, rated)} for row in _current_rows(root, earlier)]
         numbers = dict.fromkeys(name for row in rows for name in row if name not in _COLUMNS)
         columns = (*_COLUMNS, *numbers)
@@ -83,15 +84,6 @@ def read_row(result: hemisphere.ResultPlace) -> dict[str, str]:
     }
     is_measured = result.path("summary").exists()
     return cells | (hemisphere.read_summary_cells(result) if is_measured else {})
-
-
-def _read(path: Path) -> list[dict[str, str]]:
-    """Read a table of hemispheres; empty if there is none, or if it is unreadable."""
-    try:
-        rows = files.read_tsv(path)
-    except InputError:
-        return []
-    return [row for row in rows if all(column in row for column in _KEY)]
 
 
 def _key(row: dataset.Row) -> tuple[str, ...]:

@@ -12,6 +12,7 @@ from browsing import (
     enlarge,
     faint,
     fits,
+    level,
     one,
     open_page,
     pixels,
@@ -34,10 +35,6 @@ def visit(browser, shown):
     with watched(browser):
         use_theme(browser, "light")
         yield lambda name, width=1280: open_page(browser, shown / name, width)
-
-
-def level(browser):
-    return int(re.match(r"Slice (\d+) of", texts(browser, "dialog .facts")[0])[1])
 
 
 def touch(browser, kind, *points):

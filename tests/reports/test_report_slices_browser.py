@@ -1,7 +1,5 @@
 """The first screen of a page, and its slices, in a real browser; see :mod:`browsing`."""
 
-import re
-
 import numpy as np
 import pytest
 from browsing import (
@@ -9,6 +7,7 @@ from browsing import (
     colored,
     enlarge,
     fits,
+    level,
     one,
     open_page,
     pixels,
@@ -32,10 +31,6 @@ def visit(browser, shown):
     with watched(browser):
         use_theme(browser, "light")
         yield lambda name, width=1280: open_page(browser, shown / name, width)
-
-
-def level(browser):
-    return int(re.match(r"Slice (\d+) of", texts(browser, "dialog .facts")[0])[1])
 
 
 def press(browser, *keys):
