@@ -60,7 +60,9 @@ def _analyze(options: studies.GroupOptions, settings: GroupSettings) -> studies.
         visits=study.time,
     )
     table = modeled_table(cohort.table, options.comparison)
-    study = with_mixes(study, table, closed_formula(model.formula).names)
+    effects = load_effects(options.harmonize_model) if options.harmonize_model else None
+    source = (effects.file, effects.labels) if effects else ("", {})
+    study = with_mixes(study, table, closed_formula(model.formula).names, source=source)
     templates = studies.read_templates(options.template, cohort)
     analysis = fitting.analyze_cohort(
         cohort,
@@ -73,7 +75,7 @@ def _analyze(options: studies.GroupOptions, settings: GroupSettings) -> studies.
         time=study.time.column if study.time else None,
         icv=study.icv,
         templates=templates,
-        site_effects=load_effects(options.harmonize_model) if options.harmonize_model else None,
+        site_effects=effects,
     )
     analyses = {
         surface: analysis
@@ -109,6 +111,7 @@ def _analyze(options: studies.GroupOptions, settings: GroupSettings) -> studies.
             joint=tested,
             region=options.sheets.region,
             ratings=study.collection.ratings,
+            labels=study.labels,
         )
         files.write_json(folder / "model.json", document)
         if summary is not None:
@@ -141,6 +144,7 @@ def _summary(study: studies.Study, analysis: Analysis, notes: list[str]) -> dict
             "versions": list(collection.versions),
             "seg": collection.records[0].result.name.seg if collection.records else "none",
             "region": options.sheets.region,
+            "labels": study.labels,
             "settings_hash": collection.settings_hash,
         },
     )

@@ -114,6 +114,8 @@ class Study:
     """Reason and message by further visits that are left out."""
     mixes: tuple[str, ...] = ()
     """In what hemispheres differ, as far as the settings allow it, one line each."""
+    labels: Mapping[str, list[str]] = field(default_factory=dict)
+    """Values of each field of provenance of their labels."""
 
     @property
     def cohort(self) -> Cohort:
