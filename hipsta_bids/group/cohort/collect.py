@@ -10,7 +10,13 @@ from typing import Any
 import pandas as pd
 
 from hipsta_bids.derivatives import hemisphere
-from hipsta_bids.derivatives.dataset import NOT_FINISHED, name_of, provenance_of, read_status
+from hipsta_bids.derivatives.dataset import (
+    NOT_FINISHED,
+    counts_text,
+    name_of,
+    provenance_of,
+    read_status,
+)
 from hipsta_bids.derivatives.names import DATASET_FILES, HemisphereName
 from hipsta_bids.errors import InputError, MissingFileError, NothingToDoError
 from hipsta_bids.group.cohort.covariates import relocate
@@ -164,11 +170,6 @@ def collect_sheets(request: GroupRequest, *, may_lack: bool = False) -> Collecti
         ),
         warnings=_several_versions(records),
     )
-
-
-def counts_text(counts: Mapping[str, int]) -> str:
-    """List names with their numbers of hemispheres."""
-    return ", ".join(f"{name} ({n})" for name, n in sorted(counts.items()))
 
 
 def _digest(result: hemisphere.ResultPlace) -> str | None:

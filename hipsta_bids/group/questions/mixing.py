@@ -9,9 +9,8 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
-from hipsta_bids.derivatives.dataset import PROVENANCE
+from hipsta_bids.derivatives.dataset import PROVENANCE, counts_text
 from hipsta_bids.errors import InputError
-from hipsta_bids.group.cohort.collect import counts_text
 from hipsta_bids.group.cohort.read import visit_name
 from hipsta_bids.group.design.formula import typed
 from hipsta_bids.group.questions.study import Study
