@@ -9,14 +9,8 @@ from typing import Any
 
 import pandas as pd
 
-from hipsta_bids.derivatives import hemisphere
-from hipsta_bids.derivatives.dataset import (
-    NOT_FINISHED,
-    counts_text,
-    name_of,
-    provenance_of,
-    read_status,
-)
+from hipsta_bids.derivatives import dataset, hemisphere
+from hipsta_bids.derivatives.dataset import NOT_FINISHED, name_of, provenance_of, read_status
 from hipsta_bids.derivatives.names import DATASET_FILES, HemisphereName
 from hipsta_bids.errors import InputError, MissingFileError, NothingToDoError
 from hipsta_bids.group.cohort.covariates import relocate
@@ -186,7 +180,7 @@ def _several_versions(records: Sequence[SheetRecord]) -> tuple[str, ...]:
     usual = counts.most_common(1)[0][0]
     stems = [record.result.name.stem for record in records if record.version != usual]
     text = (
-        f"hemispheres were measured by several versions, {counts_text(counts)}; measure"
+        f"hemispheres were measured by several versions, {dataset.counts_text(counts)}; measure"
         f" {listed(stems, SHOWN)} with {usual}: a version may change numbers"
     )
     return (text,)
@@ -251,8 +245,8 @@ def _one_protocol(
         raise NothingToDoError(f"{request.roots[0]}: no hemisphere{request_text}; {hint}")
     if request.seg is None and len(counts) > 1:
         raise InputError(
-            f"{request.roots[0]}: hemispheres of several protocols, {counts_text(counts)}; choose"
-            " one by --seg"
+            f"{request.roots[0]}: hemispheres of several protocols,"
+            f" {dataset.counts_text(counts)}; choose one by --seg"
         )
     return request.seg or next(iter(counts))
 

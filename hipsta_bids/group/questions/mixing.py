@@ -48,13 +48,13 @@ def with_mixes(
     frame = frame.assign(voxel_size=frame["voxel_size"].map(_sizes(Counter(frame["voxel_size"]))))
     mixed = {f: f"{f}: {counts_text(n)}" for f in PROVENANCE if len(n := Counter(frame[f])) > 1}
     labels = {field: sorted(set(frame[field])) for field in PROVENANCE}
-    for field, known in source[1].items():
-        values_here = labels.get(field, [])
-        sizes = _sizes(Counter({**dict.fromkeys(values_here, 1), **dict.fromkeys(known, 2)}))
-        if set(map(sizes.get, values_here) if field == "voxel_size" else values_here) - set(known):
-            text = mixed.get(field, f"{field}: {', '.join(values_here)}")
-            mixed[field] = f"{text}, but {', '.join(known)} in {source[0]}"
-        labels[field] = sorted({*values_here, *known})
+    for field, expected in source[1].items():
+        present = labels.get(field, [])
+        sizes = _sizes(Counter({**dict.fromkeys(present, 1), **dict.fromkeys(expected, 2)}))
+        if set(map(sizes.get, present) if field == "voxel_size" else present) - set(expected):
+            text = mixed.get(field, f"{field}: {', '.join(present)}")
+            mixed[field] = f"{text}, but {', '.join(expected)} in {source[0]}"
+        labels[field] = sorted({*present, *expected})
     if refused := [field for field in mixed if field not in study.settings.design.mixed]:
         raise InputError(
             f"hemispheres of one analysis differ in {'; '.join(mixed[one] for one in refused)};"

@@ -10,7 +10,8 @@ import numpy as np
 import pandas as pd
 
 from hipsta_bids.errors import ModelError
-from hipsta_bids.group.design.formula import Contrast, listed
+from hipsta_bids.group.design.contrasts import Contrast
+from hipsta_bids.group.design.formula import listed
 from hipsta_bids.group.design.settings import GroupSettings
 from hipsta_bids.group.output import columns, tables
 from hipsta_bids.group.questions.exchange import ModelSummary, SiteSummary, shown_counts

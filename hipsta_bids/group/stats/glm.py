@@ -10,7 +10,7 @@ from scipy.optimize import elementwise
 from statsmodels.regression.linear_model import OLS
 
 from hipsta_bids.errors import ModelError
-from hipsta_bids.group.design.formula import Contrast
+from hipsta_bids.group.design.contrasts import Contrast
 from hipsta_bids.group.design.model import Design
 from hipsta_bids.group.design.settings import GlmSettings
 from hipsta_bids.group.stats.arrays import Bool, Float, Int, SideMaps, parts_of_sheets, sheets_of
