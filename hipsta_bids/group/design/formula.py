@@ -26,6 +26,9 @@ NUMERIC_SHARE = 0.5
 FEW_VALUES = 5
 
 
+#: A map as a covariate, with the sign before it.
+_MAP = re.compile(r"\+\s*map\(\s*(\w+)\s*\)(?=\s*(?:\+|$))")
+
 #: Numbers from here on overflow when they are squared and summed.
 _LARGEST = 1e100
 #: Name of the constant.
@@ -52,6 +55,8 @@ class ModelSpec:
     """Also test each column by itself, with this test."""
     measures: tuple[str, ...] = ()
     """Left-hand side: what the model is fitted to; empty for the default."""
+    maps: tuple[str, ...] = ()
+    """Maps that are covariates at each point, as ``map(curvature)`` in the formula."""
 
 
 def model_from_shortcut(formula: str, contrasts: Sequence[str], name: str) -> dict[str, Any]:
@@ -98,11 +103,24 @@ def parse_model(document: Mapping[str, Any]) -> ModelSpec:
         )
     return ModelSpec(
         name=str(node.get("Name") or document.get("Name") or "model"),
-        formula=_formula(model),
+        formula=split_maps(_formula(model))[0],
+        maps=split_maps(_formula(model))[1],
         measures=left_side(str(model.get("Formula") or "")),
         contrasts=specs,
         dummy=str(dummy.get("Test", "t")) if isinstance(dummy, Mapping) else None,
     )
+
+
+def split_maps(formula: str) -> tuple[str, tuple[str, ...]]:
+    """Take the terms ``map(NAME)`` out of the right-hand side of a formula, and list the maps."""
+    right = formula.rpartition("~")[2]
+    names = tuple(dict.fromkeys(_MAP.findall(f"+{right}")))
+    plain = _MAP.sub(" ", f"+{right}")
+    if re.search(r"\bmap\s*\(", plain):
+        raise ModelError(
+            f"formula {right.strip()!r}: add map(NAME) to other terms, as group + map(curvature)"
+        )
+    return re.sub(r"^[\s+]+", "", plain).strip() or "1", names
 
 
 def left_side(formula: str) -> tuple[str, ...]:

@@ -37,10 +37,16 @@ class Terms:
     """What contrasts can name, as rows of weights of the columns."""
 
     def __init__(
-        self, matrix: ModelMatrix, table: pd.DataFrame, levels: Mapping[str, Sequence[str]]
+        self,
+        matrix: ModelMatrix,
+        table: pd.DataFrame,
+        levels: Mapping[str, Sequence[str]],
+        maps: Sequence[str] = (),
     ) -> None:
         self.matrix: Float = np.asarray(matrix, dtype=np.float64)
         self.columns = tuple(str(column) for column in matrix.columns)
+        #: Columns of the design, and those of maps, which only points have.
+        self.names = (*self.columns, *(f"map({name})" for name in maps))
         self.spec, self.table, self.levels = matrix.model_spec, table, levels
         self._grids: dict[tuple[tuple[str, object], ...], Float] = {}
 
@@ -50,6 +56,8 @@ class Terms:
         if variable and len(spec.conditions) == 1:
             return Contrast(spec.name, self._nonlinear(variable[1], spec.name))
         parts = [self._rows(name, spec.name) for name in spec.conditions]
+        width = max(part.shape[1] for part in parts)
+        parts = [np.pad(part, ((0, 0), (0, width - part.shape[1]))) for part in parts]
         if len(parts) == 1:
             return Contrast(spec.name, parts[0] * spec.weights[0][0])
         if wide := [name for name, p in zip(spec.conditions, parts, strict=True) if len(p) > 1]:
@@ -73,8 +81,9 @@ class Terms:
 
     def _rows(self, name: str, contrast: str) -> Float:
         """Return (rows, columns) weights of a column, level, slope, term or product of these."""
-        if name in self.columns:
-            return np.eye(len(self.columns))[[self.columns.index(name)]]
+        if name in self.names:
+            size = len(self.columns) if name in self.columns else len(self.names)
+            return np.eye(size)[[self.names.index(name)]]
         atoms, conditions = split_name(name)
         fixed = {self._variable(key, contrast): value for key, value in conditions.items()}
         free: list[str] = []
@@ -108,7 +117,7 @@ class Terms:
         if name in self.table:
             return name
         levels = [f"{f}[{level}]" for f, levels in self.levels.items() for level in levels]
-        names = [*self.columns, *levels, *map(str, self.table.columns)]
+        names = [*self.names, *levels, *map(str, self.table.columns)]
         near = difflib.get_close_matches(name, names, n=1)
         hint = f"did you mean {near[0]}?" if near else f"known are {listed(names)}"
         raise ModelError(f"contrast {contrast!r}: nothing is called {name!r}; {hint}")

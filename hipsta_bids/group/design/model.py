@@ -210,6 +210,13 @@ def wanted_measures(request: ModelRequest, options: tuple[str, ...]) -> tuple[st
     return options or left
 
 
+def covariate_maps(request: ModelRequest) -> tuple[str, ...]:
+    """Names of maps that are covariates at each point."""
+    if request.file is not None:
+        return formulas.parse_model(files.read_json(request.file)).maps
+    return formulas.split_maps(request.formula or "")[1]
+
+
 def choose_model(
     request: ModelRequest,
     table: pd.DataFrame,
@@ -255,8 +262,10 @@ def model_document(
             raise UsageError("--formula is empty; write it as group + age")
         formula = request.formula
         contrasts = list(request.contrasts)
-        if not contrasts and groups is not None and groups.column in formula:
-            contrasts = [*groups.contrasts(), *interactions(formula)]
+        plain, maps = formulas.split_maps(formula)
+        if not contrasts and groups is not None and groups.column in plain:
+            contrasts = [*groups.contrasts(), *interactions(plain)]
+            contrasts += [f"map({name})" for name in maps]
         return formulas.model_from_shortcut(
             formula, contrasts, request.name or folder_name(formula)
         )
@@ -375,7 +384,7 @@ def build_design(
         raise ModelError(
             f"formula {model.formula!r}: {str(error).partition(chr(10))[0]}"
         ) from error
-    terms = Terms(model_matrix, variables, levels_used)
+    terms = Terms(model_matrix, variables, levels_used, model.maps)
     matrix, columns = terms.matrix, terms.columns
     _check_matrix(matrix, columns, variables.index, settings)
     people = table.loc[complete, PARTICIPANT].nunique() if PARTICIPANT in table else len(matrix)
@@ -384,7 +393,7 @@ def build_design(
     if model.dummy is not None:
         specs += tuple(
             ContrastSpec(name, (name,), ((1.0,),), model.dummy)
-            for name in columns
+            for name in terms.names
             if name != formulas.INTERCEPT
         )
     return Design(

@@ -318,6 +318,8 @@ def _check_model(analysis: Analysis, settings: GroupSettings) -> None:
     problem = None
     if analysis.comparison.longitudinal:
         problem = "of --longitudinal cannot be combined; use --paired"
+    elif analysis.model.maps:
+        problem = "with map() cannot be combined; remove the term"
     elif analysis.harmonization is not None:
         problem = "of harmonized values cannot be combined; leave --harmonize out"
     elif settings.glm.covariance != "ordinary":

@@ -260,8 +260,14 @@ def read_study(
     requests = external.map_patterns(options.maps, options.surfaces, reserved)
     requested = designs.wanted_measures(options.model, options.measures)
     measures = read.choose_measures(requested, collection.records, [one.name for one in requests])
+    covariate_maps = designs.covariate_maps(options.model)
+    if covariate_maps:
+        known_maps = [one.name for one in requests]
+        found_maps = read.choose_measures(covariate_maps, collection.records, known_maps)
+        if found_maps.summaries:
+            raise ModelError(f"map({found_maps.summaries[0]}) in the formula: it is no map")
     files_of, visits = external.find_all(
-        [one for one in requests if one.name in measures.maps],
+        [one for one in requests if one.name in {*measures.maps, *covariate_maps}],
         options.bids_dir,
         read.visits_of(collection.records),
         collect.wanted_by(options.sheets),
@@ -270,11 +276,16 @@ def read_study(
     sheets = read.read_sheets(
         collection.records,
         collection.grid,
-        [name for name in measures.maps if name not in names],
+        [name for name in dict.fromkeys((*measures.maps, *covariate_maps)) if name not in names],
         visits,
         max_gap=settings.registration.max_gap,
     )
     sheets, surfaces, map_notes = external.add_external(sheets, files_of, visits)
+    if covariate_maps and surfaces:
+        raise ModelError(
+            f"maps {listed(surfaces)} are not on the grid of the sheet, where map() in the formula"
+            " is; leave one out"
+        )
     measured, volume_notes = external.add_volumes(
         sheets, collection.records, options.volumes, options.bids_dir
     )
