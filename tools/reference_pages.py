@@ -155,11 +155,11 @@ def outputs_page() -> str:
         "# Outputs",
         OUTPUTS_TEXT,
         "## Files of a hemisphere",
-        _table(("file", "content"), _files(OUTPUTS)),
+        table(("file", "content"), _files(OUTPUTS)),
         SIDECARS_TEXT,
-        _table(("file", "content"), _files(EXTRA_OUTPUTS)),
+        table(("file", "content"), _files(EXTRA_OUTPUTS)),
         "## Files of the dataset",
-        _table(
+        table(
             ("file", "content"),
             (
                 *((f"`{DATASET_FILES[key]}`", text) for key, text in _DATASET_FILES.items()),
@@ -172,17 +172,17 @@ def outputs_page() -> str:
         IGNORED_TEXT,
         "## Columns of `desc-sheet_morph.tsv`",
         f"One row per grid point, with the measures {_measures(MAPS)}, and:",
-        _table(columns, _named([*place, *state])),
+        table(columns, _named([*place, *state])),
         "## Columns of the other tables",
         TABLES_TEXT.format(
             sections=_measures(SECTIONS),
             summary=_measures(SUMMARY),
             subfields=_measures(PER_SUBFIELD, ending="_NAME"),
         ),
-        _table(columns, _named(row for row in layers if row not in place)),
+        table(columns, _named(row for row in layers if row not in place)),
         "## Columns of the group level",
         COLUMNS_TEXT,
-        _table(("column", "meaning"), _group_columns()),
+        table(("column", "meaning"), _group_columns()),
     ]
     return _page(parts)
 
@@ -244,7 +244,7 @@ def _levels(listed: Callable[[str, str], bool]) -> Iterator[str]:
     """Write a section per level with the settings that are listed."""
     for title, settings in (("Participant", Settings()), ("Group", GroupSettings())):
         yield f"## {title} level"
-        yield _table(("setting", "default", "meaning"), _settings(settings, listed))
+        yield table(("setting", "default", "meaning"), _settings(settings, listed))
 
 
 def _settings(
@@ -252,10 +252,10 @@ def _settings(
 ) -> Iterator[tuple[str, str, str]]:
     """Name settings with default and meaning; settings with the same texts share a row."""
     names: dict[tuple[str, str], list[str]] = {}
-    for stage, table in settings:
-        for name, field in type(table).model_fields.items():
+    for stage, values in settings:
+        for name, field in type(values).model_fields.items():
             if listed(stage, name):
-                texts = json.dumps(getattr(table, name)), _words(field.description)
+                texts = json.dumps(getattr(values, name)), _words(field.description)
                 names.setdefault(texts, []).append(f"`{stage}.{name}`")
     return ((", ".join(rows), f"`{value}`", words) for (value, words), rows in names.items())
 
@@ -266,11 +266,11 @@ def _words(text: str | None) -> str:
 
 def reasons_page() -> str:
     """Write the page of flags, refusals and what to do about them."""
-    table = read_table("reasons.toml")
-    sections = table["section"]
+    reasons_table = read_table("reasons.toml")
+    sections = reasons_table["section"]
     where = [f"- **{section['title']}**: {_words(section['text'])}" for section in sections]
     parts = ["# Flags and refusals", REASONS_TEXT, "\n".join(where)]
-    for action, title in table["actions"].items():
+    for action, title in reasons_table["actions"].items():
         parts.append(f"## {title}")
         for section in sections:
             rows = section["reasons"].items()
@@ -280,7 +280,7 @@ def reasons_page() -> str:
             for name, row in sorted(reasons.items()):
                 parts += [f"#### `{name}`", f"{_words(row['meaning'])} *{_words(row['remedy'])}*"]
     codes = ((str(int(code)), words) for code, words in EXIT_MEANINGS.items())
-    return _page([*parts, "## Exit codes", _table(("code", "meaning"), codes)])
+    return _page([*parts, "## Exit codes", table(("code", "meaning"), codes)])
 
 
 def options_page() -> str:
@@ -307,7 +307,7 @@ def options_page() -> str:
         repeated: dict[str, list[str]] = {}
         for name, rows in groups.items():
             new = [row for row in rows if described.setdefault(row, title) == title]
-            parts += [f"**{name}**", _table(("option", "meaning"), new)] if new else []
+            parts += [f"**{name}**", table(("option", "meaning"), new)] if new else []
             for row in rows:
                 repeated.setdefault(described[row], []).append(row[0].split(", ")[0])
         repeated.pop(title, None)
@@ -333,7 +333,8 @@ def _escape(text: str) -> str:
     return re.sub(r"([*_<>\[\]])", r"\\\1", " ".join(text.split()))
 
 
-def _table(headings: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> str:
+def table(headings: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> str:
+    """Write a table in Markdown."""
     lines = [headings, ("---",) * len(headings), *rows]
     return "\n".join(f"|{' |'.join(x.replace('|', '&#124;') for x in line)}|" for line in lines)
 
