@@ -191,8 +191,8 @@ def test_readme_says_of_accuracy_what_the_validation_found():
     assert f"by {min(spread):.3f} to {max(spread):.3f} mm (SD)" in said
 
 
-def test_readme_says_of_speed_what_the_page_on_scaling_does():
-    page = (ROOT / "docs" / "scaling.md").read_text(encoding="utf-8")
+def test_readme_says_of_speed_what_the_page_on_cost_does():
+    page = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
     seconds = re.search(r"\| ([\d.]+) s, median of twelve \|", page)
     assert seconds is not None
     assert f"{seconds[1]} s of processor time per hemisphere" in README
