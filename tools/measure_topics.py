@@ -132,13 +132,13 @@ TOPICS = (
 )
 
 INTRODUCTION = """\
-This page defines the measures of the participant level. The example is a phantom: a spiral wall of
-2 mm that varies by 20 % along x, 16 mm long, with a bent axis, in voxels of 0.4 mm, with default
-settings. *Measured* is the result, *analytic* the exact value; both are means over maps and
-cross-sections, and values of CA1 for subfields. The tables are `desc-sheet_morph.tsv` (also as
-GIFTI maps), `desc-sections_morph.tsv` and `desc-summary_morph.tsv`; measures of subfields are in
-the latter, with the name of the subfield. [Method](method.md) defines the coordinates x, y and
-z."""
+This page defines the measures of the participant level. The example is a phantom: a spiral wall, 16
+mm long, with a bent axis. Its thickness is 2 mm and varies by 20 % along x. It was drawn in voxels
+of 0.4 mm and measured with default settings. *Measured* is the result, *analytic* the exact value;
+both are means over maps and cross-sections, and values of CA1 for subfields. The tables are
+`desc-sheet_morph.tsv` (also as GIFTI maps), `desc-sections_morph.tsv` and `desc-summary_morph.tsv`;
+measures of subfields are in the latter, with the name of the subfield. [Method](method.md) defines
+the coordinates x, y and z."""
 
 ERRORS = """\
 Smallest and largest error of the means over eight phantoms (left, 0.4 mm, one drawing each):
@@ -151,9 +151,9 @@ differ by 0.03 mm. [Validation](validation.md) has the errors over positions and
 
 SIZES_TEXT = """\
 Ranges over {count} measurements of real bodies: both hemispheres of three brains with manual labels
-(Winterburn et al. 2013, NeuroImage 74:254-265), in FreeSurfer's codes at 0.3 mm and in ASHS's codes
-at 0.4 x 0.4 x 1.5 mm. End planes were placed at fixed fractions of the length of the hippocampus;
-`extent_y`, areas and volumes depend on this choice."""
+(Winterburn et al. 2013, NeuroImage 74:254-265). The labels are in FreeSurfer's codes at 0.3 mm, and
+in ASHS's codes at 0.4 x 0.4 x 1.5 mm. End planes were placed at fixed fractions of the length of
+the hippocampus; `extent_y`, areas and volumes depend on this choice."""
 
 PUBLISHED = """\
 For comparison, manual segmentations of the whole hippocampus have 3208 mm³ (left) and 3324 mm³
