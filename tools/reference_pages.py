@@ -123,7 +123,7 @@ beside it gives place and numbers. This page lists the reasons by the action tha
 OPTIONS_TEXT = """\
 `hipsta-bids BIDS_DIR OUTPUT_DIR participant` measures; `hipsta-bids BIDS_DIR OUTPUT_DIR group`
 analyzes. The commands `demo`, `demo-data`, `phantom`, `surrogate`, `meta`, `resample`, `settings`
-and `schemes` print their options with `--help`, as both levels do; `--version` prints the version.
+and `protocols` print their options with `--help`, as both levels do; `--version` prints the version.
 Options accept underscores instead of hyphens (`--n_procs`)."""
 
 _SHARED_TEXT = "properties of all images with these suffixes"
@@ -279,8 +279,7 @@ def reasons_page() -> str:
             # A heading for each, so that it can be searched for and linked to.
             for name, row in sorted(reasons.items()):
                 parts += [f"#### `{name}`", f"{_words(row['meaning'])} *{_words(row['remedy'])}*"]
-    codes = ((str(int(code)), words) for code, words in EXIT_MEANINGS.items())
-    return _page([*parts, "## Exit codes", table(("code", "meaning"), codes)])
+    return _page(parts)
 
 
 def options_page() -> str:
@@ -312,7 +311,8 @@ def options_page() -> str:
                 repeated.setdefault(described[row], []).append(row[0].split(", ")[0])
         repeated.pop(title, None)
         parts += [f"As under {where}: {', '.join(rows)}." for where, rows in repeated.items()]
-    return _page(parts)
+    codes = ((str(int(code)), words) for code, words in EXIT_MEANINGS.items())
+    return _page([*parts, "## Exit codes", table(("code", "meaning"), codes)])
 
 
 def _option(action: argparse.Action) -> tuple[str, str]:
