@@ -1,4 +1,4 @@
-"""Write docs/measures.md: every measure, its figure, and its error on phantoms.
+"""Write docs/measures.md (measures, figures, errors on phantoms) and docs/measures-errors.tsv.
 
 Run it after a change of a measure, or of the geometry by more than a rounding::
 
