@@ -11,10 +11,12 @@ from pathlib import Path
 
 import pytest
 import yaml
-from reference_pages import PAGES
+from reference_pages import CHANGED, PAGES
 
 import hipsta_bids
 from hipsta_bids.errors import ExitCode
+from hipsta_bids.group.design.settings import GroupSettings
+from hipsta_bids.settings import Settings
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -189,8 +191,8 @@ def test_readme_says_of_accuracy_what_the_validation_found():
     assert f"by {min(spread):.3f} to {max(spread):.3f} mm (SD)" in said
 
 
-def test_readme_says_of_speed_what_the_page_on_scaling_does():
-    page = (ROOT / "docs" / "scaling.md").read_text(encoding="utf-8")
+def test_readme_says_of_speed_what_the_page_on_cost_does():
+    page = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
     seconds = re.search(r"\| ([\d.]+) s, median of twelve \|", page)
     assert seconds is not None
     assert f"{seconds[1]} s of processor time per hemisphere" in README
@@ -225,6 +227,17 @@ def test_links_lead_somewhere(page):
 def test_pages_say_what_the_code_says(name):
     written = (ROOT / "docs" / name).read_text(encoding="utf-8")
     assert written == PAGES[name](), "run tools/make-docs"
+
+
+def test_each_setting_is_on_one_of_two_pages():
+    levels = (Settings(), GroupSettings())
+    known = [f"`{stage}.{name}`" for level in levels for stage, table in level for name, _ in table]
+    changed, others = (
+        re.findall(r"`\w+\.\w+`", re.sub(r" \|.*", "", text, flags=re.MULTILINE))
+        for text in (PAGES["settings.md"](), PAGES["settings-all.md"]())
+    )
+    assert sorted([*changed, *others]) == sorted(known)
+    assert len(changed) == sum(len(names.split()) for names in CHANGED.values()) <= 40
 
 
 @pytest.mark.parametrize("page", ["CONTRIBUTING.md", "docs/architecture.md"])
