@@ -158,6 +158,7 @@ def _change(side: SideMaps, rows: Int, first: Int, second: Int) -> SideMaps:
         rows=rows,
         maps={name: m[second] - m[first] for name, m in side.maps.items()},
         subfield=side.subfield[first],
+        unmasked=None,
         summary=pd.DataFrame(summary, columns=side.summary.columns),
     )
 

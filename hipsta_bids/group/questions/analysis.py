@@ -307,7 +307,7 @@ def register_side(
 ) -> tuple[registration.Registration, arrays.SideMaps]:
     """Register the sheets of one hemisphere, to a template or to each other; also the maps."""
     side = cohort.sides[hemi]
-    profiles = registration.mean_profiles(side.maps["curvature"], settings.registration)
+    profiles = registration.mean_profiles(side.curvature, settings.registration)
     if templates is None:
         result = registration.register(profiles, settings.registration)
     else:

@@ -8,6 +8,7 @@ from typing import Any
 from hipsta_bids.derivatives import dataset
 from hipsta_bids.group.cohort import collect
 from hipsta_bids.group.cohort.data import SHEET, modeled_table
+from hipsta_bids.group.cohort.masks import mask_note
 from hipsta_bids.group.design import model as designs
 from hipsta_bids.group.design.grammar import closed_formula
 from hipsta_bids.group.design.settings import GroupSettings
@@ -93,6 +94,9 @@ def _analyze(options: studies.GroupOptions, settings: GroupSettings) -> studies.
     exclusions = [*study.exclusions, *collect.exclude_visits(table, incomplete)]
     measures = designs.wanted_measures(options.model, options.measures)
     notes = [*study.notes, *_notes(study, analysis)]
+    if study.masked is not None:
+        shares = study.masked[study.masked["visit"].isin(cohort.table.index)]
+        notes.append(mask_note(shares, cohort.table[groups.column] if groups else None))
     summary = _summary(study, analysis, notes)
     tell("average surfaces")
     shapes = average_shapes(study.collection.records, cohort, analysis, settings.shapes)

@@ -15,6 +15,7 @@ from hipsta_bids.errors import ModelError
 from hipsta_bids.group.cohort import collect, external, read
 from hipsta_bids.group.cohort.covariates import add_icv, add_time, read_covariates, spelled_note
 from hipsta_bids.group.cohort.data import SHEET, Cohort, Measures, choose_visits
+from hipsta_bids.group.cohort.masks import mask_sheets
 from hipsta_bids.group.design import model as designs
 from hipsta_bids.group.design.formula import ascii_letters, check_names, listed, with_factors
 from hipsta_bids.group.design.settings import GroupSettings
@@ -112,6 +113,8 @@ class Study:
     """Column and level of the participants; all without."""
     left_out: dict[str, tuple[str, str]] = field(default_factory=dict)
     """Reason and message by further visits that are left out."""
+    masked: pd.DataFrame | None = None
+    """Visit, side and share of masked points of each sheet, if a mask is asked for."""
     mixes: tuple[str, ...] = ()
     """In what hemispheres differ, as far as the settings allow it, one line each."""
     labels: Mapping[str, list[str]] = field(default_factory=dict)
@@ -289,6 +292,11 @@ def read_study(
     measured, volume_notes = external.add_volumes(
         sheets, collection.records, options.volumes, options.bids_dir
     )
+    mask_notes: list[str] = []
+    masked = None
+    if options.sheets.masks:
+        records = collection.records
+        measured, masked, mask_notes = mask_sheets(measured, records, options.sheets.masks)
     read.check_summaries(measures, measured.sides)
     covariates, absent, spelled = read_covariates(
         measured.table, options.bids_dir, options.covariates, settings
@@ -333,7 +341,11 @@ def read_study(
             *measured.damaged,
             *collect.exclude_visits(measured.table, reasons_of),
         ),
-        notes=(*collection.notes, *map_notes, *volume_notes, *_damaged(measured), *table_notes),
+        notes=(
+            *(*collection.notes, *map_notes, *mask_notes, *volume_notes),
+            *(*_damaged(measured), *table_notes),
+        ),
+        masked=masked,
         absent=absent,
         among=among,
     )

@@ -102,6 +102,14 @@ class SideMaps:
     covariates: Mapping[str, Float] = field(default_factory=dict)
     """(sheets, x, y) maps that are covariates of the model at each point, by name."""
 
+    unmasked: Float | None = None
+    """(sheets, x, y) curvature that registration uses, where a mask has points of that map."""
+
+    @property
+    def curvature(self) -> Float:
+        """(sheets, x, y) map that registration uses."""
+        return self.maps["curvature"] if self.unmasked is None else self.unmasked
+
     @property
     def shape(self) -> tuple[int, int]:
         """Nodes along x and y."""
@@ -132,6 +140,7 @@ class SideMaps:
             rows=self.rows[keep],
             maps=some_sheets(self.maps, keep),
             covariates=some_sheets(self.covariates, keep),
+            unmasked=None if self.unmasked is None else self.unmasked[keep],
             subfield=self.subfield[keep],
             summary=self.summary[keep].reset_index(drop=True),
         )
