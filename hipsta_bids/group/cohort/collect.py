@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from sys import intern
 from typing import Any
@@ -114,6 +114,8 @@ class Collection:
     versions: tuple[str, ...] = ()
     ratings: Mapping[str, int] | None = None
     """Numbers of hemispheres by rating, if there is a table of these."""
+    quality: pd.DataFrame = field(default_factory=pd.DataFrame)
+    """Participant, session, side, decision and rating of each hemisphere, also of failed ones."""
     notes: tuple[str, ...] = ()
     """What to know, one line each."""
     warnings: tuple[str, ...] = ()
@@ -139,8 +141,11 @@ def collect_sheets(request: GroupRequest, *, may_lack: bool = False) -> Collecti
     choices = Choices(request.exclude_table, request.ratings)
     records: list[SheetRecord] = []
     left_out: list[Exclusion] = []
+    quality = []
     for result in sorted(places, key=_key):
-        entry = _judge(result, request, choices)
+        record = hemisphere.read_record(result)
+        entry = _judge(result, record, request, choices)
+        quality.append(_quality(result.name, record, choices))
         if isinstance(entry, Exclusion):
             left_out.append(entry)
         else:
@@ -157,6 +162,7 @@ def collect_sheets(request: GroupRequest, *, may_lack: bool = False) -> Collecti
         exclusions=tuple(left_out),
         grid=grid_of(records[0].result.root),
         settings_hash=digest,
+        quality=pd.DataFrame(quality),
         versions=tuple(sorted({record.version for record in records})),
         ratings=choices.counts((result.name, _digest(result)) for result in places),
         notes=(
@@ -166,6 +172,19 @@ def collect_sheets(request: GroupRequest, *, may_lack: bool = False) -> Collecti
         ),
         warnings=_several_versions(records),
     )
+
+
+def _quality(
+    name: HemisphereName, record: Mapping[str, Any], choices: Choices
+) -> dict[str, str | None]:
+    """Return who, which side, the decision and the rating of a hemisphere."""
+    return {
+        PARTICIPANT: f"sub-{name.subject}",
+        SESSION: f"ses-{name.session}" if name.session else None,
+        "side": name.hemi,
+        "decision": str(record.get("decision")),
+        "rating": choices.rating(name, record.get("input_hash")),
+    }
 
 
 def _digest(result: hemisphere.ResultPlace) -> str | None:
@@ -265,9 +284,11 @@ def _refuse_twice(places: Sequence[hemisphere.ResultPlace]) -> None:
 
 
 def _judge(
-    result: hemisphere.ResultPlace, request: GroupRequest, choices: Choices
+    result: hemisphere.ResultPlace,
+    record: Mapping[str, Any],
+    request: GroupRequest,
+    choices: Choices,
 ) -> SheetRecord | Exclusion:
-    record = hemisphere.read_record(result)
     decision = record.get("decision")
     reason, message = record.get("reason") or str(decision), record.get("message") or ""
     rated = result.name, record.get("input_hash")

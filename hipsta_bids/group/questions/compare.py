@@ -5,17 +5,20 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
+
 from hipsta_bids.derivatives import dataset
 from hipsta_bids.group.cohort import collect
 from hipsta_bids.group.cohort.data import SHEET, modeled_table
 from hipsta_bids.group.cohort.masks import mask_note
+from hipsta_bids.group.cohort.quality import quality_notes, quality_table
 from hipsta_bids.group.design import model as designs
 from hipsta_bids.group.design.grammar import closed_formula
 from hipsta_bids.group.design.settings import GroupSettings
 from hipsta_bids.group.output.results import Analysis, harmonization_record
 from hipsta_bids.group.output.saved import load_effects
 from hipsta_bids.group.output.shapes import average_shapes, write_shapes
-from hipsta_bids.group.output.write import draw, write_results
+from hipsta_bids.group.output.write import draw, write_results, write_table
 from hipsta_bids.group.questions import analysis as fitting
 from hipsta_bids.group.questions import study as studies
 from hipsta_bids.group.questions.exchange import SUMMARY, summarize, write_summary
@@ -94,6 +97,8 @@ def _analyze(options: studies.GroupOptions, settings: GroupSettings) -> studies.
     exclusions = [*study.exclusions, *collect.exclude_visits(table, incomplete)]
     measures = designs.wanted_measures(options.model, options.measures)
     notes = [*study.notes, *_notes(study, analysis)]
+    quality = quality_table(study.quality, groups.column) if groups else pd.DataFrame()
+    notes += quality_notes(quality)
     if study.masked is not None:
         shares = study.masked[study.masked["visit"].isin(cohort.table.index)]
         notes.append(mask_note(shares, cohort.table[groups.column] if groups else None))
@@ -118,6 +123,8 @@ def _analyze(options: studies.GroupOptions, settings: GroupSettings) -> studies.
             labels=study.labels,
         )
         files.write_json(folder / "model.json", document)
+        if len(quality):
+            write_table(folder, "quality", quality)
         if summary is not None:
             write_summary(folder / SUMMARY, summary)
         write_shapes(folder, shapes)

@@ -11,6 +11,7 @@ from scipy import stats
 
 from hipsta_bids.derivatives.dataset import PROVENANCE, counts_text
 from hipsta_bids.errors import InputError
+from hipsta_bids.group.cohort.quality import exact_p
 from hipsta_bids.group.cohort.read import visit_name
 from hipsta_bids.group.design.formula import typed
 from hipsta_bids.group.questions.study import Study
@@ -98,5 +99,4 @@ def _association(frame: pd.DataFrame, field: str, values: pd.Series) -> tuple[st
         with warnings.catch_warnings(action="ignore"):  # of kinds without spread
             samples = (value[kind == name] for name in kind.unique())
             return "F test", float(stats.f_oneway(*samples).pvalue)
-    method = None if table.shape == (2, 2) else stats.MonteCarloMethod(rng=np.random.default_rng(0))
-    return "Fisher's exact test", float(stats.fisher_exact(table, method=method).pvalue)
+    return "Fisher's exact test", exact_p(table)

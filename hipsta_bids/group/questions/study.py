@@ -31,7 +31,7 @@ from hipsta_bids.io import files
 from hipsta_bids.progress import each, tell
 from hipsta_bids.protocols.toml import resolve
 from hipsta_bids.reports.group import write_group_report
-from hipsta_bids.types import PARTICIPANT
+from hipsta_bids.types import PARTICIPANT, SESSION
 
 #: Hemispheres that notes name.
 _MOST_NOTES = 4
@@ -113,6 +113,8 @@ class Study:
     """Column and level of the participants; all without."""
     left_out: dict[str, tuple[str, str]] = field(default_factory=dict)
     """Reason and message by further visits that are left out."""
+    quality: pd.DataFrame = field(default_factory=pd.DataFrame)
+    """Decision and rating of each hemisphere, also of failed ones, with covariates."""
     masked: pd.DataFrame | None = None
     """Visit, side and share of masked points of each sheet, if a mask is asked for."""
     mixes: tuple[str, ...] = ()
@@ -304,6 +306,7 @@ def read_study(
     lacking = (
         f"participants.tsv: has no row of {listed(sorted(absent))}; add it, or check its label"
     )
+    quality = _with_covariates(collection.quality, covariates, options, settings)
     table_notes = [lacking] * bool(absent)
     if spelled:
         file = options.model.file and files.read_json(options.model.file)
@@ -346,11 +349,31 @@ def read_study(
             *(*_damaged(measured), *table_notes),
         ),
         masked=masked,
+        quality=quality,
         absent=absent,
         among=among,
     )
     keep = members(cohort.table, among)
     return study.take(keep, ("not-asked", "another level than --among"))
+
+
+def _with_covariates(
+    quality: pd.DataFrame,
+    covariates: pd.DataFrame,
+    options: GroupOptions,
+    settings: GroupSettings,
+) -> pd.DataFrame:
+    """Add covariates to decisions; those of participants without any sheet are read."""
+    if not len(quality):
+        return quality
+    keys = [PARTICIPANT, SESSION]
+    visits = quality[keys].drop_duplicates()
+    if not visits[PARTICIPANT].isin(covariates[PARTICIPANT]).all():
+        visits = visits.set_axis(
+            visits[PARTICIPANT].str.cat(visits[SESSION], "_", na_rep="").tolist()
+        )
+        covariates = read_covariates(visits, options.bids_dir, options.covariates, settings)[0]
+    return quality.merge(covariates.drop_duplicates(keys), on=keys, how="left")
 
 
 def _damaged(measured: read.Measured) -> tuple[str, ...]:
