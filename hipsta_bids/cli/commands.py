@@ -50,7 +50,7 @@ def meta_parser() -> Parser:
     add("out", "OUT", type=Path)
     add("--random", choices=["reml", "dl"])
     add("--correction", choices=["fdr2", "bh"])
-    add("--fdr-scope", choices=["map", "hemispheres"])
+    add("--fdr-scope", choices=["map", "hemispheres", "all"])
     add("--settings", "FILE.toml")
     return parser
 

@@ -265,7 +265,7 @@ def _add_methods(parser: Parser) -> None:
         "--fdr-scope",
         "",
         "what is one family of tests, for permutations too (default: map)",
-        choices=["map", "hemispheres"],
+        choices=["map", "hemispheres", "all"],
     )
     add(
         "--joint",

@@ -36,7 +36,11 @@ _MEASURED = {
     "whole": "the whole hippocampus on one sheet (experimental)",
 }
 
-_FAMILIES = {"map": "each map", "hemispheres": "both hemispheres together"}
+_FAMILIES = {
+    "map": "each map",
+    "hemispheres": "both hemispheres together",
+    "all": "all maps of a contrast together",
+}
 #: Procedures that hold false discovery rates.
 PROCEDURES: Mapping[str, str] = {
     "bh": "the procedure of Benjamini and Hochberg",

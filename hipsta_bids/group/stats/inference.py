@@ -19,6 +19,7 @@ from hipsta_bids.group.stats.arrays import Bool, Float, Int
 from hipsta_bids.group.stats.clusters import edges_of, enhance
 from hipsta_bids.group.stats.glm import FittedMaps, RowModel, fit_points
 from hipsta_bids.progress import tell
+from hipsta_bids.types import FAMILY
 
 #: Share of the smallest p that serves as cut-off when nothing is rejected.
 BELOW_ALL = 0.1
@@ -324,7 +325,7 @@ def families(maps: Iterable[MapKey], scope: str) -> list[list[MapKey]]:
     """Group maps whose points are tested together."""
     groups: dict[tuple[str, ...], list[MapKey]] = {}
     for key in maps:
-        family = (key.measure, key.contrast, *(() if scope == "hemispheres" else (key.hemi,)))
+        family = tuple(getattr(key, name) for name in FAMILY[scope])
         groups.setdefault(family, []).append(key)
     return list(groups.values())
 

@@ -104,6 +104,11 @@ def test_pooled_family_is_no_less_strict(dataset, quick):
     options = [*quick, *PLAIN, "--correction", "permutation-max", "--permutations", "100"]
     single = run(dataset, *options)
     pooled = run(dataset, *options, "--fdr-scope", "hemispheres")
+    every = run(dataset, *options, "--fdr-scope", "all")
+    overview = table(every / "maps.tsv").query("contrast == 'CN-AD'")
+    assert len(set(overview.n_tests)) == 1
+    assert overview.n_tests.iloc[0] == len(overview) * 147
+    assert "all maps of a contrast together" in (every / "methods.md").read_text()
     name = "hemi-{}_contrast-CNAD_desc-thickness_statmap.tsv"
     for hemi in "LR":
         one, both = (table(folder / name.format(hemi)) for folder in (single, pooled))
