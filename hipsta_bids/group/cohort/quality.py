@@ -28,6 +28,8 @@ def quality_table(quality: pd.DataFrame, column: str) -> pd.DataFrame:
     ``quality`` has a row per hemisphere with participant, decision, rating and the groups'
     ``column``. The unit of the test is the participant, with the worst value of all hemispheres.
     """
+    if column not in quality:  # there are maps of other programs only
+        return pd.DataFrame()
     labels = level_labels(quality[column])
     return pd.DataFrame(_rows(quality[labels.notna()], labels.dropna()))
 

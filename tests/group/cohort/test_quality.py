@@ -44,6 +44,7 @@ def test_counts_and_test_are_of_participants():
 def test_no_note_without_a_difference():
     assert list(quality_notes(quality_table(hemispheres(3, 4), "group"))) == []
     assert not len(quality_table(hemispheres(0, 0), "group"))
+    assert not len(quality_table(pd.DataFrame(), "group")), "maps of other programs alone"
 
 
 def test_false_alarms():
