@@ -104,7 +104,7 @@ _DATASET_FILES = {
     "status_sidecar": "its columns",
     "measures": "one row per hemisphere: decision, rating, origin, all summary measures",
     "measures_sidecar": "its columns, with units",
-    "ratings": "[ratings](running.md#review), if you save them there",
+    "ratings": "[ratings](quality.md#rate-hemispheres), if you save them there",
     "inputs": "each hemisphere, file and folder of the inputs: used or not, and why",
     "inputs_sidecar": "its columns",
     "logs": "one file per run",

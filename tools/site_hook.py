@@ -28,7 +28,7 @@ def on_config(config: MkDocsConfig) -> None:
     text = Path(str(config.config_file_path)).read_text(encoding="utf-8")
     pages = sorted(path.name for path in Path(config.docs_dir).glob("*.md"))
     last = (config.nav or [])[-1]
-    last["Background"] += [name for name in pages if f" {name}\n" not in text]
+    last["Explanation"] += [name for name in pages if f" {name}\n" not in text]
 
 
 def on_files(files: Files, *, config: MkDocsConfig) -> None:
