@@ -46,8 +46,8 @@ def draw_slice(axis: Axes, image: Any, maps: Measurement) -> None:  # noqa: ANN4
     index = np.rint(nib.affines.apply_affine(np.linalg.inv(affine), place)).astype(int)
     cut = codes[tuple(np.moveaxis(np.clip(index, 0, np.array(codes.shape) - 1), -1, 0))]
     ranks = np.searchsorted(present, cut)
-    limits = {"vmin": -0.5, "vmax": len(present) - 0.5}
-    axis.pcolormesh(x, z, ranks.T, cmap=shown, alpha=0.5, shading="nearest", **limits)
+    mesh = axis.pcolormesh(x, z, ranks.T, cmap=shown, alpha=0.5, shading="nearest")
+    mesh.set_clim(-0.5, len(present) - 0.5)
     flat = (row - center) @ across.T
     axis.add_collection(LineCollection(list(flat), colors="black", linewidths=0.7))
     for wall in (0, -1):

@@ -20,6 +20,13 @@ NOTEBOOKS = "notebooks"
 #: Pages of the site that lie beside docs/.
 BESIDE = ("CONTRIBUTING.md", "CHANGELOG.md")
 
+#: Weights of pages in the search, by their section of the navigation: a question is answered by a
+#: guide, a name by the reference. Pages without a section weigh 1.
+WEIGHTS = {"Tutorials": 1.0, "Guides": 3.0, "Reference": 1.5, "Explanation": 0.5}
+
+#: Weights of other pages: lists of changes and functions, and notebooks.
+LISTS = {"CHANGELOG.md": 0.1, "CONTRIBUTING.md": 0.1, "api.md": 0.3, NOTEBOOKS: 0.5}
+
 _LINK = re.compile(r"(?<=\]\()(?![a-z]+:|#)(?P<path>[^)#\s]+)")
 
 
@@ -47,8 +54,12 @@ def on_files(files: Files, *, config: MkDocsConfig) -> None:
 
 
 def on_page_markdown(markdown: str, *, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Turn links between the files of the repository into links between pages."""
+    """Turn links between the files of the repository into links between pages, and weigh pages."""
     del config, files
+    section = page.ancestors[-1].title if page.ancestors else ""
+    name = page.file.src_uri
+    weight = LISTS.get(name.partition("/")[0], WEIGHTS.get(str(section), 1.0))
+    page.meta.setdefault("search", {"boost": weight})
     if page.file.src_uri in BESIDE:
         return _LINK.sub(lambda found: found["path"].removeprefix("docs/"), markdown)
     if page.file.src_uri.startswith(f"{NOTEBOOKS}/"):
