@@ -56,9 +56,9 @@ def on_files(files: Files, *, config: MkDocsConfig) -> None:
 def on_page_markdown(markdown: str, *, page: Page, config: MkDocsConfig, files: Files) -> str:
     """Turn links between the files of the repository into links between pages, and weigh pages."""
     del config, files
-    section = page.ancestors[-1].title if page.ancestors else ""
-    name = page.file.src_uri
-    weight = LISTS.get(name.partition("/")[0], WEIGHTS.get(str(section), 1.0))
+    *_, section = ["", *(str(item.title) for item in page.ancestors)]
+    place = page.file.src_uri.partition("/")[0]
+    weight = LISTS.get(place, WEIGHTS.get(section, 1.0))
     page.meta.setdefault("search", {"boost": weight})
     if page.file.src_uri in BESIDE:
         return _LINK.sub(lambda found: found["path"].removeprefix("docs/"), markdown)
