@@ -15,6 +15,7 @@ from reference_pages import PAGES
 
 import hipsta_bids
 from hipsta_bids.errors import ExitCode
+from hipsta_bids.io.files import read_tsv
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -177,13 +178,11 @@ def test_exit_codes_are_listed():
 
 
 def test_readme_says_of_accuracy_what_the_validation_found():
-    page = (ROOT / "docs" / "validation.md").read_text(encoding="utf-8")
-    table = page.split("**Thickness over the whole grid, mm**")[1].split("\n\n")[1]
-    rows = [[cell.strip() for cell in row.split("|")] for row in table.splitlines()]
-    fine = [row for row in rows if row[2:3] == ["0.4 iso"]]
+    rows = read_tsv(ROOT / "docs" / "validation" / "accuracy--thickness.tsv")
+    fine = [row for row in rows if row["voxels, mm"] == "0.4 iso"]
     assert len(fine) == 4
-    assert {row[1].split()[1] for row in fine} == {"1.2", "2.0"}
-    bias, spread = ([abs(float(row[k])) for row in fine] for k in (3, 4))
+    assert {row["phantom"].split()[1] for row in fine} == {"1.2", "2.0"}
+    bias, spread = ([abs(float(row[name])) for row in fine] for name in ("bias", "SD"))
     said = README.replace("\n", " ")
     assert f"by {min(bias):.3f} to {max(bias):.3f} mm on average" in said
     assert f"by {min(spread):.3f} to {max(spread):.3f} mm (SD)" in said

@@ -1,4 +1,4 @@
-"""Hook of MkDocs: notebooks, and files that pages link to beside docs/, become pages."""
+"""Hook of MkDocs: notebooks, tables of the validation and files beside docs/ become pages."""
 
 import re
 import sys
@@ -13,6 +13,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "tools")]
 
 from notebooks import notebook_page  # noqa: E402
+from validation_pages import FOLDER, appendix, site_link  # noqa: E402
 
 #: Folder of notebooks, below docs/.
 NOTEBOOKS = "notebooks"
@@ -44,6 +45,8 @@ def on_files(files: Files, *, config: MkDocsConfig) -> None:
         files.append(File.generated(config, page, content=f"{text}\n{link}"))
         for name, content in figures.items():
             files.append(File.generated(config, f"{NOTEBOOKS}/{name}", content=content))
+    for name, page in appendix():
+        files.append(File.generated(config, f"{FOLDER}/{name}", content=page))
 
 
 def on_page_markdown(markdown: str, *, page: Page, config: MkDocsConfig, files: Files) -> str:
@@ -51,7 +54,7 @@ def on_page_markdown(markdown: str, *, page: Page, config: MkDocsConfig, files: 
     del config, files
     if page.file.src_uri in BESIDE:
         return _LINK.sub(lambda found: found["path"].removeprefix("docs/"), markdown)
-    if page.file.src_uri.startswith(f"{NOTEBOOKS}/"):
+    if page.file.src_uri.startswith((f"{NOTEBOOKS}/", f"{FOLDER}/")):
         return markdown
     if page.file.src_uri.count("/"):  # a page from a folder beside docs/: its links stay there
         return _LINK.sub(r"#", markdown)
@@ -69,4 +72,6 @@ def _beyond(text: str) -> Iterator[str]:
 def _inside(path: str) -> str:
     if path.endswith(".ipynb"):
         return f"{path.removesuffix('.ipynb')}.md"
+    if path.endswith(".tsv"):
+        return site_link(path)
     return "index.md" if path == "../README.md" else path.removeprefix("../")

@@ -1,5 +1,6 @@
 """The documentation site: a build without warnings or network, read from its folder."""
 
+import html
 import os
 import re
 import subprocess
@@ -57,6 +58,21 @@ def test_pages_show_every_reason_and_setting(site):
     settings = (site / "settings.html").read_text(encoding="utf-8")
     assert "<code>topology.flag_part</code>" in settings
     assert 'id="body-split"' in (site / "reasons.html").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    "path", sorted((ROOT / "docs/validation").glob("*.tsv")), ids=lambda p: p.stem
+)
+def test_each_table_of_the_validation_is_on_the_page_of_its_suite(site, path):
+    suite, _, key = path.stem.partition("--")
+    page = (site / "validation" / f"{suite}.html").read_text(encoding="utf-8")
+    heading = page.index(f'<h2 id="{key}">')
+    end = page.index(f'href="{path.name}"', heading)
+    shown = html.unescape(re.sub(r"<[^>]+>", "", page[heading:end]))
+    cells = [cell for line in path.read_text("utf-8").splitlines() for cell in line.split("\t")]
+    missing = [cell for cell in cells if cell.replace("`", "") not in shown]
+    assert not missing
+    assert f'href="validation/{suite}.html#{key}"' in (site / "validation.html").read_text("utf-8")
 
 
 def test_notebooks_are_pages(site):
