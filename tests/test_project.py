@@ -15,7 +15,6 @@ from reference_pages import PAGES
 
 import hipsta_bids
 from hipsta_bids.errors import ExitCode
-from hipsta_bids.io.files import read_tsv
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -175,24 +174,6 @@ def test_exit_codes_are_listed():
              for code in cell.split(", ")}  # fmt: skip
     signals = {128 + 2, 128 + 15}  # SIGINT and SIGTERM, as shells report them
     assert codes == set(ExitCode) | signals
-
-
-def test_readme_says_of_accuracy_what_the_validation_found():
-    rows = read_tsv(ROOT / "docs" / "validation" / "accuracy--thickness.tsv")
-    fine = [row for row in rows if row["voxels, mm"] == "0.4 iso"]
-    assert len(fine) == 4
-    assert {row["phantom"].split()[1] for row in fine} == {"1.2", "2.0"}
-    bias, spread = ([abs(float(row[name])) for row in fine] for name in ("bias", "SD"))
-    said = README.replace("\n", " ")
-    assert f"by {min(bias):.3f} to {max(bias):.3f} mm on average" in said
-    assert f"by {min(spread):.3f} to {max(spread):.3f} mm (SD)" in said
-
-
-def test_readme_says_of_speed_what_the_page_on_scaling_does():
-    page = (ROOT / "docs" / "scaling.md").read_text(encoding="utf-8")
-    seconds = re.search(r"\| ([\d.]+) s, median of twelve \|", page)
-    assert seconds is not None
-    assert f"{seconds[1]} s of processor time per hemisphere" in README
 
 
 def test_the_figure_of_the_readme_is_small_and_licensed():

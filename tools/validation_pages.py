@@ -5,18 +5,20 @@ Both are made from what ``python -m validation`` writes into ``docs/validation``
 
 import json
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from claims import read_claims, refresh
+
 from hipsta_bids.io.files import read_tsv
-from validation.report import MET, MISSED, SUITES, Table, markdown
+from validation.report import MET, MISSED, SUITES, Cells, Table, markdown
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 #: Folder of tables, figures and their texts, below docs/; also of the appendix on the site.
 FOLDER = "validation"
-#: Begin and end of the list of suites in ``validation.md``.
-MARKS = ("<!-- Suites: written by tools/make-docs. -->", "<!-- End of suites. -->")
+#: A table in ``validation.md`` that is written from its file; ``suites`` is the list of suites.
+BLOCK = re.compile(r"(<!-- table: (?P<name>\S+) -->\n).*?(\n<!-- end -->)", re.DOTALL)
 
 Record = Mapping[str, Any]
 """What the JSON file of a suite holds."""
@@ -58,51 +60,58 @@ def _parts(record: Record) -> Iterator[str]:
     if targets:
         yield f"{record['question']}: {met} of {targets} targets are met."
     yield record["text"]
-    yield (
-        f"Measured on {record['date']} by `{record['command']}` of version {record['version']}"
-        f" (commit {record['commit']}). [All claims](../validation.md)."
-    )
+    if "command" in record:
+        yield (
+            f"Measured on {record['date']} by `{record['command']}` of version"
+            f" {record['version']} (commit {record['commit']})."
+        )
+    yield "[All claims](../validation.md)"
     for entry in record["tables"]:
         key = anchor(entry["file"])
-        _, _, table = markdown(read_table(entry)).partition("\n\n")
         yield f"## {entry['title']} {{ #{key} }}"
-        yield f"{table}\n\n[This table as TSV]({entry['file']})"
+        yield f"{_without_title(read_table(entry))}\n\n[This table as TSV]({entry['file']})"
     for entry in record["figures"]:
         yield f"![{entry['caption']}]({entry['file']})\n\n*{entry['caption']}*"
 
 
 def anchor(file: str) -> str:
     """Return the anchor of a table on its page: ``accuracy--thickness.tsv`` has ``thickness``."""
-    return Path(file).stem.partition("--")[2]
+    return Path(file).stem.rpartition("--")[2]
 
 
 def site_link(path: str) -> str:
     """Convert a link to a table below docs/ into a link to its place in the appendix."""
-    found = re.fullmatch(rf"{FOLDER}/([\w-]+?)(--[\w-]+)\.tsv", path)
-    return f"{FOLDER}/{found[1]}.md#{found[2][2:]}" if found else path
+    pages = {e["file"]: name for name, record in records().items() for e in record["tables"]}
+    file = path.removeprefix(f"{FOLDER}/")
+    return f"{FOLDER}/{pages[file]}.md#{anchor(file)}" if file in pages else path
 
 
 def claims_page() -> str:
-    """Return ``validation.md`` with the list of suites as their tables are now."""
+    """Return ``validation.md`` with its tables and numbers as their files are now."""
     text = (DOCS / "validation.md").read_text("utf-8")
-    before, _, rest = text.partition(MARKS[0])
-    _, _, after = rest.partition(MARKS[1])
-    return f"{before}{MARKS[0]}\n\n{_suites()}\n\n{MARKS[1]}{after}"
+    text = refresh(text, read_claims("docs/validation.md"))
+    return BLOCK.sub(lambda found: f"{found[1]}\n{_block(found['name'])}\n{found[3]}", text)
 
 
-def _suites() -> str:
-    lines: list[Sequence[str]] = [("suite", "targets met", "commit, date", "tables")]
-    lines.append(["---"] * len(lines[0]))
+def _block(name: str) -> str:
+    if name == "suites":
+        return _without_title(Table(title="", rows=list(_suites())))
+    return _without_title(Table(title="", rows=read_tsv(DOCS / FOLDER / name)))
+
+
+def _without_title(table: Table) -> str:
+    return markdown(table).partition("\n\n")[2]
+
+
+def _suites() -> Iterator[Cells]:
     for record in records().values():
-        met, targets = count_targets(record)
-        place = re.sub(r"[^a-z0-9]+", "-", record["title"].lower())
-        tables = [f"[{anchor(e['file'])}]({FOLDER}/{e['file']})" for e in record["tables"]]
-        lines.append(
-            (
-                f'<a id="{place}"></a>{record["title"]}',
-                f"{met} of {targets}" if targets else "no targets",
-                f"{record['commit']}, {record['date']}",
-                ", ".join(tables),
-            )
-        )
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+        if "command" in record:
+            met, targets = count_targets(record)
+            place = re.sub(r"[^a-z0-9]+", "-", record["title"].lower())
+            files = [entry["file"] for entry in record["tables"]]
+            yield {
+                "suite": f'<a id="{place}"></a>{record["title"]}',
+                "targets met": f"{met} of {targets}" if targets else "none",
+                "commit, date": f"{record['commit']}, {record['date']}",
+                "tables": ", ".join(f"[{anchor(file)}]({FOLDER}/{file})" for file in files),
+            }

@@ -9,7 +9,7 @@ from hipsta_bids.phantom import KINDS, Phantom, PhantomSpec
 from hipsta_bids.types import Decision
 from validation import cases
 from validation.cases import Case, Measured, Refusal
-from validation.report import Cells, Content, suite, table
+from validation.report import Cell, Cells, Content, suite, table
 
 SEED = 20261
 NUMBER_QUICK, NUMBER_FULL = 3, 40
@@ -69,8 +69,8 @@ def _summary(results: Results) -> Iterator[Cells | str]:
     for voxels, group in results.items():
         errors = [m.error for _, m in group if isinstance(m, Measured)]
         decisions = [m.decision for _, m in group if isinstance(m, Measured)]
-        bias = np.array([np.nanmean(error) for error in errors] or [np.nan])
-        spread = np.array([np.nanstd(error) for error in errors] or [np.nan])
+        bias = np.array([float(np.nanmean(error)) for error in errors] or [np.nan])
+        spread = np.array([float(np.nanstd(error)) for error in errors] or [np.nan])
         most, largest = TARGETS[voxels]
         yield {
             "voxels": voxels,
@@ -93,7 +93,7 @@ def _phantoms(results: Results) -> Iterator[Cells]:
     for group in results.values():
         for case, result in group:
             spec = case.spec
-            shape = {
+            shape: dict[str, Cell] = {
                 "kind": spec.kind,
                 "thickness, mm": spec.thickness,
                 "variation": f"{spec.variation:.0%} along {spec.variation_axis}",

@@ -238,20 +238,21 @@ def validate(
             reason="unknown-suite",
         )
     files.check_writable(out)
-    missed = 0
+    missed, code = 0, commit()
     for name in names or SUITES:
         suite = run_suite(name, full=full, labels=labels)
         options = (" --full" if full else "") + (" --labels BIDS_DIR" if labels else "")
-        write(suite, out, f"python -m validation --suite {name}{options}")
+        write(suite, out, f"python -m validation --suite {name}{options}", code)
         missed += suite.missed
         report(f"{suite.title}: {suite.targets - suite.missed} of {suite.targets} targets met")
     return missed
 
 
-def write(suite: Suite, out: Path, command: str) -> None:
+def write(suite: Suite, out: Path, command: str, code: str) -> None:
     """Write a suite: a table per TSV file, its figures, and their texts as JSON.
 
-    Replaces the files of this suite, and leaves those of others as they are.
+    Replaces the files of this suite, and leaves those of others as they are. ``code`` is the commit
+    that was run.
     """
     files.remove(out.glob(f"{suite.name}--*.tsv"))
     for one in suite.tables:
@@ -271,14 +272,14 @@ def write(suite: Suite, out: Path, command: str) -> None:
         "figures": [{"file": one.file, "caption": one.caption} for one in suite.pictures],
         "command": command,
         "version": __version__,
-        "commit": _commit(),
+        "commit": code,
         "date": datetime.now(UTC).date().isoformat(),
         "libraries": {"python": platform.python_version(), **libraries},
     }
     files.write_json(out / f"{suite.name}.json", texts)
 
 
-def _commit() -> str:
+def commit() -> str:
     """Return the commit of this checkout; a change that is not committed shows as ``-dirty``."""
     command = ["git", "describe", "--always", "--dirty", "--exclude", "*"]
     try:

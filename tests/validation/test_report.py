@@ -24,6 +24,7 @@ from validation.report import (
     Picture,
     Suite,
     Table,
+    commit,
     markdown,
     render,
     run_suite,
@@ -102,7 +103,7 @@ def test_a_heading_that_the_longest_row_lacks_is_refused():
 def test_a_suite_replaces_its_files_and_leaves_those_of_others(tmp_path):
     for name in ("toy--old.tsv", "toys--bias.tsv", "toys.json"):
         (tmp_path / name).write_text("before")
-    write(TOYS, tmp_path, "the command")
+    write(TOYS, tmp_path, "the command", "1234abc")
     assert {path.name for path in tmp_path.iterdir()} == {
         *("toy.json", "toy--bias.tsv", "toy.png", "toys.json", "toys--bias.tsv")
     }
@@ -114,34 +115,34 @@ def test_a_suite_replaces_its_files_and_leaves_those_of_others(tmp_path):
     record = json.loads((tmp_path / "toy.json").read_text("utf-8"))
     assert record["tables"] == [{"file": "toy--bias.tsv", "title": "Bias", "notes": "Read it so."}]
     assert record["figures"] == [{"file": "toy.png", "caption": "A falling line."}]
-    assert (record["title"], record["text"], record["command"]) == ("Toys", "Why.", "the command")
+    assert (record["title"], record["text"], record["command"]) == (
+        "Toys",
+        "Why.",
+        "the command",
+    )
     assert re.fullmatch(r"\d{4}-\d\d-\d\d", record["date"])
-    assert re.fullmatch(r"[0-9a-f]{7,40}(-dirty)?|n/a", record["commit"])
+    assert record["commit"] == "1234abc"
 
 
-def test_without_git_the_commit_is_not_known(tmp_path, monkeypatch):
+def test_the_commit_is_that_of_the_checkout_if_git_is_there(tmp_path, monkeypatch):
+    assert re.fullmatch(r"[0-9a-f]{7,40}(-dirty)?|n/a", commit())
     monkeypatch.setenv("PATH", str(tmp_path))
-    write(TOYS, tmp_path, "the command")
-    assert json.loads((tmp_path / "toy.json").read_text("utf-8"))["commit"] == "n/a"
+    assert commit() == "n/a"
 
 
 def test_every_suite_asks_something():
     assert QUESTIONS.keys() == SUITES.keys()
 
 
-@pytest.mark.parametrize("path", sorted(FOLDER.glob("*.json")), ids=lambda path: path.stem)
-def test_files_of_a_suite_are_those_that_its_record_names(path):
-    record = json.loads(path.read_text("utf-8"))
-    named = [entry["file"] for entry in (*record["tables"], *record["figures"])]
-    found = [*FOLDER.glob(f"{path.stem}--*.tsv"), *FOLDER.glob(f"{path.stem}.png")]
-    assert sorted(named) == sorted(file.name for file in found)
-    assert all(read_tsv(FOLDER / entry["file"]) for entry in record["tables"])
-
-
-def test_every_suite_has_its_files_and_no_file_is_without_a_suite():
-    assert SUITES.keys() <= {path.stem for path in FOLDER.glob("*.json")}
-    for path in FOLDER.iterdir():
-        assert (FOLDER / f"{path.stem.partition('--')[0]}.json").exists(), path.name
+def test_files_of_the_documentation_are_those_that_records_name():
+    records = {path.stem: json.loads(path.read_text("utf-8")) for path in FOLDER.glob("*.json")}
+    assert SUITES.keys() <= records.keys()
+    entries = [e for r in records.values() for e in (*r["tables"], *r["figures"])]
+    named = sorted(entry["file"] for entry in entries)
+    assert named == sorted(
+        path.name for path in FOLDER.iterdir() if path.suffix in {".tsv", ".png"}
+    )
+    assert all(read_tsv(FOLDER / name) for name in named if name.endswith(".tsv"))
 
 
 @pytest.mark.parametrize("name", SUITES)
@@ -206,7 +207,7 @@ def test_a_suite_of_which_nothing_is_measured_misses_all_targets(monkeypatch, tm
     suite = run_suite(name, full=False)
     assert suite.missed == suite.targets > 0
     # All that texts name in braces is known.
-    write(replace(suite, pictures=()), tmp_path, "the command")
+    write(replace(suite, pictures=()), tmp_path, "the command", "1234abc")
     assert not re.search(r"\{\w", (tmp_path / f"{name}.json").read_text("utf-8"))
 
 
