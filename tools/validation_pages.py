@@ -107,11 +107,11 @@ def _suites() -> Iterator[Cells]:
     for record in records().values():
         if "command" in record:
             met, targets = count_targets(record)
+            score = f"{met} of {targets}" if targets else "none"
             place = re.sub(r"[^a-z0-9]+", "-", record["title"].lower())
             files = [entry["file"] for entry in record["tables"]]
             yield {
                 "suite": f'<a id="{place}"></a>{record["title"]}',
-                "targets met": f"{met} of {targets}" if targets else "none",
-                "commit, date": f"{record['commit']}, {record['date']}",
+                "targets met; date, commit": f"{score}; {record['date']}, {record['commit']}",
                 "tables": ", ".join(f"[{anchor(file)}]({FOLDER}/{file})" for file in files),
             }
