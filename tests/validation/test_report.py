@@ -134,15 +134,16 @@ def test_every_suite_asks_something():
     assert QUESTIONS.keys() == SUITES.keys()
 
 
-def test_files_of_the_documentation_are_those_that_records_name():
+def test_files_of_the_documentation_are_those_that_records_or_pages_name():
     records = {path.stem: json.loads(path.read_text("utf-8")) for path in FOLDER.glob("*.json")}
     assert SUITES.keys() <= records.keys()
     entries = [e for r in records.values() for e in (*r["tables"], *r["figures"])]
-    named = sorted(entry["file"] for entry in entries)
-    assert named == sorted(
-        path.name for path in FOLDER.iterdir() if path.suffix in {".tsv", ".png"}
-    )
-    assert all(read_tsv(FOLDER / name) for name in named if name.endswith(".tsv"))
+    named = {entry["file"] for entry in entries}
+    found = {path.name for path in FOLDER.iterdir() if path.suffix in {".tsv", ".png"}}
+    assert named <= found
+    pages = "".join(path.read_text("utf-8") for path in FOLDER.parent.glob("*.md"))
+    assert all(f"(validation/{name})" in pages for name in found - named)
+    assert all(read_tsv(FOLDER / name) for name in found if name.endswith(".tsv"))
 
 
 @pytest.mark.parametrize("name", SUITES)
