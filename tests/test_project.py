@@ -176,61 +176,6 @@ def test_exit_codes_are_listed():
     assert codes == set(ExitCode) | signals
 
 
-def validation_table(title: str) -> list[dict[str, str]]:
-    """Rows of a table of the validation, by its title."""
-    page = (ROOT / "docs" / "validation.md").read_text(encoding="utf-8")
-    lines = page.split(f"**{title}**")[1].split("\n\n")[1].splitlines()
-    head, _, *rows = ([cell.strip() for cell in line.strip("|").split(" | ")] for line in lines)
-    return [dict(zip(head, row, strict=True)) for row in rows]
-
-
-def test_readme_has_the_accuracy_of_the_validation():
-    fine = [
-        row
-        for row in validation_table("Thickness over the whole grid, mm")
-        if row["voxels, mm"] == "0.4 iso"
-    ]
-    assert len(fine) == 4
-    bias, spread = ([abs(float(row[k])) for row in fine] for k in ("bias", "SD"))
-    readme = " ".join(README.split())
-    assert f"bias {min(bias):.3f} to {max(bias):.3f} mm" in readme
-    assert f"SD {min(spread):.3f} to {max(spread):.3f} mm on phantoms" in readme
-
-
-def test_readme_has_the_false_alarms_on_other_brains():
-    """Limits of a row marked all were set without the brain that was judged."""
-    rows = validation_table("Limits judged on brains left out")
-    fine, thick = (
-        float(row["quantile: false flags"].split("%")[0]) for row in rows if row["brain"] == "all"
-    )
-    readme = " ".join(README.split())
-    assert f"{fine:.0f} % of sound hemispheres are flagged ({thick:.0f} % with thick" in readme
-
-
-def test_readme_has_the_differences_from_other_programs():
-    left, right = (
-        float(row["bias"])
-        for row in validation_table("Thickness against HippUnfold's own, mm")
-        if row["labels"] == "HippUnfold's"
-    )
-    readme = " ".join(README.split())
-    assert f"{left:.2f} and {right:.2f} mm less than our maps of one participant" in readme
-    spread = {
-        row["variant"]: row["phantoms, SD"] for row in validation_table("One part switched off, mm")
-    }
-    assert (
-        f"error SD of {spread['all as published']} mm on phantoms, here {spread['default']} mm"
-        in readme
-    )
-
-
-def test_readme_says_of_speed_what_the_page_on_scaling_does():
-    page = (ROOT / "docs" / "scaling.md").read_text(encoding="utf-8")
-    seconds = re.search(r"\| ([\d.]+) s, median of twelve \|", page)
-    assert seconds is not None
-    assert f"{seconds[1]} s of processor time per hemisphere" in README
-
-
 def test_readme_is_short():
     words = README.split("\n## More\n")[0].split()
     assert len(words) <= 350

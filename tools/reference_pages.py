@@ -6,6 +6,8 @@ import json
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 
+from validation_pages import claims_page
+
 from hipsta_bids.cli.commands import (
     meta_parser,
     phantom_parser,
@@ -294,4 +296,5 @@ PAGES: Mapping[str, Callable[[], str]] = {
     "settings.md": settings_page,
     "reasons.md": reasons_page,
     "command-line.md": options_page,
+    "validation.md": claims_page,
 }

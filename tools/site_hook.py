@@ -1,4 +1,4 @@
-"""Hook of MkDocs: notebooks, and files that pages link to beside docs/, become pages."""
+"""Hook of MkDocs: notebooks, tables of the validation and files beside docs/ become pages."""
 
 import re
 import sys
@@ -13,6 +13,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "tools")]
 
 from notebooks import notebook_page  # noqa: E402
+from validation_pages import FOLDER, appendix, site_link  # noqa: E402
 
 #: Folder of notebooks, below docs/.
 NOTEBOOKS = "notebooks"
@@ -24,8 +25,8 @@ BESIDE = ("CONTRIBUTING.md", "CHANGELOG.md")
 #: guide, a name by the reference. Pages without a section weigh 1.
 WEIGHTS = {"Tutorials": 1.0, "Guides": 3.0, "Reference": 1.5, "Explanation": 0.5}
 
-#: Weights of other pages: lists of changes and functions, and notebooks.
-LISTS = {"CHANGELOG.md": 0.1, "CONTRIBUTING.md": 0.1, "api.md": 0.3, NOTEBOOKS: 0.5}
+#: Weights of other pages: lists of changes and functions, notebooks, tables of the validation.
+LISTS = {"CHANGELOG.md": 0.1, "CONTRIBUTING.md": 0.1, "api.md": 0.3, NOTEBOOKS: 0.5, FOLDER: 0.3}
 
 _LINK = re.compile(r"(?<=\]\()(?![a-z]+:|#)(?P<path>[^)#\s]+)")
 
@@ -51,6 +52,8 @@ def on_files(files: Files, *, config: MkDocsConfig) -> None:
         files.append(File.generated(config, page, content=f"{text}\n{link}"))
         for name, content in figures.items():
             files.append(File.generated(config, f"{NOTEBOOKS}/{name}", content=content))
+    for name, page in appendix():
+        files.append(File.generated(config, f"{FOLDER}/{name}", content=page))
 
 
 def on_page_markdown(markdown: str, *, page: Page, config: MkDocsConfig, files: Files) -> str:
@@ -62,7 +65,7 @@ def on_page_markdown(markdown: str, *, page: Page, config: MkDocsConfig, files: 
     page.meta.setdefault("search", {"boost": weight})
     if page.file.src_uri in BESIDE:
         return _LINK.sub(lambda found: found["path"].removeprefix("docs/"), markdown)
-    if page.file.src_uri.startswith(f"{NOTEBOOKS}/"):
+    if page.file.src_uri.startswith((f"{NOTEBOOKS}/", f"{FOLDER}/")):
         return markdown
     if page.file.src_uri.count("/"):  # a page from a folder beside docs/: its links stay there
         return _LINK.sub(r"#", markdown)
@@ -80,4 +83,6 @@ def _beyond(text: str) -> Iterator[str]:
 def _inside(path: str) -> str:
     if path.endswith(".ipynb"):
         return f"{path.removesuffix('.ipynb')}.md"
+    if path.endswith(".tsv"):
+        return site_link(path)
     return "index.md" if path == "../README.md" else path.removeprefix("../")

@@ -17,6 +17,8 @@ from hipsta_bids.reports import cells
 _ALPHA = 0.05  # of tests of summary measures and of models, for a word only
 _LEAST_SHARE = 0.01  # share of a map; what survives in less of it is no finding of the same rank
 _MOST_ROWS = 200  # of lists, so that pages stay small
+#: Summary measures of the thickness of the whole sheet.
+_THICKNESS = ("thickness_mean", "thickness_nodes")
 
 
 #: Columns that are never numbers.
@@ -127,6 +129,7 @@ def findings(results: GroupResults) -> Mapping[str, Any] | None:
         "tested": len(measures),
         "contrasts": measures["contrast"].nunique() if len(measures) else 0,
         "summaries": list(_summaries(results)),
+        "opposite": opposite_changes(measures),
         "classification": list(_classification(results)),
         "method": multiplicity.get("method"),
         "alpha": multiplicity.get("alpha"),
@@ -229,6 +232,33 @@ def _summaries(results: GroupResults) -> Iterator[str]:
             suffix = f", model {model}" if len(table["model"].unique()) > 1 else ""
             title = f"{cells.display_name(str(measure))}, {contrast}{suffix}"
             yield f"{title}: {'; '.join(texts)}"
+
+
+def opposite_changes(measures: pd.DataFrame) -> list[str]:
+    """List contrasts in which volume and mean thickness change in opposite directions.
+
+    Both have corrected p-values below the level, in one hemisphere or in the mean of both.
+    """
+    if not len(measures):
+        return []
+    low = measures[(measures["test"] == "t") & (measures["p_fdr"] < _ALPHA)]
+    lines = []
+    for contrast, rows in low.groupby("contrast", sort=False):
+        sides = []
+        for row in records(rows[rows["measure"].isin(_THICKNESS)]):
+            volumes = rows[(rows["measure"] == "volume") & (rows["hemi"] == row["hemi"])]
+            for volume in volumes["effect_size"][volumes["estimate"] * row["estimate"] < 0]:
+                name, d = str(row["measure"]), cells.number_text(row["effect_size"])
+                side = cells.summary_side(row["hemi"], name)
+                sides.append(f"{side}: volume d {cells.number_text(volume)}, {name} d {d}")
+        if sides:
+            lines.append(
+                f"{contrast}: volume and mean thickness change in opposite directions"
+                f" ({'; '.join(sides)}). Possible causes: labels that miss thin edges, rounded or"
+                " coarse labels, and loss of thin parts of the sheet. Check the labels of both"
+                " edges; see Validation, Thickness and loss of tissue."
+            )
+    return lines
 
 
 def _classification(results: GroupResults) -> Iterator[str]:

@@ -1,5 +1,6 @@
 """The documentation site: a build without warnings or network, read from its folder."""
 
+import html
 import json
 import os
 import re
@@ -10,8 +11,10 @@ from pathlib import Path
 
 import pytest
 from browsing import fits, one, open_page, texts, until, watched
+from validation_pages import anchor, records
 
 ROOT = Path(__file__).parents[2]
+RECORDS = records()
 
 #: What users ask, and the page that answers it.
 QUESTIONS = {
@@ -84,6 +87,20 @@ def test_pages_show_every_reason_and_setting(site):
     settings = (site / "settings.html").read_text(encoding="utf-8")
     assert "<code>topology.flag_part</code>" in settings
     assert 'id="body-split"' in (site / "reasons.html").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("name", RECORDS)
+def test_each_table_of_the_validation_is_on_the_page_of_its_suite(site, name):
+    page = (site / "validation" / f"{name}.html").read_text(encoding="utf-8")
+    for file in (entry["file"] for entry in RECORDS[name]["tables"]):
+        heading = page.index(f'<h2 id="{anchor(file)}">')
+        end = page.index(f'href="{file}"', heading)
+        shown = html.unescape(re.sub(r"<[^>]+>", "", page[heading:end]))
+        text = (ROOT / "docs" / "validation" / file).read_text(encoding="utf-8")
+        cells = [cell for line in text.splitlines() for cell in line.split("\t")]
+        assert not [cell for cell in cells if cell.replace("`", "") not in shown]
+        link = f'href="validation/{name}.html#{anchor(file)}"'
+        assert link in (site / "validation.html").read_text(encoding="utf-8")
 
 
 def test_notebooks_are_pages(site):

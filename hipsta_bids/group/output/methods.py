@@ -15,12 +15,14 @@ from hipsta_bids.group.cohort.read import LEAST_SHARE
 from hipsta_bids.group.design import settings as group_settings
 from hipsta_bids.group.output.results import Analysis
 from hipsta_bids.group.output.saved import NormsFile
+from hipsta_bids.group.output.tables import summary_tests
 from hipsta_bids.group.stats.clusters import TFCE_EXTENT, TFCE_HEIGHT
 from hipsta_bids.group.stats.exchangeability import exchange_text
 from hipsta_bids.group.stats.inference import PERMUTATIONS, control_fdr, row_blocks
 from hipsta_bids.group.stats.norms import CENTILE_FOLDS, LEVELS, SHAPE_LEVEL
 from hipsta_bids.group.stats.trials import THINNING, TrialEffect, point_level
 from hipsta_bids.protocols import EXPERIMENTAL
+from hipsta_bids.reports.group_tables import opposite_changes
 from hipsta_bids.types import PARTICIPANT
 
 REFERENCES = "# References"
@@ -122,6 +124,8 @@ def methods_text(
         paragraphs.append(_classification(analysis, settings, cite))
     if analysis.found:
         paragraphs.append(_findings(analysis))
+    opposite = opposite_changes(summary_tests(cohort, analysis, settings))
+    paragraphs += [escaped(line) for line in opposite]
     if analysis.skipped:
         points = (f"- {escaped(line)}" for line in analysis.skipped)
         paragraphs.append("\n".join(["Left out:", "", *points]))

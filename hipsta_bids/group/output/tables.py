@@ -55,7 +55,7 @@ def result_tables(
         yield from _registration_tables(cohort, analysis)
     yield from _sites(f"{prefix}sites", cohort, analysis)
     if analysis.measures:
-        yield "measures", with_fdr(_stacked(_measures(cohort, analysis)), settings)
+        yield "measures", summary_tests(cohort, analysis, settings)
         if analysis.groups is not None:
             yield "descriptives", _stacked(_descriptives(analysis))
     if len(analysis.scores):
@@ -157,6 +157,14 @@ def _profiles(cohort: Cohort, analysis: results.Analysis) -> Iterator[Columns]:
                         "mean": mean,
                         "mean_se": sd / np.sqrt(np.maximum(count, 1)),
                     }
+
+
+def summary_tests(
+    cohort: Cohort, analysis: results.Analysis, settings: GroupSettings
+) -> pd.DataFrame:
+    """Return one row per test of a summary measure; empty without any."""
+    blocks = list(_measures(cohort, analysis))
+    return with_fdr(_stacked(blocks), settings) if blocks else pd.DataFrame()
 
 
 def overview_table(discoveries: Mapping[MapKey, Discoveries]) -> pd.DataFrame:

@@ -14,6 +14,7 @@ from hipsta_bids.group.design.settings import GroupSettings
 from hipsta_bids.group.output.results import Analysis, harmonization_record
 from hipsta_bids.group.output.saved import load_effects
 from hipsta_bids.group.output.shapes import average_shapes, write_shapes
+from hipsta_bids.group.output.tables import summary_tests
 from hipsta_bids.group.output.write import draw, write_results
 from hipsta_bids.group.questions import analysis as fitting
 from hipsta_bids.group.questions import study as studies
@@ -21,6 +22,7 @@ from hipsta_bids.group.questions.exchange import SUMMARY, summarize, write_summa
 from hipsta_bids.group.questions.mixing import with_mixes
 from hipsta_bids.io import files
 from hipsta_bids.progress import tell
+from hipsta_bids.reports.group_tables import opposite_changes
 from hipsta_bids.types import PARTICIPANT
 
 
@@ -180,6 +182,7 @@ def _notes(study: studies.Study, analysis: Analysis) -> list[str]:
                 " survives, above the level; effects are widespread"
             )
     notes += fitting.unequal_spread(analysis, settings.glm)
+    notes += opposite_changes(summary_tests(study.cohort, analysis, settings))
     for hemi, registration in analysis.registrations.items():
         if not registration.converged:
             notes.append(f"hemisphere {hemi}: registration had not settled when it ended")
