@@ -25,8 +25,15 @@ BESIDE = ("CONTRIBUTING.md", "CHANGELOG.md")
 #: guide, a name by the reference. Pages without a section weigh 1.
 WEIGHTS = {"Tutorials": 1.0, "Guides": 3.0, "Reference": 1.5, "Explanation": 0.5}
 
-#: Weights of other pages: lists of changes and functions, notebooks, tables of the validation.
-LISTS = {"CHANGELOG.md": 0.1, "CONTRIBUTING.md": 0.1, "api.md": 0.3, NOTEBOOKS: 0.5, FOLDER: 0.3}
+#: Weights of other pages: long lists, notebooks, and the tables of the validation.
+LISTS = {
+    "CHANGELOG.md": 0.1,
+    "CONTRIBUTING.md": 0.1,
+    "api.md": 0.3,
+    "settings-all.md": 0.5,
+    NOTEBOOKS: 0.5,
+    FOLDER: 0.05,
+}
 
 _LINK = re.compile(r"(?<=\]\()(?![a-z]+:|#)(?P<path>[^)#\s]+)")
 

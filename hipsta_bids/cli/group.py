@@ -146,6 +146,12 @@ def _add_sheets(parser: Parser) -> None:
         "leave out: columns participant_id, perhaps session_id, hemi, protocol, region, reason",
     )
     add(
+        "--mask",
+        "MASK...",
+        "grid points that count as missing: repaired (columns that a repair touched), or a table"
+        " with x and y (numbers of nodes), perhaps participant_id, session_id, hemi",
+    )
+    add(
         "--ratings",
         "FILE.tsv",
         "ratings saved from report.html: leaves out what is rated exclude, and counts the others",
@@ -447,6 +453,7 @@ def _options(parsed: argparse.Namespace, arguments: Sequence[str]) -> "GroupOpti
         excluded=tuple(parsed.exclude_participant_label),
         sessions=tuple(parsed.session_label),
         exclude_table=parsed.exclude,
+        masks=tuple(parsed.mask or ()),
     )
     model = from_namespace(
         ModelRequest,

@@ -476,6 +476,11 @@ def describe_columns(columns: Mapping[str, Sequence[str]]) -> dict[str, dict[str
 PROVENANCE = tuple(TABLES["provenance"])
 
 
+def counts_text(counts: Mapping[str, int]) -> str:
+    """List names with their numbers of hemispheres."""
+    return ", ".join(f"{name} ({n})" for name, n in sorted(counts.items()))
+
+
 def provenance_of(record: Mapping[str, Any]) -> dict[str, str]:
     """Return where the labels of a quality record come from; ``n/a`` where it does not say."""
     entry = record.get("provenance")

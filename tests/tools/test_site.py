@@ -84,8 +84,11 @@ def test_docstrings_are_on_the_python_page(site):
 
 
 def test_pages_show_every_reason_and_setting(site):
-    settings = (site / "settings.html").read_text(encoding="utf-8")
-    assert "<code>topology.flag_part</code>" in settings
+    changed, others = (
+        (site / f"{name}.html").read_text(encoding="utf-8") for name in ("settings", "settings-all")
+    )
+    assert "<code>body.layer_rule</code>" in changed
+    assert "<code>topology.flag_part</code>" in others
     assert 'id="body-split"' in (site / "reasons.html").read_text(encoding="utf-8")
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import pandas as pd
 
-from hipsta_bids.derivatives import hemisphere
+from hipsta_bids.derivatives import dataset, hemisphere
 from hipsta_bids.derivatives.dataset import NOT_FINISHED, name_of, provenance_of, read_status
 from hipsta_bids.derivatives.names import DATASET_FILES, HemisphereName
 from hipsta_bids.errors import InputError, MissingFileError, NothingToDoError
@@ -43,6 +43,8 @@ class GroupRequest:
     exclude_qc: tuple[Condition, ...] = ()
     exclude_table: Path | None = None
     """Participants, or single sessions and hemispheres, to leave out."""
+    masks: tuple[str, ...] = ()
+    """Grid points that count as missing: ``repaired``, or tables."""
     ratings: Path | None = None
     """Ratings of hemispheres, saved from the report."""
     segmentations: tuple[Path, ...] = ()
@@ -166,11 +168,6 @@ def collect_sheets(request: GroupRequest, *, may_lack: bool = False) -> Collecti
     )
 
 
-def counts_text(counts: Mapping[str, int]) -> str:
-    """List names with their numbers of hemispheres."""
-    return ", ".join(f"{name} ({n})" for name, n in sorted(counts.items()))
-
-
 def _digest(result: hemisphere.ResultPlace) -> str | None:
     """Hash of a hemisphere's input and settings, if its record has one."""
     digest = hemisphere.read_record(result).get("input_hash")
@@ -185,7 +182,7 @@ def _several_versions(records: Sequence[SheetRecord]) -> tuple[str, ...]:
     usual = counts.most_common(1)[0][0]
     stems = [record.result.name.stem for record in records if record.version != usual]
     text = (
-        f"hemispheres were measured by several versions, {counts_text(counts)}; measure"
+        f"hemispheres were measured by several versions, {dataset.counts_text(counts)}; measure"
         f" {listed(stems, SHOWN)} with {usual}: a version may change numbers"
     )
     return (text,)
@@ -250,8 +247,8 @@ def _one_protocol(
         raise NothingToDoError(f"{request.roots[0]}: no hemisphere{request_text}; {hint}")
     if request.seg is None and len(counts) > 1:
         raise InputError(
-            f"{request.roots[0]}: hemispheres of several protocols, {counts_text(counts)}; choose"
-            " one by --seg"
+            f"{request.roots[0]}: hemispheres of several protocols,"
+            f" {dataset.counts_text(counts)}; choose one by --seg"
         )
     return request.seg or next(iter(counts))
 

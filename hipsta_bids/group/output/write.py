@@ -79,6 +79,7 @@ def write_results(
     joint: Sequence[JointMap] = (),
     region: str = "body",
     ratings: Mapping[str, int] | None = None,
+    labels: Mapping[str, list[str]],
 ) -> None:
     """Write tables, maps and text; cohorts and analyses are by surface."""
     cohort, analysis = cohorts[SHEET], analyses[SHEET]
@@ -106,6 +107,7 @@ def write_results(
     if analysis.harmonization is not None:
         parts = [one.harmonization for one in analyses.values() if one.harmonization is not None]
         if effects := results.effects_of(parts, results.digests(analysis.registrations)):
+            effects = effects.model_copy(update={"labels": dict(labels)})
             files.write_json(folder / "harmonization.json", effects.model_dump(by_alias=True))
     for surface, one in analyses.items():
         _write_surfaces(folder, cohorts[surface], one)

@@ -8,6 +8,7 @@ from typing import Any
 from hipsta_bids.derivatives import dataset
 from hipsta_bids.group.cohort import collect
 from hipsta_bids.group.cohort.data import SHEET, modeled_table
+from hipsta_bids.group.cohort.masks import mask_note
 from hipsta_bids.group.design import model as designs
 from hipsta_bids.group.design.grammar import closed_formula
 from hipsta_bids.group.design.settings import GroupSettings
@@ -62,7 +63,9 @@ def _analyze(options: studies.GroupOptions, settings: GroupSettings) -> studies.
         visits=study.time,
     )
     table = modeled_table(cohort.table, options.comparison)
-    study = with_mixes(study, table, closed_formula(model.formula).names)
+    effects = load_effects(options.harmonize_model) if options.harmonize_model else None
+    source = (effects.file, effects.labels) if effects else ("", {})
+    study = with_mixes(study, table, closed_formula(model.formula).names, source=source)
     templates = studies.read_templates(options.template, cohort)
     analysis = fitting.analyze_cohort(
         cohort,
@@ -75,7 +78,7 @@ def _analyze(options: studies.GroupOptions, settings: GroupSettings) -> studies.
         time=study.time.column if study.time else None,
         icv=study.icv,
         templates=templates,
-        site_effects=load_effects(options.harmonize_model) if options.harmonize_model else None,
+        site_effects=effects,
     )
     analyses = {
         surface: analysis
@@ -93,6 +96,9 @@ def _analyze(options: studies.GroupOptions, settings: GroupSettings) -> studies.
     exclusions = [*study.exclusions, *collect.exclude_visits(table, incomplete)]
     measures = designs.wanted_measures(options.model, options.measures)
     notes = [*study.notes, *_notes(study, analysis)]
+    if study.masked is not None:
+        shares = study.masked[study.masked["visit"].isin(cohort.table.index)]
+        notes.append(mask_note(shares, cohort.table[groups.column] if groups else None))
     summary = _summary(study, analysis, notes)
     tell("average surfaces")
     shapes = average_shapes(study.collection.records, cohort, analysis, settings.shapes)
@@ -111,6 +117,7 @@ def _analyze(options: studies.GroupOptions, settings: GroupSettings) -> studies.
             joint=tested,
             region=options.sheets.region,
             ratings=study.collection.ratings,
+            labels=study.labels,
         )
         files.write_json(folder / "model.json", document)
         if summary is not None:
@@ -143,6 +150,7 @@ def _summary(study: studies.Study, analysis: Analysis, notes: list[str]) -> dict
             "versions": list(collection.versions),
             "seg": collection.records[0].result.name.seg if collection.records else "none",
             "region": options.sheets.region,
+            "labels": study.labels,
             "settings_hash": collection.settings_hash,
         },
     )

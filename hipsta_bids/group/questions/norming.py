@@ -90,7 +90,7 @@ def run_norms(
         study, studies.read_templates(options.template, study.cohort)
     )
     tell("norms")
-    file = file.model_copy(update={"template": template})
+    file = file.model_copy(update={"template": template, "labels": dict(study.labels)})
     norms, tables["coverage"] = _fit(values, people, file, settings.norms)
     n_sites = len(file.sites)
     scoring = _Made(None, None, file, norms, people, cohorts, values, tables, n_sites)
@@ -123,7 +123,7 @@ def _score_people(
     if not people.known.any():
         reasons = "; ".join(dict.fromkeys(message for _, message in study.left_out.values()))
         raise ModelError(f"{path}: nobody here can be scored: {reasons}")
-    study = with_mixes(study, table[people.known], (file.age,))
+    study = with_mixes(study, table[people.known], (file.age,), source=(path, file.labels))
     controls_kept = studies.members(table, controls, "--controls")
     references = controls_kept & (controls is not None) & ~repeated.to_numpy()
     file = _with_new_sites(study, path, file, people, references, controls=controls)

@@ -15,6 +15,7 @@ from hipsta_bids.errors import ModelError
 from hipsta_bids.group.cohort import collect, external, read
 from hipsta_bids.group.cohort.covariates import add_icv, add_time, read_covariates, spelled_note
 from hipsta_bids.group.cohort.data import SHEET, Cohort, Measures, choose_visits
+from hipsta_bids.group.cohort.masks import mask_sheets
 from hipsta_bids.group.design import model as designs
 from hipsta_bids.group.design.formula import ascii_letters, check_names, listed, with_factors
 from hipsta_bids.group.design.settings import GroupSettings
@@ -112,8 +113,12 @@ class Study:
     """Column and level of the participants; all without."""
     left_out: dict[str, tuple[str, str]] = field(default_factory=dict)
     """Reason and message by further visits that are left out."""
+    masked: pd.DataFrame | None = None
+    """Visit, side and share of masked points of each sheet, if a mask is asked for."""
     mixes: tuple[str, ...] = ()
     """In what hemispheres differ, as far as the settings allow it, one line each."""
+    labels: Mapping[str, list[str]] = field(default_factory=dict)
+    """Values of each field of provenance of their labels."""
 
     @property
     def cohort(self) -> Cohort:
@@ -258,8 +263,14 @@ def read_study(
     requests = external.map_patterns(options.maps, options.surfaces, reserved)
     requested = designs.wanted_measures(options.model, options.measures)
     measures = read.choose_measures(requested, collection.records, [one.name for one in requests])
+    covariate_maps = designs.covariate_maps(options.model)
+    if covariate_maps:
+        known_maps = [one.name for one in requests]
+        found_maps = read.choose_measures(covariate_maps, collection.records, known_maps)
+        if found_maps.summaries:
+            raise ModelError(f"map({found_maps.summaries[0]}) in the formula: it is no map")
     files_of, visits = external.find_all(
-        [one for one in requests if one.name in measures.maps],
+        [one for one in requests if one.name in {*measures.maps, *covariate_maps}],
         options.bids_dir,
         read.visits_of(collection.records),
         collect.wanted_by(options.sheets),
@@ -268,14 +279,24 @@ def read_study(
     sheets = read.read_sheets(
         collection.records,
         collection.grid,
-        [name for name in measures.maps if name not in names],
+        [name for name in dict.fromkeys((*measures.maps, *covariate_maps)) if name not in names],
         visits,
         max_gap=settings.registration.max_gap,
     )
     sheets, surfaces, map_notes = external.add_external(sheets, files_of, visits)
+    if covariate_maps and surfaces:
+        raise ModelError(
+            f"maps {listed(surfaces)} are not on the grid of the sheet, where map() in the formula"
+            " is; leave one out"
+        )
     measured, volume_notes = external.add_volumes(
         sheets, collection.records, options.volumes, options.bids_dir
     )
+    mask_notes: list[str] = []
+    masked = None
+    if options.sheets.masks:
+        records = collection.records
+        measured, masked, mask_notes = mask_sheets(measured, records, options.sheets.masks)
     read.check_summaries(measures, measured.sides)
     covariates, absent, spelled = read_covariates(
         measured.table, options.bids_dir, options.covariates, settings
@@ -320,7 +341,11 @@ def read_study(
             *measured.damaged,
             *collect.exclude_visits(measured.table, reasons_of),
         ),
-        notes=(*collection.notes, *map_notes, *volume_notes, *_damaged(measured), *table_notes),
+        notes=(
+            *(*collection.notes, *map_notes, *mask_notes, *volume_notes),
+            *(*_damaged(measured), *table_notes),
+        ),
+        masked=masked,
         absent=absent,
         among=among,
     )

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.linalg import null_space, orth
 
 from hipsta_bids.errors import ModelError
-from hipsta_bids.group.design.formula import Contrast
+from hipsta_bids.group.design.contrasts import Contrast
 from hipsta_bids.group.stats.arrays import Bool, Float, Int
 
 #: ``whole`` exchanges participants with all their visits, ``within`` the visits of each, ``flip``

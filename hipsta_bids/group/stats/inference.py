@@ -11,7 +11,8 @@ from scipy import special
 from statsmodels.stats.multitest import multipletests
 
 from hipsta_bids.errors import ModelError
-from hipsta_bids.group.design.formula import Contrast, check_names, listed
+from hipsta_bids.group.design.contrasts import Contrast
+from hipsta_bids.group.design.formula import check_names, listed
 from hipsta_bids.group.design.settings import GlmSettings, MultiplicitySettings
 from hipsta_bids.group.stats import exchangeability
 from hipsta_bids.group.stats.arrays import Bool, Float, Int

@@ -16,7 +16,7 @@ from small_cohorts import GROUPS, NODES, PLAN, place_of, table, write_dataset
 from hipsta_bids.cli.main import main
 from hipsta_bids.group.cohort import read
 from hipsta_bids.group.cohort.collect import GroupRequest
-from hipsta_bids.group.design.formula import Contrast
+from hipsta_bids.group.design.contrasts import Contrast
 from hipsta_bids.group.design.model import ModelRequest
 from hipsta_bids.group.design.settings import GlmSettings
 from hipsta_bids.group.output import write

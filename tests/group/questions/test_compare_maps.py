@@ -28,7 +28,7 @@ from small_cohorts import (
 )
 
 from hipsta_bids.cli.main import main
-from hipsta_bids.group.design.formula import Contrast
+from hipsta_bids.group.design.contrasts import Contrast
 from hipsta_bids.group.design.settings import GlmSettings
 from hipsta_bids.group.output import write
 from hipsta_bids.group.stats.glm import fit_points

@@ -21,7 +21,8 @@ from small_cohorts import (
 
 from hipsta_bids.cli.main import main
 from hipsta_bids.group.cohort.data import Cohort, Measures
-from hipsta_bids.group.design.formula import Contrast, model_from_shortcut, parse_model
+from hipsta_bids.group.design.contrasts import Contrast
+from hipsta_bids.group.design.formula import model_from_shortcut, parse_model
 from hipsta_bids.group.design.model import Comparison
 from hipsta_bids.group.design.settings import GlmSettings, GroupSettings
 from hipsta_bids.group.output import write

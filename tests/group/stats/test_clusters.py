@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from hipsta_bids.group.design.formula import Contrast
+from hipsta_bids.group.design.contrasts import Contrast
 from hipsta_bids.group.design.settings import GlmSettings, MultiplicitySettings
 from hipsta_bids.group.output.columns import Frame, find_clusters, peak_table
 from hipsta_bids.group.stats import clusters

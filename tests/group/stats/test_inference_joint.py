@@ -7,7 +7,7 @@ from scipy import stats
 from small_cohorts import table, write_dataset
 
 from hipsta_bids.cli.main import main
-from hipsta_bids.group.design.formula import Contrast
+from hipsta_bids.group.design.contrasts import Contrast
 from hipsta_bids.group.design.settings import GlmSettings, MultiplicitySettings
 from hipsta_bids.group.output import write
 from hipsta_bids.group.stats.clusters import sheet_edges
