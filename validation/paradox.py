@@ -1,18 +1,12 @@
-"""What losses of tissue and errors of labels do to thickness, volume and surface area.
+"""What losses of tissue and errors of labels do to thickness, volume and surface area."""
 
-``python -m validation.paradox FILE.tsv`` measures all cases and writes the absolute values.
-"""
-
-import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy import ndimage
 
-from hipsta_bids.io import files
 from hipsta_bids.phantom import Phantom, PhantomSpec, Thinning
 from hipsta_bids.protocols.protocol import Part, Tissue
 from hipsta_bids.settings import PUBLISHED, Settings
@@ -271,23 +265,11 @@ Results = Mapping[Loss, Sequence[Sizes | cases.Refusal]]
 def run(full: bool) -> Iterator[Content]:
     """Measure all losses in the same poses."""
     poses = POSES_FULL if full else POSES_QUICK
-    results = measure_losses(LOSSES, poses)
+    trials = {loss: [Trial(loss=loss, pose=pose) for pose in range(poses)] for loss in LOSSES}
+    results = cases.run_groups(measure_trial, trials)
     yield _changes(results)
+    yield _values(results)
     yield {"poses": poses, "edges": (WALL - MEDIAL_EDGE[0], WALL - LATERAL_EDGE[0])}
-
-
-def measure_losses(losses: Sequence[Loss], poses: int) -> Results:
-    """Measure losses in some poses."""
-    groups = {loss: [Trial(loss=loss, pose=pose) for pose in range(poses)] for loss in losses}
-    return cases.run_groups(measure_trial, groups)
-
-
-#: Columns of the file; numbers of the measured ones are means over poses.
-COLUMNS = (
-    *("loss", "kind", "strength", "strength_unit", "n_poses", "n_refused", "n_flagged"),
-    *("true_thickness_mm", "thickness_area_mm", "thickness_nodes_mm", "thickness_published_mm"),
-    *("true_volume_mm3", "volume_mm3", "true_area_mm2", "area_mm2", "volume_per_area_mm"),
-)
 
 
 def average(loss: Loss, group: Sequence[Sizes | cases.Refusal]) -> dict[str, str | float]:
@@ -366,19 +348,13 @@ def _signed(value: float) -> Cell:
     return None if np.isnan(value) else f"{round(value, 1) + 0.0:+.1f}"  # no -0.0
 
 
-def write(path: Path, results: Results) -> None:
-    """Write the absolute values of all losses."""
-    rows = [average(loss, group) for loss, group in results.items()]
-    files.write_tsv(
-        path, list(COLUMNS), [[_spelled(row[name]) for name in COLUMNS] for row in rows]
-    )
+@table("paradox.values")
+def _values(results: Results) -> Iterator[Cells]:
+    for loss, group in results.items():
+        yield {name: _spelled(value) for name, value in average(loss, group).items()}
 
 
-def _spelled(value: str | float) -> str:
+def _spelled(value: str | float) -> Cell:
     if isinstance(value, float):
-        return files.MISSING if np.isnan(value) else f"{value:.5g}"
-    return str(value)
-
-
-if __name__ == "__main__":
-    write(Path(sys.argv[1]), measure_losses(LOSSES, POSES_FULL))
+        return None if np.isnan(value) else f"{value:.5g}"
+    return value

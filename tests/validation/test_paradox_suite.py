@@ -1,6 +1,5 @@
-"""The suite on thickness and loss of tissue: its labels, its table and its file."""
+"""The suite on thickness and loss of tissue: its labels and its tables."""
 
-import csv
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -8,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hipsta_bids.io.files import read_tsv
 from hipsta_bids.phantom import Phantom
 from validation import paradox
 from validation.cases import Refusal
@@ -127,21 +127,16 @@ def test_a_case_that_is_refused_has_no_numbers():
     assert row["rises as volume falls"] is None
 
 
-def test_the_file_has_a_row_per_loss_and_missing_values(tmp_path):
-    path = tmp_path / "paradox.tsv"
+def test_values_have_a_row_per_loss_and_missing_values():
     other = replace(loss("larger voxels"), name="other")
-    paradox.write(path, {SOUND: [sizes()], other: [Refusal(reason="r", message="m")]})
-    with path.open(newline="") as file:
-        rows = list(csv.DictReader(file, delimiter="\t"))
-    assert list(rows[0]) == list(paradox.COLUMNS)
+    rows = paradox._values({SOUND: [sizes()], other: [Refusal(reason="r", message="m")]}).rows
     assert rows[0]["thickness_area_mm"] == "1.8"
-    assert rows[1]["volume_mm3"] == "n/a"
-    assert rows[1]["n_refused"] == "1"
+    assert rows[1]["volume_mm3"] is None
+    assert rows[1]["n_refused"] == 1
 
 
-def test_the_stored_file_is_of_these_losses():
-    with (DOCS / "validation" / "paradox.tsv").open(newline="") as file:
-        rows = list(csv.DictReader(file, delimiter="\t"))
+def test_the_stored_values_are_of_these_losses():
+    rows = read_tsv(DOCS / "validation" / "paradox--values.tsv")
     assert all(re.fullmatch(r"[a-z0-9_]+", name) for name in rows[0])
     assert [(row["loss"], float(row["strength"])) for row in rows] == [
         (one.name, one.strength) for one in LOSSES
