@@ -170,14 +170,15 @@ def test_the_sentences_of_the_phantom_tutorial_say_what_came_out(study):
     beside = [int((signs[~where] > 0).sum()) for signs in (left, right)]
     near = ndimage.binary_dilation(where, np.ones((3, 3)), iterations=2)
     assert not any((signs[~near] > 0).any() for signs in (left, right))
-    assert inside[0] == where.sum() == int(THINNED)
+    assert where.sum() == int(THINNED)
+    assert min(inside) > 0.9 * where.sum()
     assert (
-        f"The planted region has {THINNED} points (`phantom_effect.tsv`). The analysis found all of"
-        f" them on the left and {inside[1]} on the right." in page
+        f"The planted region has {THINNED} points (`phantom_effect.tsv`). The analysis found"
+        f" {inside[0]} of them on the left and {inside[1]} on the right." in page
     )
     assert f"A further {beside[0]} and {beside[1]} points lie within two nodes of its" in page
     measures = table(folder / "measures.tsv").set_index(["measure", "hemi"]).p
-    assert f"(left: p = {measures['thickness_mean', 'L']:.2f})" in page
+    assert f"(left: p = {measures['thickness_mean', 'L']:.2f};" in page
     assert f"on the left (p = {measures['thickness_mean_CA1', 'L']:.3f})" in page
     assert f"on the right (p = {measures['thickness_mean_CA1', 'R']:.2f})" in page
     assert f"{int((right < 0).sum())} points survive where patients are thicker" in page
