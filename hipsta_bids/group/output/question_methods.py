@@ -43,14 +43,14 @@ def norms_text(
         first += f" Sheets were registered to {template} by curvature profiles {cite('registr')}."
     sexes = " sex and" if file.sexes else ""
     model = (
-        "At each point and for each summary measure, the mean was modeled by a natural cubic spline"
-        f" of age ({len(file.knots)} knots) and constants for{sexes} site. The logarithm of the"
+        "The mean at each point, and of each summary measure, was a natural cubic spline of age"
+        f" ({len(file.knots)} knots) with constants for{sexes} site. The logarithm of the"
         f" standard deviation was linear in age, with a constant for each site {cite('gamlss')}."
         f" Where a likelihood-ratio test rejected normality (p < {SHAPE_LEVEL:g}), residuals had a"
         f" sinh-arcsinh distribution {cite('shash')}, as in warped normative models"
-        f" {cite('warped')}. Deviations (z) are normal quantiles of the probability of a value by"
-        " Student's distribution, which allows for the uncertainty of the shift and scale of each"
-        " site."
+        f" {cite('warped')}. Deviations (z) are normal quantiles of the probability of a value."
+        " This probability was Student's, which allows for the uncertainty of the shift and scale"
+        " of each site."
     )
     paragraphs = [first, model]
     if coverage is not None:
@@ -102,16 +102,16 @@ def power_text(
             " their earlier visits are analyzed."
         )
     return (
-        f"Sample sizes are for a trial with two arms of equal size in which {question}, with a"
-        f" power of {plan.power:g}.{dropout} {end} Means, changes and variances were estimated from"
-        f" {source(cite)}. Power was computed for Student's two-sided t test by the non-central t"
-        f" distribution. The level was {plan.alpha:g} for summary measures, without correction,"
-        " because a trial has one primary end point. At single points the level was"
+        f"Sample sizes are for a trial with two arms of equal size and a power of {plan.power:g}."
+        f" In this trial, {question}.{dropout} {end} Means, changes and variances were estimated"
+        f" from {source(cite)}. Power was computed for Student's two-sided t test, by the"
+        f" non-central t distribution. The level was {plan.alpha:g} for summary measures, without"
+        " correction, because a trial has one primary end point. At single points the level was"
         f" {point_level(rules, plan):.2g}. At this level, {PROCEDURES[rules.method]}"
-        f" {cite(rules.method)} controls the false discovery rate at {rules.alpha:g}, if"
-        f" {100 * plan.affected:g} % of the points differ and are found with this power on average"
-        f" {cite('jung')} {cite('liu')}. If the measure with the smallest sample size is selected"
-        " among many, its sample size is underestimated on average."
+        f" {cite(rules.method)} controls the false discovery rate at {rules.alpha:g}. This assumes"
+        f" that {100 * plan.affected:g} % of the points differ and are found with this power on"
+        f" average {cite('jung')} {cite('liu')}. If the measure with the smallest sample size is"
+        " selected among many, its sample size is underestimated on average."
     )
 
 

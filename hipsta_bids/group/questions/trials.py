@@ -405,12 +405,15 @@ def _methods(
     """Describe what was done, with the works it rests on."""
     settings, cite = study.settings, Citations()
     among = f" ({escaped(' '.join(study.among))})" if study.among else ""
-    first = (
-        f"Measures of the hippocampal body {cite('method')} of {visits[PARTICIPANT].nunique()}"
-        f" participants{among} with {len(visits)} visits were analyzed with hipsta_bids"
-        f" {__version__}."
-    )
     surfaces = dict.fromkeys(result.layer.surface for result in results)
+    external = [name for name in surfaces if name not in {SHEET, SUMMARY}]
+    subject = f"Maps of {', '.join(external)}"
+    if len(external) < len(surfaces):
+        subject = f"Measures of the hippocampal body {cite('method')}"
+    first = (
+        f"{subject} of {visits[PARTICIPANT].nunique()} participants{among} with"
+        f" {len(visits)} visits were analyzed with hipsta_bids {__version__}."
+    )
     if SHEET in surfaces and settings.registration.align != "none":
         first += (
             f" Sheets of each session were registered by their curvature profiles"
@@ -418,7 +421,7 @@ def _methods(
         )
     elif SHEET in surfaces:
         first += " Sheets were not registered to each other."
-    if external := [name for name in surfaces if name not in {SHEET, SUMMARY}]:
+    if external:
         first += (
             f" Maps of other programs ({', '.join(external)}) were analyzed without registration."
         )

@@ -168,7 +168,7 @@ def test_sample_size_of_slowing_among_patients_draws_a_map(dataset):
     assert ticks == sorted({*ticks} & {20, 30, 50, 100, 200, 300, 500, 1000, 2000, 3000, 5000})
     assert per_arm.min() <= ticks[0] < ticks[-1] <= per_arm.max()
     text = (folder / "methods.md").read_text()
-    assert "treatment prevents 25 % of the change over time, with a power of 0.9" in text
+    assert "a power of 0.9. In this trial, treatment prevents 25 % of the change over time." in text
     assert "`time + age_first + sex`" in text
     page = group_page(folder)
     assert "Visits: months 0, 12, 24" in page
