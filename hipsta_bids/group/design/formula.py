@@ -58,6 +58,11 @@ class ModelSpec:
     maps: tuple[str, ...] = ()
     """Maps that are covariates at each point, as ``map(curvature)`` in the formula."""
 
+    @property
+    def text(self) -> str:
+        """Right-hand side with the maps."""
+        return " + ".join([self.formula, *(f"map({name})" for name in self.maps)])
+
 
 def model_from_shortcut(formula: str, contrasts: Sequence[str], name: str) -> dict[str, Any]:
     """Write the BIDS Stats Model that says the same as a formula and contrasts."""

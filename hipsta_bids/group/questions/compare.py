@@ -213,7 +213,7 @@ def _record(analysis: Analysis, ratings: Mapping[str, int] | None) -> dict[str, 
         if analysis.harmonization is None
         else harmonization_record(analysis.harmonization, analysis.groups),
         "measures": {"maps": analysis.measured.maps, "summaries": analysis.measured.summaries},
-        "formula": analysis.model.formula,
+        "formula": analysis.model.text,
         "columns": analysis.design.columns,
         "references": analysis.design.references,
         "contrasts": {c.name: c.weights.tolist() for c in analysis.design.contrasts},

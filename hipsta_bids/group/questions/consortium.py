@@ -22,7 +22,7 @@ from hipsta_bids.group.output.tables import META_COLUMNS
 from hipsta_bids.group.questions.exchange import SiteSummary, read_summary, shown_counts
 from hipsta_bids.group.questions.sites import Meta, analyze_sites, check_agreement, meta_tables
 from hipsta_bids.group.stats.arrays import SideMaps
-from hipsta_bids.group.stats.glm import FittedMaps, PointTest
+from hipsta_bids.group.stats.glm import MEAN, FittedMaps, PointTest
 from hipsta_bids.group.stats.inference import PERMUTATIONS
 from hipsta_bids.group.stats.meta import FIXED, RANDOM
 from hipsta_bids.io import files
@@ -193,7 +193,7 @@ def _record(
 
 
 def _methods(meta: Meta) -> str:
-    """Word what was done and what came out."""
+    """Return what was done and what was found."""
     rules, sites = meta.settings.meta, meta.sites
     cite = Citations()
     counts = Counter[str]()
@@ -207,54 +207,60 @@ def _methods(meta: Meta) -> str:
         else "All sites registered their maps to one template of curvature profiles (hash"
         f" {sites[0].template_hash})."
     )
+    method_text = cite("method")
+    if sites[0].template is not None:
+        aligned += f" Registration used monotone B-spline warps {cite('registr')}."
     joint = rules.model == "joint"
-    fixed = "The fixed effect is the mean of the sites' estimates, weighted by inverse variances."
+    fixed = "The fixed effect was the mean of the sites' estimates, weighted by inverse variances."
     if joint:
         fixed = (
-            "The fixed effect is that of the model of all participants with a constant per site,"
-            f" from the sites' coefficients and their covariances {cite('join')}; contrasts that"
-            " include the constant are combined by inverse variances."
+            "The fixed effect was estimated in the model of all participants with a constant per"
+            f" site, from the sites' coefficients and their covariances {cite('join')}."
         )
+        if any(item.contrast == MEAN for item in meta.items):
+            fixed += " Means, which include the constant, were combined by inverse variances."
     if rules.random == "dl":
-        random = f"the moments of DerSimonian and Laird {cite('dl')}, tests are normal"
+        random = (
+            f"estimated by the moments of DerSimonian and Laird {cite('dl')}. Tests used the normal"
+            " distribution."
+        )
     elif joint:
         random = (
-            f"restricted maximum likelihood {cite('reml')} in the same model with a random slope of"
-            " the site, tests and limits are those of t with one degree of freedom less than there"
-            " are sites"
+            f"estimated by restricted maximum likelihood {cite('reml')} in the same model with a"
+            " random slope of the site. Tests and limits used t, with one degree of freedom less"
+            " than the number of sites."
         )
     else:
         random = (
-            f"restricted maximum likelihood {cite('reml')}, tests and limits are those of Knapp and"
-            f" Hartung {cite('knapp-hartung')}, with standard errors not smaller than without their"
-            f" correction {cite('modified')}"
+            f"estimated by restricted maximum likelihood {cite('reml')}. Tests and limits were"
+            f" those of Knapp and Hartung {cite('knapp-hartung')}, with standard errors not smaller"
+            f" than without their correction {cite('modified')}."
         )
     measure_text = (
-        f"Measures of the hippocampus {cite('method')} of {meta.people} participants{groups} at"
-        f" {len(sites)} sites were combined with hipsta_bids {__version__}; no values of"
-        f" participants left a site. Each site fitted the linear model"
+        f"Measures of the hippocampal body {method_text} of {meta.people} participants{groups} at"
+        f" {len(sites)} sites were combined with hipsta_bids {__version__}. No value of a"
+        f" participant left its site. Each site fitted the linear model"
         f" {code(sites[0].models[0].formula)} at each point of the sheet and to each summary"
         " measure."
     )
     effects = (
-        f"{fixed} In the random-effects model, true effects differ between sites; their variance"
-        f" (tau²) was estimated by {random}. Heterogeneity is described by Cochran's Q and I²"
-        f" {cite('i2')}, and by limits of the effect at a further site {cite('prediction')}."
+        f"{fixed} In the random-effects model, true effects differ between sites. Their variance"
+        f" (tau²) was {random} Heterogeneity was described by Cochran's Q, by I² {cite('i2')}, and"
+        f" by limits of the effect at a further site {cite('prediction')}."
     )
     if meta.items[0].result.without:
-        effects += " All was repeated without each of the sites."
+        effects += " All analyses were repeated without each site."
     errors = (
-        f"{discovery_text(meta.settings.multiplicity, cite)}, and for all summary measures of a"
-        " contrast together. Effect sizes are Cohen's d: the estimate over"
-        f" the residual standard deviation within sites, with {rules.confidence:.0%} confidence"
-        " limits."
+        f"{discovery_text(meta.settings.multiplicity, cite)}, and over all summary measures of a"
+        " contrast. Effect sizes are Cohen's d: the estimate divided by the residual standard"
+        f" deviation within sites, with {rules.confidence:.0%} confidence limits."
     )
     paragraphs = [f"{measure_text} {aligned}", effects, errors]
     survivors = [
-        f"{key.measure}, {key.contrast}, {key.hemi}: {int(found.rejected.sum())} of"
+        f"- {escaped(f'{key.measure}, {key.contrast}, {key.hemi}')}: {int(found.rejected.sum())} of"
         f" {found.n_tests} points"
         for key, found in meta.found.items()
     ]
     if survivors:
-        paragraphs.append(f"Points that survive: {escaped('; '.join(survivors))}.")
+        paragraphs.append("\n".join(["Significant points after correction:", "", *survivors]))
     return cite.page(paragraphs, sites[0].region)

@@ -19,8 +19,9 @@ from hipsta_bids.group.design.model import BOTH, FIRST_AGE, Comparison
 from hipsta_bids.group.design.settings import GroupSettings, NormSettings
 from hipsta_bids.group.output import write
 from hipsta_bids.group.output.figures import Drawing, deviation_rows, draw_norms, norm_rows
-from hipsta_bids.group.output.methods import escaped, norms_text
+from hipsta_bids.group.output.methods import escaped
 from hipsta_bids.group.output.panels import draw_pages
+from hipsta_bids.group.output.question_methods import norms_text
 from hipsta_bids.group.output.results import ScoredMaps
 from hipsta_bids.group.output.saved import NormsFile, load_norms, save_norms, templates_from_json
 from hipsta_bids.group.questions import study as studies

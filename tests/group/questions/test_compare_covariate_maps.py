@@ -54,6 +54,10 @@ def test_a_map_is_a_covariate_at_each_point(study):
             assert found[name]["estimate"][point] == pytest.approx(estimate, rel=1e-5), name
         assert found["MapCurvature"]["p"][point] == pytest.approx(fit.pvalues.iloc[2], rel=1e-4)
     assert not (folder / "summaries.tsv").exists()
+    methods = (folder / "methods.md").read_text()
+    assert "`group + map(curvature)`, was fitted" in methods
+    assert "Casanova R" in methods
+    assert record["formula"] == "group + map(curvature)"
     notes = "\n".join(record["notes"])
     assert "summary measures are not tested: map(curvature) has values at points only" in notes
 

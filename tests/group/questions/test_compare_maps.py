@@ -166,7 +166,8 @@ def test_results_without_sheets_are_complete(alone):
     assert any("30 L, 29 R of 30 visits, 160, 140 points" in note for note in record["notes"])
     text = (alone / "methods.md").read_text()
     assert "without registration" in text
-    assert "map of hipp" in text
+    assert f"Maps of hipp of {COUNT} participants were analyzed" in text
+    assert "Diers K" not in text  # whose sheets are not among the maps
     surface = nib.load(alone / "hemi-L_space-hipp_midthickness.surf.gii")
     assert surface.darrays[0].data.shape == (160, 3)
     shape = nib.load(alone / "hemi-L_contrast-CNAD_stat-t_desc-hipp_statmap.shape.gii")
