@@ -37,7 +37,7 @@ def dataset(tmp_path_factory):
 @pytest.fixture(scope="module")
 def results(dataset, quick):
     data, out = dataset
-    assert main([str(data), str(out), "group", *quick]) == 0
+    assert main([str(data), str(out), "group", *quick, "--figures"]) == 0
     return out / "group" / MODEL
 
 
@@ -357,7 +357,7 @@ def test_figures_are_drawn_as_pictures_and_drawings(results):
 def test_same_run_gives_the_same_files(results, dataset, quick):
     data, out = dataset
     before = {path.name: path.read_bytes() for path in results.rglob("*") if path.is_file()}
-    assert main([str(data), str(out), "group", *quick]) == 0
+    assert main([str(data), str(out), "group", *quick, "--figures"]) == 0
     after = {path.name: path.read_bytes() for path in results.rglob("*") if path.is_file()}
     assert before == after
 
