@@ -295,6 +295,12 @@ def _add_reports(parser: Parser) -> None:
         "make these pages again from the results that are there, of all analyses or that of"
         " --name, and end",
     )
+    adder(group)(
+        "--figures",
+        "",
+        "also write all figures for print, as PDF and PNG (default: SVG, of what the page shows;"
+        " `hipsta-bids figure` draws one later)",
+    )
     adder(group)("-q --quiet", "", "say only what went wrong")
 
 

@@ -46,7 +46,7 @@ class Contrast:
     def __post_init__(self) -> None:
         weights = np.atleast_2d(np.array(self.weights, dtype=np.float64))
         if np.linalg.matrix_rank(weights) < weights.shape[0]:
-            raise ModelError(f"contrast {self.name!r}: a row is redundant or zero; remove it")
+            raise ModelError(f"contrast {self.name!r}: rows are redundant or zero; remove one")
         weights.flags.writeable = False
         object.__setattr__(self, "weights", weights)
 

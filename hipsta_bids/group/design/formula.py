@@ -121,7 +121,7 @@ def split_maps(formula: str) -> tuple[str, tuple[str, ...]]:
     right = formula.rpartition("~")[2]
     names = tuple(dict.fromkeys(_MAP.findall(f"+{right}")))
     plain = _MAP.sub(" ", f"+{right}")
-    if re.search(r"\bmap\s*\(", plain):
+    if re.search(r"(?<![\w.])map\s*\(", plain):
         raise ModelError(
             f"formula {right.strip()!r}: add map(NAME) to other terms, as group + map(curvature)"
         )

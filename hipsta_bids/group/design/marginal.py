@@ -58,7 +58,7 @@ class Terms:
         parts = [self._rows(name, spec.name) for name in spec.conditions]
         width = max(part.shape[1] for part in parts)
         parts = [np.pad(part, ((0, 0), (0, width - part.shape[1]))) for part in parts]
-        if len(parts) == 1:
+        if len(parts) == len(spec.weights) == 1:
             return Contrast(spec.name, parts[0] * spec.weights[0][0])
         if wide := [name for name, p in zip(spec.conditions, parts, strict=True) if len(p) > 1]:
             raise ModelError(

@@ -26,7 +26,8 @@ from hipsta_bids.group.questions.exchange import SUMMARY, summarize, write_summa
 from hipsta_bids.group.questions.mixing import with_mixes
 from hipsta_bids.io import files
 from hipsta_bids.progress import tell
-from hipsta_bids.reports.group_tables import opposite_changes
+from hipsta_bids.protocols.toml import resolve
+from hipsta_bids.reports.group_tables import GroupResults, opposite_changes
 from hipsta_bids.types import PARTICIPANT
 
 
@@ -132,8 +133,17 @@ def _analyze(options: studies.GroupOptions, settings: GroupSettings) -> studies.
         write_shapes(folder, shapes)
         if analysis.registered and study.collection.records and not shapes:
             notes.append("no average surfaces: those of the participant level are missing")
-        notes.extend(draw(folder, study.cohorts, analyses, shapes, joint=tested))
-        return _record(analysis, study.collection.ratings)
+        record = _record(analysis, study.collection.ratings)
+        saved = GroupResults(
+            folder=folder,
+            record={
+                **record,
+                "inputs": {"maps": dict(options.maps)},
+                "settings": resolve(settings),
+            },
+        )
+        notes.extend(draw(saved, study.cohorts, analyses, shapes, prints=options.figures))
+        return record
 
     return study.write_folder(
         designs.folder_name(model.formula, measures) + options.comparison.suffix,

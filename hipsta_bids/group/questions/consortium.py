@@ -15,14 +15,16 @@ from hipsta_bids.errors import OutputError, UsageError
 from hipsta_bids.group.cohort.data import Cohort
 from hipsta_bids.group.design.settings import GroupSettings
 from hipsta_bids.group.output import write
-from hipsta_bids.group.output.figures import Drawing
+from hipsta_bids.group.output.ground import grounds_of
+from hipsta_bids.group.output.maps import ContrastMap, contrasts
 from hipsta_bids.group.output.methods import Citations, code, discovery_text, escaped
-from hipsta_bids.group.output.panels import Row, contrasts, draw_pages
+from hipsta_bids.group.output.panels import Row, draw_pages
+from hipsta_bids.group.output.style import Drawing
 from hipsta_bids.group.output.tables import META_COLUMNS
 from hipsta_bids.group.questions.exchange import SiteSummary, read_summary, shown_counts
 from hipsta_bids.group.questions.sites import Meta, analyze_sites, check_agreement, meta_tables
 from hipsta_bids.group.stats.arrays import SideMaps
-from hipsta_bids.group.stats.glm import MEAN, FittedMaps, PointTest
+from hipsta_bids.group.stats.glm import MEAN, FittedMaps
 from hipsta_bids.group.stats.inference import PERMUTATIONS
 from hipsta_bids.group.stats.meta import FIXED, RANDOM
 from hipsta_bids.io import files
@@ -35,8 +37,12 @@ def run_meta(
     out_dir: Path,
     settings: GroupSettings,
     command: Sequence[str] = (),
+    *,
+    figures: bool = False,
 ) -> tuple[Path, list[str]]:
     """Combine the summaries of sites, perhaps with other names than those in them.
+
+    ``figures`` asks for figures for print, too.
 
     Returns the page and what should be known.
     """
@@ -57,7 +63,7 @@ def run_meta(
         for name, table in meta_tables(meta):
             write.write_table(scratch, name, table, described=name != "sites", meaning=META_COLUMNS)
         _write_maps(scratch, meta)
-        notes += write.write_figures(scratch, _figures(meta))
+        notes += write.write_figures(scratch, _figures(meta), prints=figures)
         files.write_text(scratch / "methods.md", _methods(meta))
         files.write_json(scratch / "meta.json", _record(meta, paths, command, notes))
     write_meta_report(out_dir)
@@ -110,17 +116,25 @@ def _cohort(meta: Meta) -> Cohort:
 def _figures(meta: Meta) -> Iterator[tuple[str, Drawing]]:
     """List figures of maps, one per measure, for :func:`write_figures`."""
     maps, cohort = list(meta.of("map")), _cohort(meta)
-    tests: dict[str, dict[str, list[PointTest]]] = {}
+    tests: dict[str, dict[str, dict[str, ContrastMap]]] = {}
     for item in maps:
         measures = tests.setdefault(item.model.hemi, {})
-        measures.setdefault(item.model.measures[0], []).extend(
-            test for _, test, _ in meta.tests(item)
-        )
-    places = {hemi: _place(meta, hemi, cohort) for hemi in tests}
+        for key, test, _ in meta.tests(item):
+            result = meta.found[key]
+            measures.setdefault(item.model.measures[0], {})[key.contrast] = ContrastMap(
+                kind=test.kind,
+                effect=test.effect,
+                statistic=test.statistic,
+                df=np.asarray(test.df, dtype=np.float64),
+                adjusted=result.adjusted,
+                rejected=result.rejected,
+                alpha=result.alpha,
+            )
+    places = grounds_of(cohort, {hemi: _place(meta, hemi, cohort) for hemi in tests})
     like = {item.label(RANDOM): item.label(FIXED) for item in maps}
     for measure in dict.fromkeys(item.model.measures[0] for item in maps):
         sides = {hemi: one for hemi, one in places.items() if measure in tests[hemi]}
-        blocks = list(contrasts(tests, meta.found, measure, like))
+        blocks = list(contrasts(tests, measure, like))
         items = [item for item in maps if item.model.measures[0] == measure]
         for number, contrast in enumerate(dict.fromkeys(item.contrast for item in items)):
             row = Row(
@@ -136,7 +150,7 @@ def _figures(meta: Meta) -> Iterator[tuple[str, Drawing]]:
                 },
             )
             blocks[2 * number + 1].append(row)
-        yield f"{measure}_maps", partial(draw_pages, cohort, sides, blocks)
+        yield f"{measure}_maps", partial(draw_pages, sides, blocks)
 
 
 def _place(meta: Meta, hemi: str, cohort: Cohort) -> FittedMaps:

@@ -63,6 +63,8 @@ class GroupOptions:
     summary."""
     reports: bool = True
     """Whether a page is made."""
+    figures: bool = False
+    """Whether figures are written for print, too, as PDF and PNG."""
     command: tuple[str, ...] = ()
     """The command line, for the record."""
 

@@ -20,10 +20,11 @@ from hipsta_bids.group.design.formula import listed, model_from_shortcut, parse_
 from hipsta_bids.group.design.settings import GroupSettings
 from hipsta_bids.group.output import write
 from hipsta_bids.group.output.columns import frame_of
-from hipsta_bids.group.output.figures import Drawing
+from hipsta_bids.group.output.ground import grounds_of
 from hipsta_bids.group.output.methods import Citations, code, escaped
 from hipsta_bids.group.output.panels import Row, draw_pages, spanned
 from hipsta_bids.group.output.question_methods import power_text, retest_text
+from hipsta_bids.group.output.style import Drawing
 from hipsta_bids.group.output.tables import entity_label
 from hipsta_bids.group.questions import study as studies
 from hipsta_bids.group.questions.mixing import with_mixes
@@ -319,7 +320,7 @@ def run_trial(
         if templates:
             files.write_json(folder / "template.json", templates)
         files.write_text(folder / "methods.md", _methods(study, source, modeled, results, effect))
-        return write.write_figures(folder, _figures(cohorts, results))
+        return write.write_figures(folder, _figures(cohorts, results), prints=options.figures)
 
     record = {
         "formula": source.spec.formula if isinstance(source, Modeled) else None,
@@ -496,7 +497,8 @@ def _figures(
             unit = cohorts[surface].units.get(measure, "1")
             if rows := list(make(sides, display_name(measure), unit)):
                 points = {hemi: r.points for hemi, r in sides.items() if r.points is not None}
-                yield f"{measure}_{question}", partial(draw_pages, cohorts[surface], points, [rows])
+                grounds = grounds_of(cohorts[surface], points)
+                yield f"{measure}_{question}", partial(draw_pages, grounds, [rows])
 
 
 def _agreement(sides: Mapping[str, Described], measure: str, unit: str) -> Iterator[Row]:

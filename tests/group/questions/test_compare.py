@@ -37,7 +37,7 @@ def dataset(tmp_path_factory):
 @pytest.fixture(scope="module")
 def results(dataset, quick):
     data, out = dataset
-    assert main([str(data), str(out), "group", *quick]) == 0
+    assert main([str(data), str(out), "group", *quick, "--figures"]) == 0
     return out / "group" / MODEL
 
 
@@ -146,7 +146,8 @@ def test_maps_file_is_typed_and_has_units(results):
 def test_record_and_methods_have_the_numbers(results, dataset, quick):
     record = json.loads((results / "analysis.json").read_text())
     data, out = dataset
-    assert record["command"] == ["hipsta-bids", str(data), str(out), "group", *quick]
+    command = ["hipsta-bids", str(data), str(out), "group", *quick, "--figures"]
+    assert record["command"] == command
     assert record["participants"] == sum(PLAN.sizes)
     assert record["references"]["group"] == GROUPS[0]
     assert record["settings"]["classification"]["repeats"] == 2
@@ -361,7 +362,7 @@ def test_figures_are_drawn_as_pictures_and_drawings(results):
 def test_same_run_gives_the_same_files(results, dataset, quick):
     data, out = dataset
     before = {path.name: path.read_bytes() for path in results.rglob("*") if path.is_file()}
-    assert main([str(data), str(out), "group", *quick]) == 0
+    assert main([str(data), str(out), "group", *quick, "--figures"]) == 0
     after = {path.name: path.read_bytes() for path in results.rglob("*") if path.is_file()}
     assert before == after
 

@@ -173,7 +173,7 @@ def test_results_without_sheets_are_complete(alone):
     shape = nib.load(alone / "hemi-L_contrast-CNAD_stat-t_desc-hipp_statmap.shape.gii")
     np.testing.assert_allclose(shape.darrays[0].data, statmap(alone, "L").statistic, rtol=1e-5)
     assert not (alone / "warps.tsv").exists()
-    assert {path.stem for path in (alone / "figures").glob("*.png")} == {"hipp_maps"}
+    assert {path.stem for path in (alone / "figures").glob("*.svg")} == {"hipp_maps"}
     for path in alone.glob("*_statmap.json"):
         assert "vertex" in json.loads(path.read_text())
     page = group_page(alone)

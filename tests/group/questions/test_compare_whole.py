@@ -51,8 +51,7 @@ def only_maps(*given):
 def folder(tmp_path_factory):
     root = tmp_path_factory.mktemp("whole")
     data, out = write_dataset(root, region=REGION, plan=IN_HEAD, known=known_nodes())
-    with pytest.MonkeyPatch.context() as patch:  # figures as the page shows them alone
-        patch.setattr(figures, "_METADATA", {"svg": {"Date": None, "Creator": None}})
+    with pytest.MonkeyPatch.context() as patch:
         patch.setattr(write, "draw_figures", only_maps)
         assert main([str(data), str(out), "group", "--region", REGION, *QUICK, *EXPORT]) == 0
     return out / "group" / f"thickness_group_{REGION}"

@@ -37,7 +37,7 @@ def _only_what_counts():
     """Figures and classifiers take longer than all else."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(write, "draw_figures", lambda *_: iter(()))
-        patch.setattr(write, "write_figures", lambda *_: [])
+        patch.setattr(write, "write_figures", lambda *_, **__: [])
         patch.setattr(analysis, "classify_groups", lambda *_: ([], []))
         yield
 

@@ -81,7 +81,9 @@ def results(study, quick):
         patch.setattr(
             write,
             "draw_figures",
-            lambda cohort, analysis, _: [("sites", partial(draw_sites, cohort, analysis))],
+            lambda _, cohorts, analyses, *__: [
+                ("sites", partial(draw_sites, cohorts[""], analyses[""]))
+            ],
         )
         assert main([str(data), str(out), "group", "--harmonize", "site", *quick]) == 0
     return out / "group" / MODEL

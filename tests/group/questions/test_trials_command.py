@@ -107,7 +107,7 @@ def test_retest_registers_sheets_as_comparisons_do_and_draws_them(dataset):
     nodes = [f"node_{i + 1}" for i in range(NODES[0])]
     np.testing.assert_allclose(written[nodes], warps, atol=1e-9)
     assert (folder / "template.json").is_file()
-    assert (folder / "figures" / "thickness_retest.png").is_file()
+    assert (folder / "figures" / "thickness_retest.svg").is_file()
     page = group_page(folder)
     assert "Thickness: agreement between sessions at each point" in page
     assert page.count("data:image/svg+xml") == 1
