@@ -97,6 +97,8 @@ def test_maps_on_different_grids_are_compared_where_they_are():
     assert row["r with Hipsta"] == pytest.approx(1, abs=1e-3)
     assert row["minus Hipsta, mm"] == pytest.approx(0.05, abs=0.005)  # 0.02 per step of the grid
     assert "bias, mm" not in row
+    assert "r with Hipsta" not in compare("default", PLAIN, maps)  # nothing varies in it
+    assert compare("default", UNEVEN, maps)["r with Hipsta"] == pytest.approx(1, abs=1e-3)
     flipped = maps | {HIPSTA: Map(thickness=0.9 * (1 + u), points=points[::-1])}
     assert compare("default", None, flipped)["r with Hipsta"] < -0.9
 
@@ -206,3 +208,4 @@ def test_tables_and_their_record_are_written(tmp_path, monkeypatch):
     assert uneven["bias, mm"] == "n/a"
     (summary,) = read_tsv(out / "beside-hipsta--summary.tsv")
     assert (summary["hemispheres"], summary["failed"]) == ("2", "1")
+    assert summary["median CPU s"] == plain["CPU s"]  # failed runs end early
