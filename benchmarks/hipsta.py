@@ -375,7 +375,16 @@ def spell(name: str, value: Any) -> str:  # noqa: ANN401  (a cell)
     return f"{value:.{DIGITS.get(name, 3)}f}" if isinstance(value, float) else str(value)
 
 
-def write_tables(folder: Path, tables: Mapping[str, pd.DataFrame], command: str) -> None:
+def peer_version(command: str) -> str:
+    """Ask Hipsta for its version."""
+    done = subprocess.run(  # noqa: S603  (the user's)
+        [command, "--version"], capture_output=True, text=True, check=False
+    )
+    words = re.findall(r"\d+\.\d[\w.]*", done.stdout)
+    return words[-1] if words and done.returncode == 0 else files.MISSING
+
+
+def write_tables(folder: Path, tables: Mapping[str, pd.DataFrame], command: str, peer: str) -> None:
     """Write tables as tab-separated values, and their texts as the record of a suite."""
     entries = []
     for name, table in tables.items():
@@ -395,7 +404,7 @@ def write_tables(folder: Path, tables: Mapping[str, pd.DataFrame], command: str)
         "version": __version__,
         "commit": commit(),
         "date": datetime.now(UTC).date().isoformat(),
-        "libraries": {"python": about["python"], **about["versions"]},
+        "libraries": {"python": about["python"], "Hipsta": peer, **about["versions"]},
     }
     files.write_json(folder / "beside-hipsta.json", record)
 
@@ -428,7 +437,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         rows += measure(item, options.hipsta, options.work, options.limit)
     table = pd.DataFrame(rows, columns=list(COLUMNS))
     command = "benchmarks/hipsta.py BIDS_DIR --hipsta COMMAND --work DIR --tables DIR"
-    write_tables(options.tables, {"hemispheres": table, "summary": summarize(table)}, command)
+    tables = {"hemispheres": table, "summary": summarize(table)}
+    write_tables(options.tables, tables, command, peer_version(options.hipsta))
 
 
 if __name__ == "__main__":

@@ -189,15 +189,19 @@ def test_tables_and_their_record_are_written(tmp_path, monkeypatch):
     _, _, points = grid(PLAIN)
     write_hipsta(tmp_path / "made", points, np.full(points.shape[:2], 1.8))
     script = tmp_path / "run_hipsta"  # like Hipsta: the hemisphere and the folder are options
-    script.write_text(
-        '#!/bin/sh\ncase "$2" in *uneven*) echo "AssertionError: Check surface failed"; exit 1;; '
-        f'esac\ncp -r {tmp_path / "made"}/. "$8"\n'
-    )
+    lines = [
+        "#!/bin/sh",
+        '[ "$1" = --version ] && echo run_hipsta 9.8.7 && exit',
+        'case "$2" in *uneven*) echo "AssertionError: Check surface failed"; exit 1;; esac',
+        f'cp -r {tmp_path / "made"}/. "$8"',
+    ]
+    script.write_text("\n".join(lines) + "\n")
     script.chmod(0o755)
     out = tmp_path / "docs"
     options = ["--hipsta", str(script), "--work", str(tmp_path / "work"), "--tables", str(out)]
     hipsta.main(options)
     record = json.loads((out / "beside-hipsta.json").read_text())
+    assert record["libraries"]["Hipsta"] == "9.8.7"
     names = [entry["file"] for entry in record["tables"]]
     assert sorted(names) == sorted(file.name for file in out.glob("*.tsv"))
     plain, uneven = read_tsv(out / "beside-hipsta--hemispheres.tsv")
