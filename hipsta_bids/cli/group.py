@@ -146,6 +146,12 @@ def _add_sheets(parser: Parser) -> None:
         "leave out: columns participant_id, perhaps session_id, hemi, protocol, region, reason",
     )
     add(
+        "--mask",
+        "MASK...",
+        "grid points that count as missing: repaired (columns that a repair touched), or a table"
+        " with x and y (numbers of nodes), perhaps participant_id, session_id, hemi",
+    )
+    add(
         "--ratings",
         "FILE.tsv",
         "ratings saved from report.html: leaves out what is rated exclude, and counts the others",
@@ -259,7 +265,7 @@ def _add_methods(parser: Parser) -> None:
         "--fdr-scope",
         "",
         "what is one family of tests, for permutations too (default: map)",
-        choices=["map", "hemispheres"],
+        choices=["map", "hemispheres", "all"],
     )
     add(
         "--joint",
@@ -288,6 +294,12 @@ def _add_reports(parser: Parser) -> None:
         "",
         "make these pages again from the results that are there, of all analyses or that of"
         " --name, and end",
+    )
+    adder(group)(
+        "--figures",
+        "",
+        "also write all figures for print, as PDF and PNG (default: SVG, of what the page shows;"
+        " `hipsta-bids figure` draws one later)",
     )
     adder(group)("-q --quiet", "", "say only what went wrong")
 
@@ -447,6 +459,7 @@ def _options(parsed: argparse.Namespace, arguments: Sequence[str]) -> "GroupOpti
         excluded=tuple(parsed.exclude_participant_label),
         sessions=tuple(parsed.session_label),
         exclude_table=parsed.exclude,
+        masks=tuple(parsed.mask or ()),
     )
     model = from_namespace(
         ModelRequest,

@@ -13,6 +13,7 @@ import pandas as pd
 
 from hipsta_bids.io import files
 from hipsta_bids.reports import cells
+from hipsta_bids.types import FAMILY
 
 _ALPHA = 0.05  # of tests of summary measures and of models, for a word only
 _LEAST_SHARE = 0.01  # share of a map; what survives in less of it is no finding of the same rank
@@ -115,8 +116,8 @@ def findings(results: GroupResults) -> Mapping[str, Any] | None:
     cards.sort(key=lambda card: -card["share"])
     settings = results.record.get("settings") or {}
     multiplicity = settings.get("multiplicity") or {}
-    scope = multiplicity.get("scope")
-    family = ["measure", "contrast", *(() if scope == "hemispheres" else ("hemi",))]
+    scope = multiplicity.get("scope", "map")
+    family = list(FAMILY.get(scope, FAMILY["map"]))
     measures = results.table("measures")
     return {
         "n": len(cards),
@@ -125,7 +126,7 @@ def findings(results: GroupResults) -> Mapping[str, Any] | None:
         "none": [card for card in cards if not card["share"]],
         "least": _LEAST_SHARE,
         "families": maps[family].drop_duplicates().shape[0] if len(maps) else 0,
-        "together": scope == "hemispheres",
+        "scope": scope,
         "tested": len(measures),
         "contrasts": measures["contrast"].nunique() if len(measures) else 0,
         "summaries": list(_summaries(results)),

@@ -141,9 +141,9 @@ class MultiplicitySettings(toml.SettingsTable):
     """``fdr2`` (two-stage false discovery rate, Benjamini, Krieger and Yekutieli 2006; the
     paper's), ``bh`` (Benjamini and Hochberg 1995), or family-wise error by permutation:
     ``permutation-tfce`` (threshold-free cluster enhancement) or ``permutation-max`` (largest t)."""
-    scope: Literal["map", "hemispheres"] = "map"
-    """What is one family: each ``map`` (measure, contrast and hemisphere), or both ``hemispheres``
-    together."""
+    scope: Literal["map", "hemispheres", "all"] = "map"
+    """What is one family: each ``map`` (measure, contrast and hemisphere), both ``hemispheres``
+    together, or ``all`` maps of a contrast."""
     alpha: toml.OpenFraction = 0.05
     """False discovery rate, or family-wise error rate of permutation tests."""
     permutations: AtLeastTwo = 5000
