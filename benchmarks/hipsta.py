@@ -102,7 +102,8 @@ NOTES = f"""\
 Hipsta's thickness spans nine tenths of the wall (z from -{WALL:g} to {WALL:g} of -1 to 1), and is
 divided by {WALL:g} here; *as written* is not. Inside: without {EDGE} columns beside each edge;
 outermost: the first and the last column. The truth is that at the place of each node. Compared
-with Hipsta: our thickness at the place of our mid-surface nearest to each of its nodes.
+with Hipsta: our thickness at the place of our mid-surface nearest to each of its nodes; r only of
+walls that vary. The summary has medians and means of hemispheres with a map.
 """
 
 THREADS = {f"{name}_NUM_THREADS": "1" for name in ("OMP", "OPENBLAS", "MKL", "NUMEXPR")}
@@ -277,10 +278,13 @@ def compare(program: str, drawing: Drawing | None, maps: Mapping[str, Map]) -> d
         here = nearest_thickness(maps[program], maps[HIPSTA].points)
         row |= {
             "minus Hipsta, mm": mean(here - peer),
-            "r with Hipsta": correlation(here, peer),
             "minus Hipsta inside, mm": mean(inside(here - peer)),
-            "r with Hipsta inside": correlation(inside(here), inside(peer)),
         }
+        if drawing is None or drawing.spec.variation:  # r of a constant wall is that of errors
+            row |= {
+                "r with Hipsta": correlation(here, peer),
+                "r with Hipsta inside": correlation(inside(here), inside(peer)),
+            }
     return row
 
 
@@ -343,15 +347,16 @@ def correlation(first: Float, second: Float) -> float:
 
 
 def summarize(table: pd.DataFrame) -> pd.DataFrame:
-    """Summarize the rows of each kind of labels and program; means are over hemispheres."""
+    """Summarize the rows of each kind of labels and program; failed ones are counted alone."""
     rows = []
-    for (labels, program), group in table.groupby(["labels", "program"], sort=False):
+    for (labels, program), every in table.groupby(["labels", "program"], sort=False):
+        group = every[every["result"] != "failed"]
         rows.append(
             {
                 "labels": labels,
                 "program": program,
-                "hemispheres": len(group),
-                "failed": int((group["result"] == "failed").sum()),
+                "hemispheres": len(every),
+                "failed": len(every) - len(group),
                 "median CPU s": group["CPU s"].median(),
                 "largest CPU s": group["CPU s"].max(),
                 "median CPU s of measuring": group["CPU s of measuring"].median(),
@@ -370,7 +375,16 @@ def spell(name: str, value: Any) -> str:  # noqa: ANN401  (a cell)
     return f"{value:.{DIGITS.get(name, 3)}f}" if isinstance(value, float) else str(value)
 
 
-def write_tables(folder: Path, tables: Mapping[str, pd.DataFrame], command: str) -> None:
+def peer_version(command: str) -> str:
+    """Ask Hipsta for its version."""
+    done = subprocess.run(  # noqa: S603  (the user's)
+        [command, "--version"], capture_output=True, text=True, check=False
+    )
+    words = re.findall(r"\d+\.\d[\w.]*", done.stdout)
+    return words[-1] if words and done.returncode == 0 else files.MISSING
+
+
+def write_tables(folder: Path, tables: Mapping[str, pd.DataFrame], command: str, peer: str) -> None:
     """Write tables as tab-separated values, and their texts as the record of a suite."""
     entries = []
     for name, table in tables.items():
@@ -390,7 +404,7 @@ def write_tables(folder: Path, tables: Mapping[str, pd.DataFrame], command: str)
         "version": __version__,
         "commit": commit(),
         "date": datetime.now(UTC).date().isoformat(),
-        "libraries": {"python": about["python"], **about["versions"]},
+        "libraries": {"python": about["python"], "Hipsta": peer, **about["versions"]},
     }
     files.write_json(folder / "beside-hipsta.json", record)
 
@@ -423,7 +437,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         rows += measure(item, options.hipsta, options.work, options.limit)
     table = pd.DataFrame(rows, columns=list(COLUMNS))
     command = "benchmarks/hipsta.py BIDS_DIR --hipsta COMMAND --work DIR --tables DIR"
-    write_tables(options.tables, {"hemispheres": table, "summary": summarize(table)}, command)
+    tables = {"hemispheres": table, "summary": summarize(table)}
+    write_tables(options.tables, tables, command, peer_version(options.hipsta))
 
 
 if __name__ == "__main__":

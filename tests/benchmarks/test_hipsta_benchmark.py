@@ -97,6 +97,8 @@ def test_maps_on_different_grids_are_compared_where_they_are():
     assert row["r with Hipsta"] == pytest.approx(1, abs=1e-3)
     assert row["minus Hipsta, mm"] == pytest.approx(0.05, abs=0.005)  # 0.02 per step of the grid
     assert "bias, mm" not in row
+    assert "r with Hipsta" not in compare("default", PLAIN, maps)  # nothing varies in it
+    assert compare("default", UNEVEN, maps)["r with Hipsta"] == pytest.approx(1, abs=1e-3)
     flipped = maps | {HIPSTA: Map(thickness=0.9 * (1 + u), points=points[::-1])}
     assert compare("default", None, flipped)["r with Hipsta"] < -0.9
 
@@ -187,15 +189,19 @@ def test_tables_and_their_record_are_written(tmp_path, monkeypatch):
     _, _, points = grid(PLAIN)
     write_hipsta(tmp_path / "made", points, np.full(points.shape[:2], 1.8))
     script = tmp_path / "run_hipsta"  # like Hipsta: the hemisphere and the folder are options
-    script.write_text(
-        '#!/bin/sh\ncase "$2" in *uneven*) echo "AssertionError: Check surface failed"; exit 1;; '
-        f'esac\ncp -r {tmp_path / "made"}/. "$8"\n'
-    )
+    lines = [
+        "#!/bin/sh",
+        '[ "$1" = --version ] && echo run_hipsta 9.8.7 && exit',
+        'case "$2" in *uneven*) echo "AssertionError: Check surface failed"; exit 1;; esac',
+        f'cp -r {tmp_path / "made"}/. "$8"',
+    ]
+    script.write_text("\n".join(lines) + "\n")
     script.chmod(0o755)
     out = tmp_path / "docs"
     options = ["--hipsta", str(script), "--work", str(tmp_path / "work"), "--tables", str(out)]
     hipsta.main(options)
     record = json.loads((out / "beside-hipsta.json").read_text())
+    assert record["libraries"]["Hipsta"] == "9.8.7"
     names = [entry["file"] for entry in record["tables"]]
     assert sorted(names) == sorted(file.name for file in out.glob("*.tsv"))
     plain, uneven = read_tsv(out / "beside-hipsta--hemispheres.tsv")
@@ -206,3 +212,4 @@ def test_tables_and_their_record_are_written(tmp_path, monkeypatch):
     assert uneven["bias, mm"] == "n/a"
     (summary,) = read_tsv(out / "beside-hipsta--summary.tsv")
     assert (summary["hemispheres"], summary["failed"]) == ("2", "1")
+    assert summary["median CPU s"] == plain["CPU s"]  # failed runs end early

@@ -147,7 +147,8 @@ def test_the_command_starts_no_thread_that_would_keep_workers_from_being_forked(
     """Libraries such as pyarrow start threads when they are loaded, and pandas loads it."""
     code = (
         "import psutil; from hipsta_bids.participant.pool import pin_threads; pin_threads();"
-        "import hipsta_bids.cli.participant, hipsta_bids.participant.run, hipsta_bids.inputs.search;"
+        "import hipsta_bids.cli.participant, hipsta_bids.participant.run;"
+        "import hipsta_bids.inputs.search;"
         "print(psutil.Process().num_threads())"
     )
     command = [sys.executable, "-c", code]
