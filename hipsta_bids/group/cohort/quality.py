@@ -37,12 +37,14 @@ def quality_table(quality: pd.DataFrame, column: str) -> pd.DataFrame:
 def _rows(quality: pd.DataFrame, labels: pd.Series) -> Iterator[dict[str, object]]:
     """Return a row per value and group, of fields that vary."""
     for field, order in ORDERS.items():
-        ranks = quality[field].map(order.index)
+        # A damaged record may have any word.
+        ranks = quality[field].map({word: rank for rank, word in enumerate(order)}).dropna()
+        ranks = ranks.astype(np.int64)
         if ranks.nunique() < 2:  # noqa: PLR2004 -- all have the same value
             continue
         worst = ranks.groupby(quality[PARTICIPANT]).max()
-        group_of = labels.groupby(quality[PARTICIPANT]).first()
-        people, sheets = pd.crosstab(worst, group_of), pd.crosstab(ranks, labels)
+        group_of = labels.groupby(quality[PARTICIPANT]).first()[worst.index]
+        people, sheets = pd.crosstab(worst, group_of), pd.crosstab(ranks, labels[ranks.index])
         p = exact_p(people.to_numpy()) if min(people.shape) > 1 else np.nan
         for rank in sheets.index:
             for group in sheets.columns:

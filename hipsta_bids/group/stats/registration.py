@@ -277,7 +277,8 @@ def shift_difference(
             method="permutation-max", permutations=permutations + 1, seed=seed
         )
         (test,) = permute([part], contrast, settings=rules)
-        p = float(np.nanmin(test.p_max))
+        finite = test.p_max[np.isfinite(test.p_max)]  # none where groups leave no residuals
+        p = float(finite.min()) if len(finite) else p
     largest = float(spread[node])
     return {"difference": largest, "difference_node": node + 1, "difference_p": p}
 

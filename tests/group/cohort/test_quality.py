@@ -41,6 +41,14 @@ def test_counts_and_test_are_of_participants():
     assert "failed AD 12, CN 2" in note
 
 
+def test_words_that_are_no_decision_do_not_count():
+    rows = hemispheres(2, 12)
+    rows.loc[rows.index[-1], "decision"] = "None"
+    counts = quality_table(rows, "group").set_index(["value", "group"])["hemispheres"]
+    assert counts["use", "AD"] == 67
+    assert counts["failed", "AD"] == 12
+
+
 def test_no_note_without_a_difference():
     assert list(quality_notes(quality_table(hemispheres(3, 4), "group"))) == []
     assert not len(quality_table(hemispheres(0, 0), "group"))

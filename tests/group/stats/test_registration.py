@@ -1,5 +1,6 @@
 """Registration against R, known warps and frozen templates; what warps do to maps."""
 
+from dataclasses import replace
 from time import process_time
 
 import numpy as np
@@ -197,6 +198,13 @@ def test_groups_that_are_moved_apart_are_told_from_those_that_are_not():
     assert sum(p <= 0.05 for p in together) <= 3  # of 12 at .05: more by chance in .2 %
     assert np.mean(together) > 0.25
     assert np.isnan(tested(0.0, 6, groups=("a", "a"))["difference_p"])
+    # Two warps in each group that are the same: F has no residuals, and no p.
+    profiles, _, _ = simulated(4, seed=1)
+    alike = register(profiles[[0, 0, 1, 1]], SETTINGS)
+    exact = replace(alike, warps=alike.warps[[0, 0, 2, 2]])
+    names = np.array(["a", "a", "b", "b"])
+    result = shift_difference(exact, names, np.arange(4), permutations=19, seed=0)
+    assert not result["difference_p"] <= 0.05
     # Visits are not people: thirty of each group who come ten times are three of each.
     visits = np.arange(60) % 6
     assert tested(2.0, 6, people=visits)["difference_p"] > 1 / 200
