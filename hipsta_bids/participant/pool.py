@@ -259,9 +259,14 @@ def _start(plan: WorkerPlan) -> _Slot:
     parent_end, child_end = context.Pipe()
     # Not daemonic: stages may start helper processes of their own.
     process = context.Process(target=_serve, args=(child_end, plan, os.getpid()), daemon=False)
-    with _inherited(plan):
-        process.start()
-    child_end.close()
+    try:
+        with _inherited(plan):
+            process.start()
+    except BaseException:  # Ctrl-C: the worker ends when nothing can reach it
+        parent_end.close()
+        raise
+    finally:
+        child_end.close()
     return _Slot(process=process, connection=parent_end)
 
 

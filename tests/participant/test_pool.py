@@ -77,6 +77,9 @@ def test_ctrl_c_while_a_worker_starts_is_not_lost(tmp_path, monkeypatch, method)
     finally:
         signal.signal(signal.SIGINT, handler)
     assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, ())
+    for process in multiprocessing.active_children():
+        process.join(20)
+    assert not multiprocessing.active_children(), "the worker that was started ends"
 
 
 def test_workers_that_cannot_start_are_a_bug(tmp_path):
