@@ -262,8 +262,9 @@ def _start(plan: WorkerPlan) -> _Slot:
     try:
         with _inherited(plan):
             process.start()
-    except BaseException:  # Ctrl-C: the worker ends when nothing can reach it
-        parent_end.close()
+    except BaseException:  # Ctrl-C: nothing would reach the worker
+        if process.pid is not None:
+            process.kill()
         raise
     finally:
         child_end.close()
