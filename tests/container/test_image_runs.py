@@ -46,7 +46,7 @@ def test_group_level(both_levels):
     out, done = both_levels
     assert ended(done), done
     kinds = {path.suffix for path in out.glob("group/*/figures/thickness_maps.*")}
-    assert kinds == {".pdf", ".png", ".svg"}
+    assert kinds == {".svg"}
 
 
 def test_files_are_those_of_a_run_outside(both_levels, phantoms, reference):
