@@ -4,6 +4,7 @@ import argparse
 import json
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from pathlib import Path
 
 from hipsta_bids.cli.commands import (
     meta_parser,
@@ -63,6 +64,8 @@ derivatives (BEP011).
 Properties of all images with one suffix (`Description`, `Units`, `SpatialReference`) are in the
 root, for example in `thickness.json`. `SpatialReference` is `orig` for the scanner RAS space of the
 segmentation, in mm."""
+
+GROUP_FILES = (Path(__file__).parent / "group_files.md").read_text("utf-8").strip()
 
 TABLES_TEXT = """\
 `desc-sections_morph.tsv` has one row per cross-section from posterior to anterior, with `y` and
@@ -180,6 +183,7 @@ def outputs_page() -> str:
             subfields=_measures(PER_SUBFIELD, ending="_NAME"),
         ),
         table(columns, _named(row for row in layers if row not in place)),
+        GROUP_FILES,
         "## Columns of the group level",
         COLUMNS_TEXT,
         table(("column", "meaning"), _group_columns()),
