@@ -90,7 +90,7 @@ with the numbers. Here is what the names mean, in the order of what to do."""
 OPTIONS_TEXT = """\
 `hipsta-bids BIDS_DIR OUTPUT_DIR participant` measures, `... group` compares. Other commands:
 `demo`, `phantom`, `surrogate`, `meta`, `resample`, `settings`, `protocols`. All print
-these texts with `--help`. Underscores do in place of hyphens (`--n_procs`)."""
+these texts with `--help`. Options accept underscores instead of hyphens (`--n_procs`)."""
 
 _SHARED_TEXT = "of all images with these endings: what they are, unit, space"
 

@@ -261,9 +261,10 @@ def check_side(body: Body, hemi: str) -> float:
 def wrong_side(hemi: str, offset: float) -> GeometryError:
     """Make the error of a hemisphere whose medial subfields lie ``offset`` mm medially of CA1."""
     side = {"L": "left", "R": "right"}
+    opposite = side["R" if hemi == "L" else "L"]
     return GeometryError(
-        f"labeled {side[hemi]}, but the subiculum lies {-offset:.1f} mm lateral of CA1; "
-        "check the image's affine, and which file is left",
+        f"labeled {side[hemi]}, but the subiculum lies {-offset:.1f} mm lateral of CA1 as "
+        f"in a {opposite} hemisphere; check affine and file",
         reason="left-right-swapped",
     )
 

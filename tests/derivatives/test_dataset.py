@@ -68,7 +68,7 @@ def test_a_damaged_description_is_written_anew(tmp_path, damage):
 @pytest.mark.parametrize("damage", [None, "x", [1]])
 def test_damaged_settings_are_other_settings(tmp_path, damage):
     files.write_json(tmp_path / "desc-settings.json", {"hash": "0", "settings": damage})
-    with pytest.raises(SettingsError, match="holds results with other settings"):
+    with pytest.raises(SettingsError, match="results with other settings"):
         dataset.settle_settings(tmp_path, Settings())
 
 
@@ -213,7 +213,7 @@ def test_citation_states_settings_and_protocols():
 def test_citation_says_whose_molecular_layer_was_left_out():
     protocols = [load_protocol("freesurfer"), load_protocol("hippunfold")]
     text = dataset.citation_text(Settings(), protocols)
-    assert "given to the nearest subfield of the sheet, or left out (hippunfold)." in text
+    assert "given to the nearest subfield of the sheet, or excluded (hippunfold)." in text
     joined = Settings(body=BodySettings(join_every_layer=True))
     for settings, chosen in ((joined, protocols), (Settings(), protocols[:1])):
         assert "left out" not in dataset.citation_text(settings, chosen)
@@ -271,7 +271,7 @@ def test_the_methods_text_says_which_steps_are_as_published():
         body={"end_rule": "last-slice"}, boundaries={"operator": "published", "edges": "zero-lines"}
     )
     published = dataset.citation_text(settings, [])
-    for text in ("lay at the last slices with labels", "of the original method, without a thresh"):
+    for text in ("lay at the last slices with CA1", "of the original method, without a thresh"):
         assert text in published
         assert text not in usual
     assert "moved to the middle of the sheet's edges" in usual

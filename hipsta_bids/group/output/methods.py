@@ -71,7 +71,7 @@ class Citations:
         return f"[{self._keys.index(key) + 1}]"
 
     def page(self, paragraphs: Sequence[str], region: str = "body") -> str:
-        """Return the text with its references; the first paragraph says what was measured."""
+        """Return the text with its references; the first paragraph names the measures."""
         region_text = _MEASURED["body"]
         first = paragraphs[0].replace(region_text, _MEASURED.get(region, region_text), 1)
         bibliography = references()
@@ -91,14 +91,14 @@ def methods_text(
     region: str = "body",
     ratings: Mapping[str, int] | None = None,
 ) -> str:
-    """Word what was done and what came out."""
+    """Word the methods and the results."""
     cite = Citations()
     paragraphs = [_sample(cohort, analysis, n_out, cite("method"), surfaces)]
     if ratings is not None:
         counts = ", ".join(f"{n} {rating}" for rating, n in ratings.items())
         paragraphs[0] += (
-            f" Hemispheres were rated on their report pages ({counts}); those rated exclude were"
-            " left out."
+            f" Hemispheres were rated on their report pages ({counts}); hemispheres"
+            " rated exclude were excluded."
         )
     aligned = [_registration(analysis, settings, cite)] if analysis.registrations else []
     if surfaces:
@@ -124,7 +124,7 @@ def methods_text(
         paragraphs.append(_findings(analysis))
     if analysis.skipped:
         points = (f"- {escaped(line)}" for line in analysis.skipped)
-        paragraphs.append("\n".join(["Left out:", "", *points]))
+        paragraphs.append("\n".join(["Excluded:", "", *points]))
     return cite.page(paragraphs, region)
 
 
@@ -148,7 +148,7 @@ def _sample(
         text += f" ({', '.join(f'{counts[g]} {escaped(g)}' for g in analysis.groups.levels)})"
     if sheets := ", ".join(f"{len(one.used)} {hemi}" for hemi, one in analysis.fitted.items()):
         text += f", with hemispheres {sheets}"
-    return f"{text}. {n_out} hemispheres or visits were left out; the table of exclusions says why."
+    return f"{text}. {n_out} hemispheres or visits were excluded (see the table of exclusions)."
 
 
 def _registration(
@@ -182,21 +182,21 @@ def _registration(
     return (
         "Curvature profiles from medial to lateral (means from posterior to"
         f" anterior){standardization} were registered by {method}, and the warps were applied to"
-        " all maps. The share of the variance of the profiles that their mean explains went from"
+        " all maps. The mean profile explained this share of the variance, before to after:"
         f" {shares}.{moved} Warps out of line with the others: {extreme}."
     )
 
 
 def _rims(analysis: Analysis) -> str:
-    """Say how points are handled that some participants lack."""
+    """Word the handling of points that some participants lack."""
     fits = [fit for one in analysis.fitted.values() for fit in one.fits.values()]
     n = np.concatenate([fit.n[np.isfinite(fit.tests[0].p)] for fit in fits])
     span = f" ({n.min()} to {n.max()} per point)" if len(n) else ""
     return (
         "Sheets have no values within 1 mm of edges, ends and filled holes, which differ between"
-        f" participants; points that fewer than {LEAST_SHARE:.0%} have were left out. None was"
-        f" imputed: a point was tested by those who have a value{span}. Profiles for registration"
-        " are means of known values, interpolated where a whole position has none."
+        f" participants; points present in fewer than {LEAST_SHARE:.0%} were excluded. No value"
+        f" was imputed: a point was tested in participants with a value{span}. Profiles for"
+        " registration are means of known values, interpolated where a whole position has none."
     )
 
 
@@ -212,35 +212,35 @@ def _harmonization(analysis: Analysis, cite: Callable[[str], str]) -> list[str]:
     if plan.icv is not None:
         preserved += f", for volumes also {escaped(plan.icv)}"
     text = (
-        f"Effects of {column} ({counts} participants) were taken out of"
-        f"{' the registered' if analysis.registered else ''} maps and summary measures by ComBat"
-        f" {sources}: at each point, a shift and a scale of the residuals of a linear model that"
+        f"ComBat {sources} removed effects of {column} ({counts} participants) from"
+        f"{' the registered' if analysis.registered else ''} maps and summary measures."
+        " At each point it estimates a shift and a scale of the residuals of a linear model that"
         f" keeps {preserved}. The two were pooled over the points of a map by empirical Bayes, and"
-        " estimated for each summary measure by itself; missing values were left out point by"
+        " estimated for each summary measure by itself. Missing values were excluded point by"
         " point."
     )
     if plan.visits.participant is not None:
         text += (
-            " Participants had random intercepts, which were kept, so that the scale is that of"
-            f" differences within participants {cite('beer')}."
+            " Participants had random intercepts, which were kept, so that the scale"
+            f" describes differences within participants {cite('beer')}."
         )
     if plan.saved is not None:
         saved_sites = sum(site in plan.saved.sites for site in plan.counts)
-        text += f" Parameters of {saved_sites} of these were those of an earlier analysis"
+        text += f" Parameters of {saved_sites} of these were from an earlier analysis"
         new = escaped(", ".join(plan.estimated))
-        text += f"; those of {new} were new." if new else "."
+        text += f"; parameters of {new} were new." if new else "."
     if plan.estimated and not analysis.comparison.pair:
         columns_lost = len(plan.counts) - 1
         text += (
-            f" As the shifts were estimated from the same participants, {column} is also a"
-            f" factor of the model, which has {columns_lost}"
-            f" degree{'s' if columns_lost > 1 else ''} of freedom less: without, tests would reject"
+            f" The shifts were estimated from the same participants, therefore {column} is also a"
+            f" factor of the model, which costs {columns_lost}"
+            f" degree{'s' if columns_lost > 1 else ''} of freedom. Without it, tests would reject"
             f" too often {cite('nygaard')}."
         )
     if analysis.pairs and analysis.groups and harmonization.leaks(analysis.groups.column):
         text += (
-            " Classifiers were given the measures before harmonization, since parameters that"
-            " were estimated with the groups known would tell something about who is left out."
+            " Classifiers were given the measures before harmonization: parameters estimated with"
+            " the groups known would reveal the groups of held-out participants."
         )
     return [text]
 
@@ -280,7 +280,7 @@ def _models(
 
 
 def _slopes(analysis: Analysis, cite: Callable[[str], str]) -> str:
-    """Say at how many points slopes vary, and where they could not be told from none."""
+    """Word at how many points slopes vary, and where their variance is zero."""
     fits = [fit for one in analysis.fitted.values() for fit in one.fits.values()]
     p = np.concatenate([fit.slopes_p for fit in fits if fit.slopes_p is not None] or [np.empty(0)])
     tested = int(np.isfinite(p).sum())
@@ -288,14 +288,14 @@ def _slopes(analysis: Analysis, cite: Callable[[str], str]) -> str:
         return ""
     return (
         f". Slopes differed between participants at {np.sum(p < _LEVEL) / tested:.0%} of the points"
-        f" (p < {_LEVEL:g}, uncorrected; ratio of restricted likelihoods against an equal mixture"
-        f" of chi squared with 1 and 2 degrees of freedom {cite('mixture')}), and were left out of"
-        f" the model at {np.sum(p == 1) / tested:.0%}, where their variance was zero"
+        f" (p < {_LEVEL:g}, uncorrected). The test is a ratio of restricted likelihoods against an"
+        f" equal mixture of chi squared with 1 and 2 degrees of freedom {cite('mixture')}. At"
+        f" {np.sum(p == 1) / tested:.0%} the variance of slopes was zero, and the model had none"
     )
 
 
 def _nonlinear(analysis: Analysis, settings: group_settings.GroupSettings) -> str:
-    """Say how age was modeled, and in how many summary measures it bends."""
+    """Word the model of age, and the number of summary measures in which it bends."""
     names = [one.name for one in analysis.design.contrasts if one.name.endswith(" nonlinear")]
     if not names or settings.model.age == "linear":
         return ""
@@ -309,7 +309,7 @@ def _nonlinear(analysis: Analysis, settings: group_settings.GroupSettings) -> st
     result = control_fdr(np.concatenate(p or [np.empty(0)]), settings.multiplicity.alpha)
     return (
         f" Age was in the model with {curve}; the contrast {escaped(names[0])} tests whether that"
-        f" differs from a line, as it did in {int(result.rejected.sum())} of {result.n_tests} tests"
+        f" differs from a line. It did in {int(result.rejected.sum())} of {result.n_tests} tests"
         " of summary measures (false discovery rate)."
     )
 
@@ -373,11 +373,11 @@ def _joint(settings: group_settings.GroupSettings, cite: Callable[[str], str]) -
         f" tested together by non-parametric combination {cite('joint')}. At each point the"
         f" evidence is {by}, as the normal quantile of its two-sided p-value for independent maps."
         f" In each of {rules.permutations} permutations of residuals (Freedman and Lane's; seed"
-        f" {rules.seed}) {cite('permutation')} all maps were shuffled alike, so that their"
-        f" dependence is kept. The largest value of {statistic} in each holds the"
+        f" {rules.seed}) {cite('permutation')} all maps were shuffled alike to keep"
+        f" their dependence. The largest value of {statistic} in each holds the"
         f" family-wise error rate at {rules.alpha:g} over the points{family}. The null hypothesis"
-        " of a point is that none of the maps has an effect there; the effect sizes of each map say"
-        " where a finding comes from."
+        " of a point is that no map has an effect there. The effect sizes of each map show the"
+        " source of a finding."
     )
 
 
@@ -389,9 +389,9 @@ def norms_text(
     new: Sequence[str],
     controls: tuple[str, str] | None,
 ) -> str:
-    """Word how norms were made, or how people were scored by them.
+    """Word how norms were made, or how participants were scored by them.
 
-    ``who`` was in it; ``coverage`` is that of norms that were made; ``new`` sites come last.
+    ``coverage`` is of norms that were made; ``new`` sites are last.
     """
     cite = Citations()
     ages = f"{file.knots[0]:g} to {file.knots[-1]:g} years"
@@ -409,12 +409,13 @@ def norms_text(
         first += f" Sheets were registered to {template} by curvature profiles {cite('registr')}."
     model = (
         f"Norms have a mean with a natural cubic spline of age ({len(file.knots)} knots) and"
-        f" constants for {'sex and ' if file.sexes else ''}site, and an SD whose logarithm is"
-        f" linear in age with a constant for each site {cite('gamlss')}, at each point and for each"
-        f" summary measure. Where a likelihood-ratio test (p < {SHAPE_LEVEL:g}) rejected a"
-        f" normal distribution, residuals have a sinh-arcsinh distribution {cite('shash')}, as in"
-        f" {cite('warped')}. Deviations z are normal quantiles of the probability of a value, which"
-        " allows for how well shift and scale of the site are known (Student's t)."
+        f" constants for {'sex and ' if file.sexes else ''}site. The logarithm of their SD is"
+        f" linear in age with a constant for each site {cite('gamlss')}. They were fitted at each"
+        f" point and for each summary measure. Where a likelihood-ratio test (p < {SHAPE_LEVEL:g})"
+        f" rejected a normal distribution, residuals have a sinh-arcsinh distribution"
+        f" {cite('shash')}, as in {cite('warped')}. Deviations z are normal quantiles of the"
+        " probability of a value. It includes the uncertainty of the site's shift and scale"
+        " (Student's t)."
     )
     paragraphs = [first, model]
     if coverage is not None:
@@ -454,10 +455,10 @@ def _normative(
     formula: str, n_reference: int, group: str, settings: group_settings.GroupSettings, source: str
 ) -> str:
     return (
-        f"Each participant was scored against {n_reference} with {escaped(group)}: w is the"
-        f" difference from what a linear model {code(formula)} of these expects, over its residual"
-        f" standard deviation {source}. Members of the reference group were scored by the model"
-        " without themselves."
+        f"Each participant was scored against {n_reference} with {escaped(group)}. The score w is"
+        f" the difference from the prediction of their linear model {code(formula)}, over its"
+        f" residual standard deviation {source}. Members of the reference group were scored by"
+        " the model without themselves."
         " Points count as low or high where the two-sided p, with the uncertainty of the model, is"
         " below"
         f" {1 - settings.glm.confidence:.2g}."
@@ -476,9 +477,9 @@ def _classification(
         else f" No comparison was separated (else Firth's method {firth} is used)."
     )
     return (
-        f"Pairs of groups were told apart by logistic models of {base}, and of"
-        " the same with one measure added; a likelihood-ratio test compares the two, on the same"
-        f" participants. Areas under the curve have DeLong intervals {delong}, and are also given"
+        f"Pairs of groups were discriminated by logistic models of {base}, and by the same models"
+        " with one measure added. A likelihood-ratio test compares the two, on the same"
+        f" participants. Areas under the curve have DeLong intervals {delong}. They are also given"
         f" from {rules.folds}-fold stratified cross-validation repeated {rules.repeats} times (seed"
         f" {rules.seed}).{by_firth} Calibration is judged where both groups have"
         f" {rules.least_calibrated} members or more {snell}."
@@ -508,7 +509,7 @@ def power_text(
     source: Callable[[Cite], str],
     cite: Cite,
 ) -> str:
-    """Word what was asked, and how it was answered; ``source`` words what variances rest on."""
+    """Word the question and its answer; ``source`` words the origin of the variances."""
     plan, rules = settings.power, settings.multiplicity
     months = ", ".join(f"{month:g}" for month in effect.visits)
     question = f"{100 * effect.share:g} % of the change over time is prevented"
@@ -518,23 +519,23 @@ def power_text(
     end = "A participant's value is the end point."
     if effect.visits:
         end = (
-            f"The end point is the slope over visits at months {months}; its variance is that of"
-            " true slopes between participants plus the variance within participants over the sum"
-            f" of squared times {cite('ard')}."
+            f"The end point is the slope over visits at months {months}. Its variance has two"
+            " terms: true slopes between participants, and the variance within participants over"
+            f" the sum of squared times {cite('ard')}."
         )
     dropout = f", if {100 * plan.dropout:g} % drop out" if plan.dropout else ""
     if dropout and effect.visits:
         dropout += " at a constant hazard and are analyzed with the visits before"
     return (
-        f"Sample sizes are those of a trial of two arms of equal size in which {question}, with a"
-        f" power of {plan.power:g}{dropout}. {end} Means, changes and variances are those of"
-        f" {source(cite)}. Power is that of Student's two-sided t test (non-central t), at the"
-        f" level {plan.alpha:g} for a summary measure, without correction, since a trial has one"
-        f" primary end point. At single points the level is {point_level(rules, plan):.2g}: at that"
-        f" level {PROCEDURES[rules.method]} {cite(rules.method)} holds the false discovery rate at"
-        f" {rules.alpha:g} if"
+        f"Sample sizes are for a trial of two equal arms in which {question}, with a"
+        f" power of {plan.power:g}{dropout}. {end} Means, changes and variances are from"
+        f" {source(cite)}. Power follows Student's two-sided t test (non-central t), at the"
+        f" level {plan.alpha:g} for a summary measure. It is not corrected, since a trial has one"
+        f" primary end point. At single points the level is {point_level(rules, plan):.2g}:"
+        f" {PROCEDURES[rules.method]} {cite(rules.method)} then holds the false discovery rate at"
+        f" {rules.alpha:g} {cite('jung')} {cite('liu')}. It is assumed that"
         f" {100 * plan.affected:g} % of the points of a map differ and are found with this power"
-        f" on average {cite('jung')} {cite('liu')}. Of many measures the one that needs fewest"
+        " on average. Of many measures the one that needs fewest"
         " does so partly by chance; its number is too small on average."
     )
 
@@ -547,7 +548,7 @@ def retest_text(
         f"Agreement between {sessions} sessions of {participants}"
         " participants was estimated at each point of the maps and for each summary measure. The"
         " within-subject standard deviation is the root of the mean variance of a participant's"
-        f" values {cite('bland')}; a change beyond 1.96 √2 times this is unlikely to be measurement"
+        f" values {cite('bland')}. A change beyond 1.96 √2 times this is unlikely to be measurement"
         f" alone (minimal detectable change {cite('weir')}). The intraclass correlation is"
         " ICC(2,1), of two-way random effects, absolute agreement and single measurements"
         f" {cite('shrout')}, with {settings.confidence:.0%} limits {cite('mcgraw')}. It depends on"

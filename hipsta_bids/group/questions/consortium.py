@@ -36,13 +36,10 @@ def run_meta(
     settings: GroupSettings,
     command: Sequence[str] = (),
 ) -> tuple[Path, list[str]]:
-    """Combine the summaries of sites, perhaps with other names than those in them.
-
-    Returns the page and what should be known.
-    """
+    """Combine the summaries of sites, perhaps renamed; returns the page and notes."""
     if settings.multiplicity.method in PERMUTATIONS:
         raise UsageError(
-            "meta: there is nobody to permute in summaries; use --correction fdr2 or bh"
+            "meta: summaries have no participants to permute; use --correction fdr2 or bh"
         )
     sites = _read(paths)
     notes = check_agreement(sites)
@@ -211,30 +208,28 @@ def _methods(meta: Meta) -> str:
     fixed = "The fixed effect is the mean of the sites' estimates, weighted by inverse variances."
     if joint:
         fixed = (
-            "The fixed effect is that of the model of all participants with a constant per site,"
-            f" from the sites' coefficients and their covariances {cite('join')}; contrasts that"
-            " include the constant are combined by inverse variances."
+            "The fixed effect is of the model of all participants with a constant per site"
+            f" {cite('join')}. It needs the sites' coefficients and their covariances only."
+            " Contrasts that include the constant are combined by inverse variances."
         )
     if rules.random == "dl":
         random = f"the moments of DerSimonian and Laird {cite('dl')}, tests are normal"
     elif joint:
         random = (
             f"restricted maximum likelihood {cite('reml')} in the same model with a random slope of"
-            " the site, tests and limits are those of t with one degree of freedom less than there"
-            " are sites"
+            " the site. Tests and limits follow t with one degree of freedom less than sites"
         )
     else:
         random = (
-            f"restricted maximum likelihood {cite('reml')}, tests and limits are those of Knapp and"
-            f" Hartung {cite('knapp-hartung')}, with standard errors not smaller than without their"
+            f"restricted maximum likelihood {cite('reml')}, tests and limits of Knapp and"
+            f" Hartung {cite('knapp-hartung')}. Standard errors are not smaller than without their"
             f" correction {cite('modified')}"
         )
     measure_text = (
         f"Measures of the hippocampus {cite('method')} of {meta.people} participants{groups} at"
-        f" {len(sites)} sites were combined with hipsta_bids {__version__}; no values of"
+        f" {len(sites)} sites were combined with hipsta_bids {__version__}. No values of"
         f" participants left a site. Each site fitted the linear model"
-        f" {code(sites[0].models[0].formula)} at each point of the sheet and to each summary"
-        " measure."
+        f" {code(sites[0].models[0].formula)} at each point of the sheet, and to summary measures."
     )
     effects = (
         f"{fixed} In the random-effects model, true effects differ between sites; their variance"

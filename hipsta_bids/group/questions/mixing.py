@@ -54,7 +54,7 @@ def with_mixes(study: Study, rows: pd.DataFrame, terms: Iterable[str]) -> Study:
         parts = ", ".join(f"with {name} p {p_text(p)} ({test})" for name, test, p in tests if test)
         names = ", ".join(name for name, _, p in tests if p < _LEVEL)
         ending = f"; association {parts}" if parts else ""
-        ending += f"; effects of {names} may be those of {field}" if names else ""
+        ending += f"; effects of {names} may be effects of {field}" if names else ""
         lines.append(f"hemispheres differ in {text}{ending}")
     return replace(study, mixes=tuple(lines))
 

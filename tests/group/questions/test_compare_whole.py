@@ -105,7 +105,7 @@ def test_what_is_experimental_is_said(folder):
     assert "Region whole is experimental." in page
     text = (folder / "methods.md").read_text()
     assert "the whole hippocampus on one sheet (experimental)" in text
-    assert "None was imputed" in text
+    assert "No value was imputed" in text
 
 
 def test_figures_show_how_many_have_a_value(folder):
