@@ -3,7 +3,7 @@
 #   make quick   tests of geometry, statistics, formats, protocols and designs
 #   make test    lint, types, layer contracts and tests, exactly as in CI
 #   make release    what takes long: validation, tutorials, faults, containers, clusters, browser
-#   make validation    measure accuracy: all suites, and docs/validation.md with their tables
+#   make validation    measure accuracy: all suites, and their tables in docs/validation
 #   make docs    the documentation as a site in build/site, without network
 
 VENV ?= .venv
@@ -77,7 +77,7 @@ release: $(STAMP) validation
 
 # All suites, on the real labels too where they are: LABELS=BIDS_DIR.
 validation: $(STAMP)
-	"$(BIN)/python" -m validation --full $(if $(LABELS),--labels "$(LABELS)")
+	"$(BIN)/python" -m validation --full --out docs/validation $(if $(LABELS),--labels "$(LABELS)")
 
 docs: $(STAMP)
 	NO_MKDOCS_2_WARNING=1 "$(BIN)/python" -m mkdocs build --strict --quiet

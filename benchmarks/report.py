@@ -21,9 +21,9 @@ def print_table(header: Sequence[str], rows: Mapping[str, Sequence[float]]) -> N
         print(title.ljust(first), *cells)
 
 
-def write_report(path: Path, found: Mapping[str, Any]) -> None:
-    """Write results as JSON, with what they depend on."""
-    about = {
+def describe_machine() -> dict[str, Any]:
+    """Return what results depend on: machine and versions."""
+    return {
         "machine": platform.machine(),
         "system": platform.platform(),
         "processor": _processor(),
@@ -31,7 +31,12 @@ def write_report(path: Path, found: Mapping[str, Any]) -> None:
         "python": platform.python_version(),
         "versions": {name: version(name) for name in _LIBRARIES},
     }
-    path.write_text(json.dumps(about | dict(found), indent=1) + "\n", encoding="utf-8")
+
+
+def write_report(path: Path, found: Mapping[str, Any]) -> None:
+    """Write results as JSON, with what they depend on."""
+    content = describe_machine() | dict(found)
+    path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
 
 def _spell(value: float) -> str:

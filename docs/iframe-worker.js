@@ -24,3 +24,25 @@ if (location.protocol === "file:") {
     }
   };
 }
+
+// A word of a question also finds longer words: "a" would find "age". Words without a topic are
+// removed before the question is sent.
+const COMMON = new Set(
+  (
+    "a am an and are as at be been by can could did do does for from had has have how i if in into " +
+    "is it its my of on or our should so than that the their then there these they this to use " +
+    "using was we were what when where which who why will with would you your"
+  ).split(" "),
+);
+
+function keywords(question) {
+  const words = question.split(/\s+/).filter((word) => !COMMON.has(word.toLowerCase()));
+  return words.length ? words.join(" ") : question;
+}
+
+const QUERY = 2; // the type of the theme's messages with a question
+const send = Worker.prototype.postMessage;
+Worker.prototype.postMessage = function (message, ...rest) {
+  const query = message.type === QUERY ? { ...message, data: keywords(message.data) } : message;
+  return send.call(this, query, ...rest);
+};

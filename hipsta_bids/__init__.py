@@ -1,8 +1,8 @@
 """Hippocampal thickness, curvature and shape maps from subfield segmentations.
 
 ``import hipsta_bids as hb`` gives :func:`measure`, :func:`load`, :func:`register`, :func:`group`,
-:func:`example`, and the functions ``plot_sheet``, ``plot_surface`` and ``plot_group``. They are
-loaded when first used.
+:func:`figure`, :func:`example`, and the functions ``plot_sheet``, ``plot_surface`` and
+``plot_group``. They are loaded when first used.
 """
 
 __version__ = "0.1.0"
@@ -13,6 +13,7 @@ _MODULES = {
     "load": "hipsta_bids.api.datasets",
     "example": "hipsta_bids.api.datasets",
     "register": "hipsta_bids.group.questions.models",
+    "figure": "hipsta_bids.api.figures",
     "plot_sheet": "hipsta_bids.api.plots",
     "plot_surface": "hipsta_bids.api.plots",
     "plot_group": "hipsta_bids.api.plots",
@@ -21,6 +22,7 @@ _MODULES = {
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from hipsta_bids.api.datasets import example, load
+    from hipsta_bids.api.figures import figure
     from hipsta_bids.api.maps import measure
     from hipsta_bids.api.plots import plot_group, plot_sheet, plot_surface
     from hipsta_bids.group.questions.models import group, register
@@ -42,6 +44,7 @@ else:
 
 __all__ = [
     "example",
+    "figure",
     "group",
     "load",
     "measure",

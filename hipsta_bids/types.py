@@ -220,6 +220,14 @@ class Sheet:
         return int(self.points.shape[2] // 2)
 
 
+#: What the maps of a family of tests have in common, by the setting ``multiplicity.scope``.
+FAMILY = {
+    "map": ("measure", "contrast", "hemi"),
+    "hemispheres": ("measure", "contrast"),
+    "all": ("contrast",),
+}
+
+
 class Decision(StrEnum):
     """Decision on a hemisphere, from its flags."""
 

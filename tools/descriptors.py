@@ -210,6 +210,7 @@ _MODEL = {
     "sample_sizes": ("power*.tsv", "participants per arm of a trial (`--power`)", False),
     "registration": ("registration.tsv", "variance explained before and after", False),
     "excluded": ("excluded.tsv", "who is not in it, and why", True),
+    "quality": ("quality.tsv", "decisions and ratings by group, with a test", False),
     "covariates": ("covariates.tsv", "the table that was fitted", True),
     "design": ("design.tsv", "the same as a design matrix", False),
     "statistical_maps": ("hemi-*_statmap.tsv", "statistics at each point", False),

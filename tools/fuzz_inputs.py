@@ -279,7 +279,7 @@ def leave_out_figures() -> None:
     """Draw no figures and start no workers, which take longer than all else."""
     for module, name, function in (
         ("group.output.write", "draw_figures", lambda *_: iter(())),
-        ("group.output.write", "write_figures", lambda *_: []),
+        ("group.output.write", "write_figures", lambda *_, **__: []),
         ("group.questions.norming", "_figures", lambda *_: iter(())),
         ("participant.run", "run_jobs", lambda plan, jobs: ((j, plan.work(j)) for j in jobs)),
     ):

@@ -1,4 +1,4 @@
-"""Write docs/measures.md: every measure, its figure, and how near it is to the truth.
+"""Write docs/measures.md (measures, figures, errors on phantoms) and docs/measures-errors.tsv.
 
 Run it after a change of a measure, or of the geometry by more than a rounding::
 
@@ -10,7 +10,7 @@ the results of real hemispheres. A test compares the page with what the code say
 
 import argparse
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from io import BytesIO
 from pathlib import Path
@@ -21,13 +21,14 @@ from measure_example import Comparison, Example
 from measure_figures import DRAWINGS
 from measure_topics import ERRORS, INTRODUCTION, PUBLISHED, SIZES_TEXT, TOPICS, Topic
 from PIL import Image
+from reference_pages import table
 
 from hipsta_bids.geometry.catalog import MAPS, PER_SUBFIELD, SECTIONS, SUMMARY, Column
 from hipsta_bids.participant.measure import measure_hemisphere
 from hipsta_bids.phantom import Phantom, PhantomSpec
 from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.settings import Settings
-from validation.report import Cell, Cells, Picture, Table, markdown, render
+from validation.report import Picture, render
 
 #: Where measures are found, and the rows of the catalog that are there.
 TABLES: Mapping[str, Sequence[Column]] = {
@@ -35,12 +36,6 @@ TABLES: Mapping[str, Sequence[Column]] = {
     "sections": SECTIONS,
     "summary": SUMMARY,
     "subfields": PER_SUBFIELD,
-}
-FILES = {
-    "sheet": "`desc-sheet_morph.tsv`, GIFTI",
-    "sections": "`desc-sections_morph.tsv`",
-    "summary": "`desc-summary_morph.tsv`",
-    "subfields": "`desc-summary_morph.tsv`, with the subfield's name",
 }
 
 #: The phantom of the figures, and the others of the table of errors.
@@ -58,7 +53,7 @@ OTHERS: Mapping[str, PhantomSpec] = {
 SUBFIELD = "CA1"
 """Whose numbers stand for those of all subfields."""
 
-PAGE = "measures.md"
+PAGE, ALL_ERRORS = "measures.md", "measures-errors.tsv"
 LARGEST = 60_000
 """Bytes of a figure."""
 SIZES = Path(__file__).with_name("real_sizes.json")
@@ -79,6 +74,9 @@ def write(out: Path) -> None:
     for topic in TOPICS:
         (out / image(topic)).write_bytes(_draw(topic, shown))
     (out / PAGE).write_text(page(shown, others), encoding="utf-8")
+    rows = [("measure", "table", *others), *errors(others)]
+    text = "\n".join("\t".join(row) for row in rows)
+    (out / ALL_ERRORS).write_text(f"{text}\n", encoding="utf-8")
 
 
 def page(shown: Example, others: Mapping[str, Example]) -> str:
@@ -96,9 +94,9 @@ def page(shown: Example, others: Mapping[str, Example]) -> str:
         "# Measures",
         INTRODUCTION,
         *(_section(topic, shown) for topic in TOPICS),
-        "## How near they are",
+        "## Errors on phantoms",
         ERRORS,
-        markdown(_errors(others)),
+        table(("measure", "table", "smallest", "largest"), map(_range, errors(others))),
         "## Sizes of real bodies",
         _real_sizes(json.loads(SIZES.read_text(encoding="utf-8"))),
     ]
@@ -124,60 +122,71 @@ def ranges(results: Path) -> dict[str, object]:
 
 
 def _section(topic: Topic, shown: Example) -> str:
-    rows = [
-        _row(column, name, shown)
+    columns = [
+        (column, name)
         for name, names in topic.measures.items()
         for column in TABLES[name]
         if column.name in names
     ]
     parts = [f"## {topic.title}", topic.text, f"![{topic.title} on a phantom]({image(topic)})"]
-    if rows:
-        headings = ("measure", "where", "unit", "what it is", "measured", "analytic", "source")
-        parts.append(_table(headings, rows))
+    if columns:
+        headings = ("measure", "table", "unit", "definition", "measured", "analytic")
+        parts.append(table(headings, (_row(*pair, shown) for pair in columns)))
+        parts.append(_sources([column for column, _ in columns]))
     return "\n\n".join(parts)
 
 
-def _row(column: Column, table: str, shown: Example) -> tuple[Cell, ...]:
-    name = f"{column.name}_{SUBFIELD}" if table == "subfields" else column.name
-    found, true = (f"{mean:.{column.digits - 1}f}" for mean in shown.measured[table][name].means)
+def _row(column: Column, name: str, shown: Example) -> tuple[str, ...]:
+    key = f"{column.name}_{SUBFIELD}" if name == "subfields" else column.name
+    means = (f"{mean:.{column.digits - 1}f}" for mean in shown.measured[name][key].means)
     words = column.definition.format("a subfield")
-    return (f"`{column.name}`", FILES[table], column.unit, words, found, true, column.source)
+    return (f"`{column.name}`", name, column.unit, words, *means)
 
 
-def _errors(others: Mapping[str, Example]) -> Table:
-    rows: list[Cells] = []
-    for table in TABLES:
-        for name in next(iter(others.values())).measured[table]:
-            errors = {key: _error(one.measured[table][name]) for key, one in others.items()}
-            rows.append({"measure": f"`{name}`", "table": table, **errors})
-    return Table(title="Errors", rows=rows)
+def _sources(columns: Sequence[Column]) -> str:
+    """Cite the works that define measures; the most frequent one without their names."""
+    names: dict[str, list[str]] = {}
+    for column in columns:
+        names.setdefault(column.source, []).append(f"`{column.name}`")
+    usual, *others = sorted(names, key=lambda source: -len(names[source]))
+    rest = (f"; {', '.join(names[source])}: {source}" for source in others)
+    return f"Source: {usual}{''.join(rest)}."
 
 
-def _error(one: Comparison) -> str:
+def errors(others: Mapping[str, Example]) -> list[tuple[str, ...]]:
+    """List each measure with its table and its error on each phantom."""
+    return [
+        (name, where, *(_error(example.measured[where][name]) for example in others.values()))
+        for where in TABLES
+        for name in next(iter(others.values())).measured[where]
+    ]
+
+
+def _range(row: tuple[str, ...]) -> tuple[str, ...]:
+    name, where, *cells = row
+    relative = [cell for cell in cells if cell.endswith("%")]
+    ordered = sorted(relative or cells, key=lambda cell: float(cell.split()[0]))
+    return (f"`{name}`", where, ordered[0], ordered[-1])
+
+
+def _error(comparison: Comparison) -> str:
     """Spell an error: in percent, or in the unit of curvatures that are about zero."""
-    found, true = one.means
-    if "gaussian" in one.name or abs(true) < 1e-6:  # noqa: PLR2004 -- zero but for rounding
-        return f"{round(found - true, 4) + 0.0:+.4f}"  # no -0
-    return f"{round(100 * (found / true - 1), 1) + 0.0:+.1f} %"
+    measured, true = comparison.means
+    if "gaussian" in comparison.name or abs(true) < 1e-6:  # noqa: PLR2004 -- zero but for rounding
+        return f"{round(measured - true, 4) + 0.0:+.4f}"  # no -0
+    return f"{round(100 * (measured / true - 1), 1) + 0.0:+.1f} %"
 
 
 def _real_sizes(record: Mapping[str, object]) -> str:
     sizes = record["sizes"]
     assert isinstance(sizes, dict)  # noqa: S101 -- our own file
-    rows = [
+    rows = (
         (f"`{row.name}`", row.unit, *(f"{x:.{row.digits - 1}f}" for x in sizes[row.name]))
         for row in SUMMARY
         if row.name in sizes
-    ]
-    table = _table(("measure", "unit", "smallest", "median", "largest"), rows)
-    return f"{SIZES_TEXT.format(count=record['hemispheres'])}\n\n{table}\n\n{PUBLISHED}"
-
-
-def _table(headings: tuple[str, ...], rows: Iterable[tuple[Cell, ...]]) -> str:
-    """Write a table in Markdown, without a title."""
-    cells = [dict(zip(headings, row, strict=True)) for row in rows]
-    text = markdown(Table(title="", rows=cells))
-    return text.split("\n\n", 1)[1]
+    )
+    sizes_table = table(("measure", "unit", "smallest", "median", "largest"), rows)
+    return f"{SIZES_TEXT.format(count=record['hemispheres'])}\n\n{sizes_table}\n\n{PUBLISHED}"
 
 
 def _draw(topic: Topic, shown: Example) -> bytes:

@@ -1,4 +1,4 @@
-"""What the page of measures says: figures, the measures that each explains, and texts."""
+"""Texts of the page of measures: figures, and the measures that each explains."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -27,10 +27,12 @@ TOPICS = (
     Topic(
         figure="thickness",
         title="Thickness",
-        text="Gray lines are columns of the sheet: they follow z from the interior to the exterior"
-        " wall. Two of them are drawn in color with the lengths of their points' steps. Means count"
-        " every square millimeter of the mid-surface the same, but for `thickness_nodes`: there"
-        " every node counts the same, as in Diers et al. (2023).",
+        text="Gray lines are columns of the sheet, which follow z from the interior to the exterior"
+        " wall. Two columns are colored, with the lengths of their steps. Thickness is the"
+        " length of a column. `thickness_mean` weights grid points by the area of the"
+        " mid-surface and excludes points that were not measured directly. `thickness_nodes` is the"
+        " unweighted mean over grid points, as in Diers et al. (2023). Grid points are not"
+        " evenly spaced, therefore the two means differ. `extent_z` includes all points.",
         measures={
             "sheet": ("thickness",),
             "sections": ("thickness",),
@@ -40,8 +42,9 @@ TOPICS = (
     Topic(
         figure="extents",
         title="Extents",
-        text="The mid-surface with one line along each of its axes. The long axis of this phantom"
-        " is bent, so lines along y differ in length.",
+        text="The mid-surface with one line along each axis. Lines reach from edge to edge and from"
+        " end plane to end plane. The long axis of this phantom is bent, therefore lines along y"
+        " differ in length.",
         measures={
             "sheet": ("extent_x", "extent_y"),
             "summary": ("extent_x", "extent_y"),
@@ -50,8 +53,11 @@ TOPICS = (
     Topic(
         figure="sections",
         title="Cross-sections",
-        text="The middle cross-section with its walls and its area in gray, and the same measures"
-        " in all sections. Next to the rims, the walls are continued along the mid-surface.",
+        text="The middle cross-section with its walls and its area (gray), and the measures of all"
+        " cross-sections. Where a wall ends on a rounded edge is arbitrary. In the outer tenth"
+        " at either edge, wall lengths therefore follow the mid-line, scaled by the ratio of"
+        " wall and mid-line further inside. `shape_index` is circumference over area, not the"
+        " shape index of Koenderink.",
         measures={
             "sections": tuple(row.name for row in SECTIONS if row.name != "thickness"),
             "summary": (
@@ -65,9 +71,13 @@ TOPICS = (
     Topic(
         figure="curvature",
         title="Mean curvature",
-        text="At a column, the circles that touch the three surfaces across the axis, with the"
-        " radii that were measured. Single points have the roughness of the voxels, on the"
-        " interior most; means are taken away from rims and ends.",
+        text="Circles that touch the three surfaces at one column, with the measured radii. Mean"
+        " curvature is half the sum of the principal curvatures. They follow from the first and"
+        " second fundamental form of cubic polynomials in windows of 9 x 9 grid points. Curvature"
+        " is positive"
+        " where the surface is concave towards the interior side; a cylinder of radius r has"
+        " 1/(2r). Voxels roughen single points, most on the interior wall. Means exclude the"
+        " four outermost rows and columns of grid points.",
         measures={
             "sheet": _three("curvature"),
             "summary": tuple(f"{name}_mean" for name in _three("curvature")),
@@ -76,9 +86,9 @@ TOPICS = (
     Topic(
         figure="gaussian",
         title="Gaussian curvature",
-        text="The product of both curvatures: zero where a surface could be laid flat. Here the"
-        " axis bends too, so the lateral part is a dome. White: next to rims and ends, where it is"
-        " not summed up.",
+        text="The product of the principal curvatures, in windows of 9 x 21 grid points. It is zero"
+        " where a surface could be flattened without stretching. The axis of this phantom bends,"
+        " therefore the lateral part is a dome. White grid points are excluded from means.",
         measures={
             "sheet": _three("gaussian_curvature"),
             "summary": tuple(f"{name}_mean" for name in _three("gaussian_curvature")),
@@ -87,8 +97,8 @@ TOPICS = (
     Topic(
         figure="surfaces",
         title="Areas and volume",
-        text="The three surfaces from rim to rim and from end to end; the body is 16 mm long. Rims"
-        " and end planes do not count as surface.",
+        text="The three surfaces from edge to edge and from end plane to end plane, over 16 mm."
+        " Edges and end planes are excluded from the areas.",
         measures={
             "summary": (
                 *(f"area_{name}" for name in ("interior", "mid", "exterior")),
@@ -101,51 +111,52 @@ TOPICS = (
     Topic(
         figure="subfields",
         title="Subfields",
-        text="The nodes of the sheet by subfield. Areas and volumes do not depend on the nodes:"
-        " they go by the labels at some ten thousand places between them, and by the tetrahedra.",
+        text="Grid points by subfield: the most frequent label of the column. Areas use the labels"
+        " at about ten thousand places between grid points, volumes the labels of tetrahedra.",
         measures={"subfields": tuple(row.name for row in PER_SUBFIELD)},
     ),
     Topic(
         figure="profiles",
         title="Profiles",
-        text="Every map is averaged over y and over x in `desc-profile_morph.tsv`, by area; here"
-        " thickness.",
+        text="`desc-profile_morph.tsv` has each map averaged over y, and over x, weighted by area;"
+        " here thickness.",
         measures={},
     ),
     Topic(
         figure="layers",
         title="Layers",
-        text="Points of a column lie at equal distances, or so that the same volume lies between"
-        " any two layers, which moves them outwards at a bend (setting `sheet.depths`). They say"
-        " where `--map` samples; no measure depends on them.",
+        text="Points of a column have equal distances, or equal volumes between layers"
+        " (`sheet.depths`). Equal volumes move points outwards at a bend. Layers decide where"
+        " `--map` samples; no measure depends on them.",
         measures={},
     ),
 )
 
 INTRODUCTION = """\
-What every number of the participant level is, shown on a phantom: a spiral wall of 2 mm that
-varies by 20 % along x, 16 mm long, with a bent axis, drawn as labels in voxels of 0.4 mm and
-measured with default settings. *Measured* is what came out, *analytic* what a perfect method
-would find; of maps and of cross-sections both are means, of subfields those of CA1. x runs from
-medial to lateral, y from posterior to anterior, z from interior to exterior."""
+This page defines the measures of the participant level. The example is a phantom: a spiral wall, 16
+mm long, with a bent axis. Its thickness is 2 mm and varies by 20 % along x. It was drawn in voxels
+of 0.4 mm and measured with default settings. *Measured* is the result, *analytic* the exact value;
+both are means over maps and cross-sections, and values of CA1 for subfields. The tables are
+`desc-sheet_morph.tsv` (also as GIFTI maps), `desc-sections_morph.tsv` and `desc-summary_morph.tsv`;
+measures of subfields are in the latter, with the name of the subfield. [Method](method.md) defines
+the coordinates x, y and z."""
 
 ERRORS = """\
-The same comparison on other phantoms, one drawing each (left, 0.4 mm). Errors of Gaussian
-curvature, and of curvatures that are zero, are in their unit. Tests ask for 2 % of every measure
-(5 % of curvature, 0.005 1/mm² of Gaussian curvature) on shapes like these but the last, on both
-sides. Areas and volumes of subfields may also be off by a strip of 0.15 mm: labels end at voxels,
-and smoothing rounds off the sharp rims of phantoms, by 0.13 mm² per section. Thickness of CA2 and
-CA3 in the wall of 1.2 mm may be off by 0.03 mm: three voxels at the strongest bend. The tight
-spiral has an interior radius of 0.6 mm at its lateral end, which voxels of 0.4 mm do not hold: its
-interior wall comes out too long."""
+Smallest and largest error of the means over eight phantoms (left, 0.4 mm, one drawing each):
+[all errors](measures-errors.tsv). Errors of Gaussian curvature are in 1/mm². Tests require 2 % for
+all measures, 5 % for mean curvature and 0.005 1/mm² for Gaussian curvature, except on the tight
+spiral. Its interior radius of 0.6 mm at the lateral end is too small for voxels of 0.4 mm, and the
+interior wall is too long. Areas and volumes of subfields may differ by a strip of 0.15 mm, because
+labels end at voxels and smoothing rounds edges. In the wall of 1.2 mm, thickness of CA2 and CA3 may
+differ by 0.03 mm. [Validation](validation.md) has the errors over positions and voxel sizes."""
 
 SIZES_TEXT = """\
-Ranges over {count} measurements of real bodies: both hemispheres of three brains, with manual
-labels (Winterburn et al. 2013, NeuroImage 74:254-265) in FreeSurfer's codes at 0.3 mm and in
-ASHS's at 0.4 x 0.4 x 1.5 mm. The ends of the body were set at fixed shares of the hippocampus's
-length, so `extent_y`, areas and volumes depend on that choice."""
+Ranges over {count} measurements of real bodies: both hemispheres of three brains with manual labels
+(Winterburn et al. 2013, NeuroImage 74:254-265). The labels are in FreeSurfer's codes at 0.3 mm, and
+in ASHS's codes at 0.4 x 0.4 x 1.5 mm. End planes were placed at fixed fractions of the length of
+the hippocampus; `extent_y`, areas and volumes depend on this choice."""
 
 PUBLISHED = """\
-For scale: whole hippocampi have 3208 (left) and 3324 mm³ (right) on average by manual
-segmentation (Pruessner et al. 2000, Cereb Cortex 10:433-442), dentate gyrus, CA4, head and tail
-included, none of which is part of the sheet."""
+For comparison, manual segmentations of the whole hippocampus have 3208 mm³ (left) and 3324 mm³
+(right) on average (Pruessner et al. 2000, Cereb Cortex 10:433-442). They include head, tail,
+dentate gyrus and CA4, which the sheet excludes."""

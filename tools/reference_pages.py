@@ -1,7 +1,6 @@
 """Pages of docs/ that are made from the code: outputs, settings, reasons, options."""
 
 import argparse
-import inspect
 import json
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -18,7 +17,6 @@ from hipsta_bids.derivatives.hemisphere import LAYERS, NODES, POSITION, STATE
 from hipsta_bids.derivatives.names import (
     DATASET_FILES,
     EXTRA_OUTPUTS,
-    IGNORED,
     OUTPUTS,
     SHARED,
     HemisphereName,
@@ -35,178 +33,232 @@ from hipsta_bids.settings import Settings
 NOTE = "<!-- Written by `tools/make-docs`; do not edit, run it again. -->"
 
 OUTPUTS_TEXT = """\
-A BIDS derivative dataset. Files of a hemisphere lie in `sub-X[/ses-Y]/anat/` and begin with
-`sub-X[_ses-Y]_hemi-<L|R>`; `P` is the name of the segmentation protocol. Other regions than the
-body have `label-extended` or `label-entorhinal` after `seg-P`. Missing values are `n/a` in tables
-and NaN in GIFTI files. What the numbers mean, with figures: [Measures](measures.md).
+The output folder is a BIDS derivative dataset. Files of a hemisphere lie in `sub-X[/ses-Y]/anat/`
+and begin with `sub-X[_ses-Y]_hemi-<L|R>`. `P` is the segmentation protocol. Regions other than the
+body have `label-NAME` after `seg-P`. Missing values are `n/a` in tables and NaN in GIFTI files.
 
-Axes mean the same on both sides: x runs from medial (subiculum) to lateral (CA3), y from posterior
-to anterior, z from interior to exterior. Head and tail are part of no number."""
+The axes have the same meaning in both hemispheres. Axis x runs from the medial to the lateral edge,
+and y from the posterior to the anterior end plane. Axis z runs from the interior to the exterior
+wall. Head and tail are excluded from all numbers of the body. [Measures](measures.md) defines the
+measures."""
+
+SIDECARS_TEXT = """\
+Each table has a JSON file with the columns and units. Each image has a JSON file with its inputs
+(`Sources`); images with the same suffix may share the file. With an option or another command:"""
 
 SOURCES_TEXT = """\
-`SourceDatasets` and `DatasetLinks` in `dataset_description.json` say where the segmentations are,
-as a path relative to the output folder, so that both may move together. If the output moves alone,
-pages made anew (`--reports-only`) draw no labels, and the group level needs `--segmentations DIR`,
-until the participant level has run there or the links are corrected. Where the way there leads
-through the root of the file system, the folder is written as you spelled it, `file:///...`. In a
-container that is a path inside it, unless folders are mounted where they are outside: with
-`-v /data:/data`, `/data/study` and `/data/study-hipsta` mean the same on both sides.
+`dataset_description.json` names the folders of the segmentations (`SourceDatasets`,
+`DatasetLinks`), relative to the output folder. Move both folders together. If only the output
+moves, `--reports-only` draws no labels, and the group level needs `--segmentations DIR`. Folders
+that are reached through the root of the file system have absolute paths. In a container, mount
+folders at the path that they have outside (`-v /data:/data`).
 
-`GeneratedBy` has the version; in a container image also `Container`; and `CodeURL`, where the image
-(`HIPSTA_BIDS_CODE_URL`) or the metadata of the package know it."""
+`GeneratedBy` has the version, and in a container image `Container` and `CodeURL`."""
 
 IGNORED_TEXT = """\
 The dataset passes the [BIDS validator](https://github.com/bids-standard/bids-validator) without
-errors. BIDS 1.11 has no names for some of its files. They have entities in its order, and the
-suffixes of the proposal for structural derivatives (BEP011) where it has one. `.bidsignore` lists
-them, below; a sidecar has the ending of what it is about, so both are hidden by one line.
+errors. BIDS 1.11 has no names for some files. `.bidsignore` lists the patterns of these files, with
+the reason. Their entities follow the order of BIDS, and their suffixes the proposal for structural
+derivatives (BEP011).
 
-Each table has a JSON file beside it. Surfaces, maps, labels and masks follow the inheritance
-principle: what is the same for all (`Description`, `Units`, `SpatialReference`) is said once, by
-`thickness.json` and others in the root; `Sources`, which differ, by a file beside the images. No
-image has two sidecars in a folder, so images share one if the name of one of them has no `desc`:
-`curv.json` is about all curvatures and says by `desc` what differs, `interior.json` about the
-surface in both spaces. `SpatialReference` is `orig`, the scanner RAS of the segmentation, in mm, or
-in words. Units of maps are in the GIFTI files, too."""
+Properties of all images with one suffix (`Description`, `Units`, `SpatialReference`) are in the
+root, for example in `thickness.json`. `SpatialReference` is `orig` for the scanner RAS space of the
+segmentation, in mm."""
+
+TABLES_TEXT = """\
+`desc-sections_morph.tsv` has one row per cross-section from posterior to anterior, with `y` and
+{sections}.
+
+`desc-summary_morph.tsv` has one row, with {summary}, and per subfield {subfields}.
+
+`desc-profile_morph.tsv` has one row per `axis` and `node`, with each map of the sheet table
+averaged over the other axis, weighted by area.
+
+`desc-layers_morph.tsv` (`--write-meshes`) has one row per point of the three-dimensional grid:"""
 
 COLUMNS_TEXT = """\
-Which table has which is said in [Group level](group.md#what-is-written) and in the `.json` beside
-each."""
+The JSON file beside each table describes its columns. `_low` and `_high` end the names of
+confidence limits, `_se` of standard errors, `_cv_sd` of SDs over repeats. `pN` is centile N at the
+average site, `below_N` the cross-validated share below centile N (5, 25, 50, 75, 95)."""
 
 SETTINGS_TEXT = """\
-Every number that changes a result. `hipsta-bids settings` prints those of the participant level
-as a TOML file, `hipsta-bids settings group` those of the group level. Change what you need, keep
-the rest out, and give the file with `--settings`:"""
+Settings change results. `hipsta-bids settings` prints the settings of the participant level as a
+TOML file, `hipsta-bids settings group` the settings of the group level. Keep the lines that you
+change, and give the file with `--settings`:"""
 
 ONE_SET_TEXT = """\
-One output folder holds results of one set of settings. Do not pool results of different settings.
-Numbers that nobody has a reason to change are constants in the code, with their meaning."""
+An output folder holds results of one set of settings. Do not pool results of different settings.
+Below are the settings that users change; [All settings](settings-all.md) has the others. Many of
+them have an option on the [command line](command-line.md)."""
+
+REST_TEXT = """\
+Limits, sizes and iterations, beside the [settings that users change](settings.md). The defaults are
+the values of the [validation](validation.md)."""
+
+#: Settings that users change, of the participant and of the group level.
+CHANGED: Mapping[str, str] = {
+    "body": "region layer_rule join_every_layer end_rule end_margin mending",
+    "boundaries": "operator edges",
+    "sheet": "x_nodes y_nodes z_nodes x_coordinate depths",
+    "uncertainty": "relabeling end_shift",
+    "maps": "min_known",
+    "surrogate": "positions",
+    "registration": "align standardize",
+    "model": "group_columns reference_levels covariates age icv_columns",
+    "design": "factors mixed",
+    "glm": "covariance",
+    "longitudinal": "random",
+    "harmonization": "column",
+    "asymmetry": "relative",
+    "multiplicity": "method scope alpha permutations blocks",
+    "joint": "measures",
+    "classification": "base added",
+    "meta": "model random",
+}
 
 REASONS_TEXT = """\
-Every reason has a short name that programs can read: in the column `reason` of `status.tsv`, in
-`desc-qc_metrics.json`, and in the group level's `excluded.tsv`. The message beside it says where,
-with the numbers. Here is what the names mean, in the order of what to do."""
+A reason is a short name for programs. It is in the column `reason` of `status.tsv` and
+`measures.tsv`, in `desc-qc_metrics.json`, and in `excluded.tsv` of the group level. The message
+beside it gives place and numbers. This page lists the reasons by the action that they need."""
 
 OPTIONS_TEXT = """\
-`hipsta-bids BIDS_DIR OUTPUT_DIR participant` measures, `... group` compares. Other commands:
-`demo`, `phantom`, `surrogate`, `meta`, `resample`, `settings`, `protocols`. All print
-these texts with `--help`. Options accept underscores instead of hyphens (`--n_procs`)."""
+`hipsta-bids BIDS_DIR OUTPUT_DIR participant` measures; `hipsta-bids BIDS_DIR OUTPUT_DIR group`
+analyzes. The commands `demo`, `demo-data`, `phantom`, `surrogate`, `meta`, `resample`, `settings`
+and `protocols` print their options with `--help`, as both levels do; `--version` prints the
+version. Options accept underscores instead of hyphens (`--n_procs`)."""
 
-_SHARED_TEXT = "of all images with these endings: what they are, unit, space"
+_SHARED_TEXT = "properties of all images with these suffixes"
 
 _DATASET_FILES = {
-    "description": "what BIDS asks for, with versions and sources",
-    "readme": "what is where; written unless there is a README",
-    "ignore": "which files are [not in the standard](#names-that-bids-does-not-have)",
-    "settings": "all settings of these results, and their hash",
-    "citation": "a methods paragraph with references, for your article",
+    "description": "description of the dataset, with versions and sources",
+    "readme": "overview; an existing README is kept",
+    "ignore": "files that are [not in the standard](#bids)",
+    "settings": "all settings, and their hash",
+    "citation": "methods paragraph with references",
     "status": "one row per hemisphere: decision, reason, message, time per stage, peak memory",
-    "status_sidecar": "its columns",
-    "measures": "one row per hemisphere: decision, rating, origin, all summary measures",
-    "measures_sidecar": "its columns, with units",
-    "ratings": "[ratings](running.md#review), if you save them there",
-    "inputs": "each hemisphere, file and folder of the inputs: used or not, and why",
-    "inputs_sidecar": "its columns",
+    "measures": "one row per hemisphere: decision, rating, origin of the labels, summary measures",
+    "ratings": "ratings that were saved from the pages",
+    "inputs": "each hemisphere, file and folder of the inputs: used or not, and the reason",
     "logs": "one file per run",
-    "group": "results of the [group level](group.md#what-is-written), one folder per model",
-    "report": "all hemispheres; beside it a page per participant and session",
+    "group": "results of the [group level](group.md), one folder per model",
+    "report": "page of all hemispheres; each participant and session has a page beside it",
 }
 
 
 def outputs_page() -> str:
     """Write the page of files and columns."""
     place, state, layers = (
-        [(name, about[1] if about[1:] else None, about[0]) for name, about in columns.items()]
+        [(name, about[1] if about[1:] else "", about[0]) for name, about in columns.items()]
         for columns in (NODES | POSITION, STATE, LAYERS)
     )
-    columns = ("column", "unit", "what it is")
+    columns = ("column", "unit", "meaning")
     parts = [
         "# Outputs",
         OUTPUTS_TEXT,
         "## Files of a hemisphere",
-        _table(("file", "content"), _files(OUTPUTS)),
-        "With an option or another command:",
-        _table(("file", "content"), _files(EXTRA_OUTPUTS)),
+        table(("file", "content"), _files(OUTPUTS)),
+        SIDECARS_TEXT,
+        table(("file", "content"), _files(EXTRA_OUTPUTS)),
         "## Files of the dataset",
-        _table(
+        table(
             ("file", "content"),
             (
-                *((f"`{name}`", _DATASET_FILES[key]) for key, name in DATASET_FILES.items()),
+                *((f"`{DATASET_FILES[key]}`", text) for key, text in _DATASET_FILES.items()),
                 (", ".join(f"`{row.for_all}`" for row in SHARED), _SHARED_TEXT),
             ),
         ),
         "## Sources",
         SOURCES_TEXT,
-        "## Names that BIDS does not have",
+        "## BIDS",
         IGNORED_TEXT,
-        _table(
-            ("files", "why"),
-            ((f"`{pattern.lstrip('/')}`", why) for pattern, why in IGNORED.items()),
-        ),
         "## Columns of `desc-sheet_morph.tsv`",
-        "One row per point of the sheet.",
-        _table(columns, _named([*place, *_measures(MAPS), *state])),
-        "## Columns of `desc-sections_morph.tsv`",
-        "One row per cross-section, `y` from the posterior to the anterior end.",
-        _table(columns, _named(_measures(SECTIONS))),
-        "## Columns of `desc-summary_morph.tsv`",
-        "One row per hemisphere.",
-        _table(columns, _named(_measures(SUMMARY))),
-        "And per subfield:",
-        _table(columns, _named(_measures(PER_SUBFIELD, ending="_NAME"))),
-        "## Columns of `desc-profile_morph.tsv`",
-        "`axis`, `node`, and the maps of the sheet table, averaged over the other axis by area.",
-        "## Columns of `desc-layers_morph.tsv`",
-        "One row per point of the three-dimensional grid (`--write-meshes`).",
-        _table(columns, _named(layers)),
-        "## Columns of the group level's tables",
-        COLUMNS_TEXT,
-        _table(
-            ("column", "what it is"),
-            ((f"`{k}`", v) for k, v in {**COLUMNS, **JOINT_COLUMNS, **COLUMNS}.items()),
+        f"One row per grid point, with the measures {_measures(MAPS)}, and:",
+        table(columns, _named([*place, *state])),
+        "## Columns of the other tables",
+        TABLES_TEXT.format(
+            sections=_measures(SECTIONS),
+            summary=_measures(SUMMARY),
+            subfields=_measures(PER_SUBFIELD, ending="_NAME"),
         ),
+        table(columns, _named(row for row in layers if row not in place)),
+        "## Columns of the group level",
+        COLUMNS_TEXT,
+        table(("column", "meaning"), _group_columns()),
     ]
     return _page(parts)
 
 
 def _files(outputs: Iterable[Output]) -> Iterator[tuple[str, str]]:
+    """Name the files but for sidecars; maps by their measure."""
     name = HemisphereName(subject="X", session=None, hemi="L", seg="P")
+    measures = {row.name: f"map of `{row.name}`, {row.unit}" for row in MAPS}
     for output in outputs:
+        if output.extension == ".json" and output.key != "qc":
+            continue
         desc = "NAME" if output.desc == "*" else None
         spelled = output_name(name, output.key, desc).removeprefix(name.stem)
-        yield f"`{spelled}`", output.description
+        yield f"`{spelled}`", measures.get(output.key, output.description)
 
 
-def _measures(rows: Iterable[Column], ending: str = "") -> list[tuple[str, str, str]]:
-    words = "the subfield"
-    return [(f"{x.name}{ending}", x.unit, x.definition.format(words)) for x in rows]
+def _measures(rows: Iterable[Column], ending: str = "") -> str:
+    """List names of measures, with their units."""
+    units = {"1": ""}
+    named = ((f"`{x.name}{ending}`", units.get(x.unit, f" ({x.unit})")) for x in rows)
+    return ", ".join(f"{name}{unit}" for name, unit in named)
 
 
-def _named(rows: Iterable[tuple[str, str | None, str]]) -> Iterator[tuple[str, str, str]]:
-    return ((f"`{name}`", unit or "", words) for name, unit, words in rows)
+def _named(rows: Iterable[tuple[str, str, str]]) -> Iterator[tuple[str, str, str]]:
+    return ((f"`{name}`", unit, words) for name, unit, words in rows)
+
+
+def _group_columns() -> Iterator[tuple[str, str]]:
+    """Explain the columns of the group level whose names do not follow a rule of the page."""
+    ruled = re.compile(r".+_(low|high|se|cv_sd)|(p|below_)\d+")
+    for name, words in {**JOINT_COLUMNS, **COLUMNS}.items():
+        if not ruled.fullmatch(name) and words not in {name, name.removesuffix("_id")}:
+            yield f"`{name}`", words
 
 
 def settings_page() -> str:
-    """Write the page of settings of both levels."""
+    """Write the page of the settings that users change."""
     parts = [
         "# Settings",
         SETTINGS_TEXT,
         '```toml\n[sheet]\nx_nodes = 61\n\n[body]\nlayer_rule = "nearest-label"\n```',
         ONE_SET_TEXT,
-        "## Participant level",
-        _table(("setting", "default", "meaning"), _stages(Settings())),
-        "## Group level",
-        _table(("setting", "default", "meaning"), _stages(GroupSettings())),
+        *_levels(lambda stage, name: name in CHANGED.get(stage, "").split()),
     ]
     return _page(parts)
 
 
-def _stages(settings: Settings | GroupSettings) -> Iterator[tuple[str, str, str]]:
-    for name, stage in settings:
-        yield f"**{name}**", "", f"**{_words(inspect.getdoc(type(stage)))}**"
-        for key, field in type(stage).model_fields.items():
-            value = json.dumps(getattr(stage, key))
-            yield f"`{name}.{key}`", f"`{value}`", _words(field.description)
+def all_settings_page() -> str:
+    """Write the page of the other settings."""
+    parts = [
+        "# All settings",
+        REST_TEXT,
+        *_levels(lambda stage, name: name not in CHANGED.get(stage, "").split()),
+    ]
+    return _page(parts)
+
+
+def _levels(listed: Callable[[str, str], bool]) -> Iterator[str]:
+    """Write a section per level with the settings that are listed."""
+    for title, settings in (("Participant", Settings()), ("Group", GroupSettings())):
+        yield f"## {title} level"
+        yield table(("setting", "default", "meaning"), _settings(settings, listed))
+
+
+def _settings(
+    settings: Settings | GroupSettings, listed: Callable[[str, str], bool]
+) -> Iterator[tuple[str, str, str]]:
+    """Name settings with default and meaning; settings with the same texts share a row."""
+    names: dict[tuple[str, str], list[str]] = {}
+    for stage, values in settings:
+        for name, field in type(values).model_fields.items():
+            if listed(stage, name):
+                texts = json.dumps(getattr(values, name)), _words(field.description)
+                names.setdefault(texts, []).append(f"`{stage}.{name}`")
+    return ((", ".join(rows), f"`{value}`", words) for (value, words), rows in names.items())
 
 
 def _words(text: str | None) -> str:
@@ -215,15 +267,11 @@ def _words(text: str | None) -> str:
 
 def reasons_page() -> str:
     """Write the page of flags, refusals and what to do about them."""
-    table = read_table("reasons.toml")
-    sections = table["section"]
-    where = ((section["title"], " ".join(section["text"].split())) for section in sections)
-    parts = [
-        "# Flags and refusals",
-        REASONS_TEXT,
-        _table(("where a reason is given", "what it says"), where),
-    ]
-    for action, title in table["actions"].items():
+    reasons_table = read_table("reasons.toml")
+    sections = reasons_table["section"]
+    where = [f"- **{section['title']}**: {_words(section['text'])}" for section in sections]
+    parts = ["# Flags and refusals", REASONS_TEXT, "\n".join(where)]
+    for action, title in reasons_table["actions"].items():
         parts.append(f"## {title}")
         for section in sections:
             rows = section["reasons"].items()
@@ -231,17 +279,14 @@ def reasons_page() -> str:
             parts += [f"**{section['title']}**"] if reasons else []
             # A heading for each, so that it can be searched for and linked to.
             for name, row in sorted(reasons.items()):
-                parts += [f"#### `{name}`", f"{row['meaning']}\n**Try:** {row['remedy']}"]
-    codes = ((str(int(code)), words) for code, words in EXIT_MEANINGS.items())
-    return _page([*parts, "## Exit codes", _table(("code", "meaning"), codes)])
+                parts += [f"#### `{name}`", f"{_words(row['meaning'])} *{_words(row['remedy'])}*"]
+    return _page(parts)
 
 
 def options_page() -> str:
     """Write the page of all options of all commands."""
-    parts = [
-        "# Command line",
-        OPTIONS_TEXT,
-    ]
+    parts = ["# Command line", OPTIONS_TEXT]
+    described: dict[tuple[str, str], str] = {}
     for title, parser in (
         ("Participant level", build_parser()),
         ("Group level", group_parser()),
@@ -251,14 +296,24 @@ def options_page() -> str:
         ("hipsta-bids resample", resample_parser()),
     ):
         parts.append(f"## {title}")
-        for group in parser._action_groups:  # noqa: SLF001  (argparse shows nothing in public)
-            rows = [_option(a) for a in group._group_actions if a.help != argparse.SUPPRESS]  # noqa: SLF001
-            if rows:
-                parts += [
-                    f"**{str(group.title).capitalize()}**",
-                    _table(("option", "meaning"), rows),
-                ]
-    return _page(parts)
+        groups = {
+            str(group.title).capitalize(): [
+                _option(a)
+                for a in group._group_actions  # noqa: SLF001  (argparse shows nothing in public)
+                if a.help != argparse.SUPPRESS and a.dest not in {"help", "version"}
+            ]
+            for group in parser._action_groups  # noqa: SLF001
+        }
+        repeated: dict[str, list[str]] = {}
+        for name, rows in groups.items():
+            new = [row for row in rows if described.setdefault(row, title) == title]
+            parts += [f"**{name}**", table(("option", "meaning"), new)] if new else []
+            for row in rows:
+                repeated.setdefault(described[row], []).append(row[0].split(", ")[0])
+        repeated.pop(title, None)
+        parts += [f"As under {where}: {', '.join(rows)}." for where, rows in repeated.items()]
+    codes = ((str(int(code)), words) for code, words in EXIT_MEANINGS.items())
+    return _page([*parts, "## Exit codes", table(("code", "meaning"), codes)])
 
 
 def _option(action: argparse.Action) -> tuple[str, str]:
@@ -279,9 +334,10 @@ def _escape(text: str) -> str:
     return re.sub(r"([*_<>\[\]])", r"\\\1", " ".join(text.split()))
 
 
-def _table(headings: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> str:
+def table(headings: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> str:
+    """Write a table in Markdown."""
     lines = [headings, ("---",) * len(headings), *rows]
-    return "\n".join(f"| {' | '.join(x.replace('|', '&#124;') for x in line)} |" for line in lines)
+    return "\n".join(f"|{' |'.join(x.replace('|', '&#124;') for x in line)}|" for line in lines)
 
 
 def _page(parts: Iterable[str]) -> str:
@@ -292,6 +348,7 @@ def _page(parts: Iterable[str]) -> str:
 PAGES: Mapping[str, Callable[[], str]] = {
     "outputs.md": outputs_page,
     "settings.md": settings_page,
+    "settings-all.md": all_settings_page,
     "reasons.md": reasons_page,
     "command-line.md": options_page,
 }

@@ -1,4 +1,4 @@
-"""Hook of MkDocs: notebooks, and files that pages link to beside docs/, become pages."""
+"""Hook of MkDocs: notebooks, tables of the validation and files beside docs/ become pages."""
 
 import re
 import sys
@@ -13,12 +13,27 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "tools")]
 
 from notebooks import notebook_page  # noqa: E402
+from validation_pages import FOLDER, appendix, site_link  # noqa: E402
 
 #: Folder of notebooks, below docs/.
 NOTEBOOKS = "notebooks"
 
 #: Pages of the site that lie beside docs/.
 BESIDE = ("CONTRIBUTING.md", "CHANGELOG.md")
+
+#: Weights of pages in the search, by their section of the navigation: a question is answered by a
+#: guide, a name by the reference. Pages without a section weigh 1.
+WEIGHTS = {"Tutorials": 1.0, "Guides": 3.0, "Reference": 1.5, "Explanation": 0.5}
+
+#: Weights of other pages: long lists, notebooks, and the tables of the validation.
+LISTS = {
+    "CHANGELOG.md": 0.1,
+    "CONTRIBUTING.md": 0.1,
+    "api.md": 0.3,
+    "settings-all.md": 0.5,
+    NOTEBOOKS: 0.5,
+    FOLDER: 0.05,
+}
 
 _LINK = re.compile(r"(?<=\]\()(?![a-z]+:|#)(?P<path>[^)#\s]+)")
 
@@ -28,7 +43,7 @@ def on_config(config: MkDocsConfig) -> None:
     text = Path(str(config.config_file_path)).read_text(encoding="utf-8")
     pages = sorted(path.name for path in Path(config.docs_dir).glob("*.md"))
     last = (config.nav or [])[-1]
-    last["Background"] += [name for name in pages if f" {name}\n" not in text]
+    last["Explanation"] += [name for name in pages if f" {name}\n" not in text]
 
 
 def on_files(files: Files, *, config: MkDocsConfig) -> None:
@@ -44,14 +59,20 @@ def on_files(files: Files, *, config: MkDocsConfig) -> None:
         files.append(File.generated(config, page, content=f"{text}\n{link}"))
         for name, content in figures.items():
             files.append(File.generated(config, f"{NOTEBOOKS}/{name}", content=content))
+    for name, page in appendix():
+        files.append(File.generated(config, f"{FOLDER}/{name}", content=page))
 
 
 def on_page_markdown(markdown: str, *, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Turn links between the files of the repository into links between pages."""
+    """Turn links between the files of the repository into links between pages, and weigh pages."""
     del config, files
+    *_, section = ["", *(str(item.title) for item in page.ancestors)]
+    place = page.file.src_uri.partition("/")[0]
+    weight = LISTS.get(place, WEIGHTS.get(section, 1.0))
+    page.meta.setdefault("search", {"boost": weight})
     if page.file.src_uri in BESIDE:
         return _LINK.sub(lambda found: found["path"].removeprefix("docs/"), markdown)
-    if page.file.src_uri.startswith(f"{NOTEBOOKS}/"):
+    if page.file.src_uri.startswith((f"{NOTEBOOKS}/", f"{FOLDER}/")):
         return markdown
     if page.file.src_uri.count("/"):  # a page from a folder beside docs/: its links stay there
         return _LINK.sub(r"#", markdown)
@@ -69,4 +90,6 @@ def _beyond(text: str) -> Iterator[str]:
 def _inside(path: str) -> str:
     if path.endswith(".ipynb"):
         return f"{path.removesuffix('.ipynb')}.md"
+    if path.endswith(".tsv"):
+        return site_link(path)
     return "index.md" if path == "../README.md" else path.removeprefix("../")

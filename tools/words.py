@@ -46,6 +46,8 @@ BUDGETS = Path(__file__).with_suffix(".toml")
 #: A word for whatever is computed, and for code.
 _PLACEHOLDER = "X1"
 _WORD = re.compile(r"\S*[^\W_]\S*")
+#: A list of code, each perhaps with a unit.
+_CODES = re.compile(r"X1( \([^()]{1,6}\))?(,\s+(and |or )?X1( \([^()]{1,6}\))?)+")
 _END = re.compile(r"(?<=[.?!])(?:\{\w+\}|X1)*[)\"]?\s+(?=[A-Z\"(`*\[])|\n\s*\n|\n {2,}|\n[-*] ")
 _ABBREVIATIONS = re.compile(r"\b(et al|e\.g|i\.e|cf|vs|Fig|Eq|No|approx)\.")
 
@@ -191,9 +193,10 @@ def script_texts(source: str) -> Iterator[Text]:
 
 
 def _prose(text: str) -> str:
-    """Return Markdown without code, addresses and comments: code is a word each."""
+    """Return Markdown without code, addresses and comments: code, or a list of it, is a word."""
     text = re.sub(r"<!--.*?-->", " ", text, flags=re.DOTALL)
     text = re.sub(r"``?[^`]+``?", _PLACEHOLDER, text)
+    text = _CODES.sub(_PLACEHOLDER, text)
     text = re.sub(r"!?\[([^\]]*)\]\([^)]*\)", r"\1", text)
     return re.sub(r"https?://\S+", _PLACEHOLDER, text)
 
@@ -246,7 +249,7 @@ def _read(path: Path) -> list[Text]:
 
 
 #: Files with methods texts.
-METHODS = ("methods.py", "texts.toml")
+METHODS = ("methods.py", "question_methods.py", "texts.toml")
 
 #: Files whose texts are read.
 FILES = (
@@ -267,6 +270,13 @@ def files(root: Path) -> Iterator[Path]:
     """Return the files of the program and of the docs that are checked."""
     for pattern in FILES:
         yield from (path for path in sorted(root.glob(pattern)) if ".min." not in path.name)
+
+
+def _expanded(paths: Sequence[Path]) -> Iterator[Path]:
+    """Return files, and the checked files of folders; all checked files without paths."""
+    checked = list(files(Path()))
+    for path in paths or [Path()]:
+        yield from (f for f in checked if path in f.parents) if path.is_dir() else [path]
 
 
 def lines(path: Path) -> list[str]:
@@ -290,9 +300,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--list", action="store_true", help="print file:line problem instead")
     parser.add_argument("--lower", action="store_true", help="lower the budgets to the counts")
-    parser.add_argument("paths", nargs="*", type=Path, help="default: the program and the docs")
+    parser.add_argument("paths", nargs="*", type=Path, help="files or folders (default: all)")
     options = parser.parse_args(arguments)
-    rows_of = {str(path): lines(path) for path in options.paths or files(Path())}
+    rows_of = {str(path): lines(path) for path in _expanded(options.paths)}
     if options.list:
         sys.stdout.writelines(f"{line}\n" for rows in rows_of.values() for line in rows)
         return 0

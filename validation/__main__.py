@@ -1,4 +1,4 @@
-"""``python -m validation``: run the suites and write their report; from a checkout."""
+"""``python -m validation``: run the suites and write their tables; from a checkout."""
 
 import sys
 from collections.abc import Sequence
@@ -7,7 +7,7 @@ from pathlib import Path
 from hipsta_bids.cli.console import echo, warn
 from hipsta_bids.cli.parser import Parser, adder
 from hipsta_bids.errors import HipstaError
-from validation.report import PAGE, validate
+from validation.report import validate
 
 
 def build_parser() -> Parser:
@@ -15,12 +15,15 @@ def build_parser() -> Parser:
     parser = Parser(
         prog="python -m validation",
         description="measure phantoms with known truth; write tables and figures",
-        epilog="the exit code is 0 whether or not targets are met: the report says which are",
+        epilog="the exit code is 0 whether or not targets are met: the tables show which are",
     )
     add = adder(parser)
     add("--full", "", "all cases, minutes instead of a quick selection")
     add(
-        "--out", "DIR", "folder for validation.md and images/ (default: docs)", default=Path("docs")
+        "--out",
+        "DIR",
+        "folder for the files of these suites; others stay (default: build/validation)",
+        default=Path("build/validation"),
     )
     add("--suite", "NAME", "only these suites", nargs="+", default=[])
     add(
@@ -50,7 +53,7 @@ def main(arguments: Sequence[str]) -> int:
     except HipstaError as error:
         warn(f"{error}")
         return error.exit_code
-    echo(f"targets missed: {missed}; report: {options.out / PAGE}")
+    echo(f"targets missed: {missed}; report: {options.out}")
     return 0
 
 

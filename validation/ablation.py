@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 
 from hipsta_bids.inputs.labels import read_label_volume
-from hipsta_bids.inputs.search import HemisphereInput
 from hipsta_bids.phantom import Phantom, PhantomSpec
 from hipsta_bids.settings import PUBLISHED, Settings
 from hipsta_bids.types import Decision
 from validation import cases, continuity
+from validation.labelings import Revision, revisions
 from validation.report import Cell, Cells, Content, suite, table
 
 SEED = 20242
@@ -51,15 +51,6 @@ class Drawing:
     settings: Settings
 
 
-@dataclass(frozen=True, kw_only=True)
-class Revision:
-    """Two sets of labels of one hemisphere."""
-
-    first: HemisphereInput
-    second: HemisphereInput
-    settings: Settings
-
-
 def measure_error(drawing: Drawing) -> tuple[float, float]:
     """Measure the mean and the SD of a phantom's error of thickness, mm."""
     case = drawing.case
@@ -83,20 +74,6 @@ def compare_revision(revision: Revision) -> tuple[float, float, bool]:
         cases.rms(pair[0] - pair[1]),
         flagged[0] == flagged[1],
     )
-
-
-def revisions(labels: Path | None, settings: Settings) -> list[Revision]:
-    """Pair the sets A and B of each brain in the revised dataset beside ``labels``."""
-    if labels is None:
-        return []
-    folder = labels.absolute().parent / f"{labels.absolute().name}-revised"
-    items = cases.fine_segmentations(folder, 0.6) if folder.is_dir() else []
-    sets = {(item.subject, item.hemi): item for item in items}
-    return [
-        Revision(first=item, second=sets[subject[:-1] + "B", hemi], settings=settings)
-        for (subject, hemi), item in sets.items()
-        if subject.endswith("A") and (subject[:-1] + "B", hemi) in sets
-    ]
 
 
 @suite("ablation")

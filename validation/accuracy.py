@@ -31,10 +31,8 @@ MAX_GAUSSIAN_ERROR = 0.005
 """1/mm2, root mean square over the middle of the sheet, on straight extrusions."""
 #: Summary measures by the title of their table.
 SIZES = {
-    "Volume, areas and extents": (
-        *("volume", "area_interior", "area_mid", "area_exterior", "extent_x", "extent_y"),
-    ),
-    "Cross-sections and ratios": (
+    "sizes": (*("volume", "area_interior", "area_mid", "area_exterior", "extent_x", "extent_y"),),
+    "sections": (
         *("circumference_mean", "interior_exterior_ratio_mean", "section_area_mean"),
         *("shape_index_mean", "area_ratio", "surface_volume_ratio"),
     ),
@@ -103,8 +101,8 @@ def run(full: bool) -> Iterator[Content]:
     yield _thickness_table(results)
     yield _curvature_table(results)
     yield _gaussian_table(results)
-    for title in SIZES:
-        yield _size_table(results, title)
+    for key, names in SIZES.items():
+        yield table(f"accuracy.{key}")(_size_rows)(results, names)
     yield _error_picture(results)
     yield {"poses": poses}
 
@@ -201,13 +199,12 @@ def _middles(results: Results, names: Sequence[str]) -> Iterator[tuple[Row, str,
                 yield row, surface, true, found
 
 
-@table("accuracy.sizes")
-def _size_table(results: Results, title: str) -> Iterator[Cells]:
+def _size_rows(results: Results, names: Sequence[str]) -> Iterator[Cells]:
     for row, group in _measured(results).items():
         errors = {
             name.removesuffix("_mean").replace("_", " "): 100.0
             * float(np.mean([m.summary[name] / m.true_summary[name] - 1.0 for m in group]))
-            for name in SIZES[title]
+            for name in names
         }
         yield {
             "phantom": row.name,

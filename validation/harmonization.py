@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import ndimage
 
-from hipsta_bids.group.design.formula import Contrast
+from hipsta_bids.group.design.contrasts import Contrast
 from hipsta_bids.group.design.settings import GroupSettings
 from hipsta_bids.group.stats.arrays import Float, Int
 from hipsta_bids.group.stats.combat import Visits, fit_effects, harmonize

@@ -1,10 +1,11 @@
-"""Validation suites: their tables with targets, their figures, and the page ``validation.md``."""
+"""Validation suites: their tables with targets, their figures, and the files of both."""
 
 import platform
-import re
+import subprocess
 import tomllib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from functools import wraps
 from importlib import import_module, resources
 from importlib.metadata import version
@@ -31,14 +32,10 @@ WITH_LABELS = frozenset(name for name, row in _TABLE.items() if row.get("labels"
 #: What each suite asks, as the sentence that would hold if all its targets were met.
 QUESTIONS: Mapping[str, str] = {name: row["question"] for name, row in _TABLE.items()}
 
-#: What is written, below the output folder.
-PAGE = "validation.md"
-IMAGES = "images"
+#: How a target that was met, or missed, is written.
+MET, MISSED = "met", "missed"
 
 _DPI = 100
-#: Missed targets of a table that are named; of more the number is said.
-_NAMED = 3
-_MET, _MISSED = "#0072b2", "#e69f00"  # told apart also by those who see no red or no green
 _LIBRARIES = ("numpy", "scipy", "scikit-image", "lapy", "tetgen")
 
 #: A float is shown with the table's number of digits, a bool as met or missed, None as n/a.
@@ -52,6 +49,8 @@ Cells = Mapping[str, Cell]
 class Table:
     """One table of the report."""
 
+    name: str = ""
+    """As in ``suites.toml``; part of the file's name."""
     title: str
     rows: Sequence[Cells]
     """The longest one has all headings, in order; the others may lack cells."""
@@ -80,23 +79,9 @@ class Table:
         """Number of targets: cells that are True or False."""
         return sum(isinstance(cell, bool) for row in self.rows for cell in row.values())
 
-    @property
-    def misses(self) -> list[str]:
-        """Name the rows with missed targets, by as many first cells as tell rows apart."""
-        cells = [[show(row.get(name), self.digits) for name in self.columns] for row in self.rows]
-        size = next(
-            (
-                n
-                for n in range(1, len(self.columns))
-                if len({*(tuple(c[:n]) for c in cells)}) == len(cells)
-            ),
-            1,
-        )
-        return [
-            ", ".join(c[:size])
-            for c, row in zip(cells, self.rows, strict=True)
-            if False in (cell for cell in row.values() if isinstance(cell, bool))
-        ]
+    def file(self, suite: str) -> str:
+        """Name the file of this table of a suite."""
+        return f"{suite}--{self.name}.tsv"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,7 +89,7 @@ class Picture:
     """One figure of the report, drawn when it is written, so that suites need no plotting."""
 
     name: str
-    """Of the file: ``validation-<name>.png``."""
+    """Of the suite, and of the file."""
     caption: str
     """One sentence or two: what is shown, units; also the text for those who cannot see it."""
     draw: "Callable[[Figure], None]"
@@ -115,7 +100,7 @@ class Picture:
     @property
     def file(self) -> str:
         """Name of the file."""
-        return f"validation-{self.name}.png"
+        return f"{self.name}.png"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -164,6 +149,7 @@ def table(
             values = rows.__globals__ | signature(rows).bind(*args, **kwargs).arguments
             found = list(rows(*args, **kwargs))
             return Table(
+                name=key,
                 title=texts["title"].format_map(values),
                 rows=[row for row in found if not isinstance(row, str)],
                 notes=texts.get("notes", "").format_map(values)
@@ -243,7 +229,7 @@ def validate(
     labels: Path | None = None,
     report: Callable[[str], None] = lambda _: None,
 ) -> int:
-    """Run suites, write their report, and count the targets that were missed."""
+    """Run suites, write the files of each, and count the targets that were missed."""
     unknown = [name for name in names if name not in SUITES]
     if unknown:
         raise UsageError(
@@ -252,115 +238,57 @@ def validate(
             reason="unknown-suite",
         )
     files.check_writable(out)
-    suites, missed = [], 0
+    missed, code = 0, commit()
     for name in names or SUITES:
         suite = run_suite(name, full=full, labels=labels)
-        suites.append(suite)
+        options = (" --full" if full else "") + (" --labels BIDS_DIR" if labels else "")
+        write(suite, out, f"python -m validation --suite {name}{options}", code)
         missed += suite.missed
         report(f"{suite.title}: {suite.targets - suite.missed} of {suite.targets} targets met")
-    for picture in (overview(suites), *(p for suite in suites for p in suite.pictures)):
-        files.write_bytes(out / IMAGES / picture.file, render(picture))
-    files.write_text(out / PAGE, page(suites, full=full, labels=labels is not None))
     return missed
 
 
-def page(suites: Sequence[Suite], *, full: bool, labels: bool = False) -> str:
-    """Write the page in Markdown."""
-    names = [suite.name for suite in suites]
-    command = "hipsta-bids validate" + (" --full" if full else "")
-    command += "" if names == list(SUITES) else " --suite " + " ".join(names)
-    command += " --labels BIDS_DIR" if labels else ""
-    python = f"Python {platform.python_version()}"
-    libraries = ", ".join([python, *(f"{name} {version(name)}" for name in _LIBRARIES)])
-    counts: list[Cells] = [
-        {"suite": one.title, "table": t.title, "targets": t.targets, "missed": t.missed}
-        for one in suites
-        for t in one.tables or (Table(title="left out", rows=()),)
-    ]
-    intro = (
-        f"Written by `{command}` of hipsta_bids {__version__} ({libraries}). The same command"
-        " with the same versions gives the same numbers."
-    )
-    parts = [
-        f"<!-- Written by `{command}`; do not edit, run it again. -->",
-        "# Validation",
-        opening(suites),
-        intro,
-        markdown(Table(title="Overview", rows=counts)),
-        *(_section(suite) for suite in suites),
-    ]
-    return "\n\n".join(parts) + "\n"
+def write(suite: Suite, out: Path, command: str, code: str) -> None:
+    """Write a suite: a table per TSV file, its figures, and their texts as JSON.
+
+    Replaces the files of this suite, and leaves those of others as they are. ``code`` is the commit
+    that was run.
+    """
+    files.remove(out.glob(f"{suite.name}--*.tsv"))
+    for one in suite.tables:
+        rows = [[show(row.get(name), one.digits) for name in one.columns] for row in one.rows]
+        files.write_tsv(out / one.file(suite.name), one.columns, rows)
+    for picture in suite.pictures:
+        files.write_bytes(out / picture.file, render(picture))
+    libraries = {name: version(name) for name in _LIBRARIES}
+    texts = {
+        "title": suite.title,
+        "question": QUESTIONS.get(suite.name, suite.title),
+        "text": suite.text.strip(),
+        "tables": [
+            {"file": one.file(suite.name), "title": one.title, "notes": one.notes.strip()}
+            for one in suite.tables
+        ],
+        "figures": [{"file": one.file, "caption": one.caption} for one in suite.pictures],
+        "command": command,
+        "version": __version__,
+        "commit": code,
+        "date": datetime.now(UTC).date().isoformat(),
+        "libraries": {"python": platform.python_version(), **libraries},
+    }
+    files.write_json(out / f"{suite.name}.json", texts)
 
 
-def opening(suites: Sequence[Suite]) -> str:
-    """Say from the tables alone what was asked, what holds, and what does not."""
-    targets, missed = (sum(getattr(s, name) for s in suites) for name in ("targets", "missed"))
-    judged = [suite for suite in suites if suite.targets]
-    holds = [f"{_asked(suite)} ({suite.targets})" for suite in judged if not suite.missed]
-    short = [_shortfall(suite) for suite in judged if suite.missed]
-    total = (
-        f"**{targets - missed} of {targets} targets are met.** Each line is what was asked, with"
-        " its number of targets, and leads to the tables."
-    )
-    parts = [
-        total,
-        *(["What holds:", _bullets(holds)] if holds else []),
-        *(["What does not hold everywhere:", _bullets(short)] if short else []),
-        _figure(overview(suites)),
-    ]
-    return "\n\n".join(parts)
-
-
-def _bullets(lines: Sequence[str]) -> str:
-    return "\n".join(f"- {line}" for line in lines)
-
-
-def _asked(suite: Suite) -> str:
-    anchor = re.sub(r"[^a-z0-9]+", "-", suite.title.lower())
-    return f"[{QUESTIONS.get(suite.name, suite.title)}](#{anchor})"
-
-
-def _shortfall(suite: Suite) -> str:
-    parts = []
-    for table in suite.tables:
-        if table.missed:
-            title = table.title.split(",")[0].split(":")[0]
-            names = table.misses
-            which = f": {'; '.join(names)}" if len(names) <= _NAMED else ""
-            parts.append(f"{title} ({table.missed} of {table.targets}{which})")
-    met = f"{suite.targets - suite.missed} of {suite.targets}"
-    return f"{_asked(suite)}: {met}. Missed: {', '.join(parts)}."
-
-
-def overview(suites: Sequence[Suite]) -> Picture:
-    """Draw the share of targets that each suite meets."""
-    judged = [suite for suite in suites if suite.targets]
-
-    def draw(figure: "Figure") -> None:
-        axis = figure.subplots()
-        for place, suite in enumerate(judged):
-            share = 100 * (1 - suite.missed / suite.targets)
-            axis.barh(place, share, color=_MET)
-            axis.barh(place, 100 - share, left=share, color=_MISSED)
-            axis.text(101, place, f"{suite.targets - suite.missed} of {suite.targets}", va="center")
-        axis.set_yticks(range(len(judged)), [suite.title for suite in judged])
-        axis.invert_yaxis()
-        axis.set_xlim(0, 100)
-        axis.set_xlabel("targets met, percent")
-        axis.spines[["top", "right"]].set_visible(False)
-
-    caption = "Share of targets that are met (blue) and missed (orange), with their numbers."
-    return Picture(name="overview", caption=caption, draw=draw, size=(8.0, 0.6 + 0.3 * len(judged)))
-
-
-def _figure(picture: Picture) -> str:
-    return f"![{picture.caption}]({IMAGES}/{picture.file})\n\n*{picture.caption}*"
-
-
-def _section(suite: Suite) -> str:
-    text = [suite.text.strip()] if suite.text else []
-    shown = [*map(markdown, suite.tables), *map(_figure, suite.pictures)]
-    return "\n\n".join([f"## {suite.title}", *text, *shown])
+def commit() -> str:
+    """Return the commit of this checkout; a change that is not committed shows as ``-dirty``."""
+    command = ["git", "describe", "--always", "--dirty", "--exclude", "*"]
+    try:
+        done = subprocess.run(  # noqa: S603  (a fixed command)
+            command, cwd=Path(__file__).parent, capture_output=True, text=True, check=False
+        )
+    except OSError:
+        return files.MISSING
+    return done.stdout.strip() or files.MISSING
 
 
 def markdown(table: Table) -> str:
@@ -377,7 +305,8 @@ def markdown(table: Table) -> str:
 
 
 def _line(cells: Sequence[str]) -> str:
-    return "| " + " | ".join(cell.replace("|", r"\|") for cell in cells) + " |"
+    shown = (f"**{cell}**" if cell == MISSED else cell.replace("|", r"\|") for cell in cells)
+    return f"| {' | '.join(shown)} |"
 
 
 def show(cell: Cell, digits: int) -> str:
@@ -385,7 +314,7 @@ def show(cell: Cell, digits: int) -> str:
     if cell is None or cell != cell:  # noqa: PLR0124  (NaN)
         return "n/a"
     if isinstance(cell, bool):
-        return "yes" if cell else "**no**"
+        return MET if cell else MISSED
     return f"{cell:.{digits}f}" if isinstance(cell, float) else str(cell)
 
 

@@ -10,7 +10,7 @@ from scipy import stats
 from statsmodels.stats.multitest import multipletests
 
 from hipsta_bids.group.cohort.data import SHEET, Cohort, layers
-from hipsta_bids.group.design.formula import Contrast
+from hipsta_bids.group.design.contrasts import Contrast
 from hipsta_bids.group.design.model import ModelRequest, VisitTime
 from hipsta_bids.group.design.settings import GroupSettings
 from hipsta_bids.group.questions.trials import Modeled, Retested

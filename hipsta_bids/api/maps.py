@@ -279,7 +279,7 @@ def node_axes(grid: SheetSettings, region: str) -> dict[str, Any]:
     return {axis: ([axis], values, _NODES[axis]) for axis, values in axis_values}
 
 
-def check_choice(name: str, value: object, choices: Mapping[str, object]) -> None:
+def check_choice(name: str, value: object, choices: Mapping[Any, object]) -> None:
     """Refuse a value that is not among the choices."""
     if value not in choices:
         raise ValueError(f"{name} is {value!r}; choose {' or '.join(map(repr, choices))}")

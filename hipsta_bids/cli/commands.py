@@ -6,7 +6,7 @@ from pathlib import Path
 
 from hipsta_bids.cli import participant
 from hipsta_bids.cli.console import echo, echo_table, warn
-from hipsta_bids.cli.parser import Parser, from_namespace, given_settings, parser_of
+from hipsta_bids.cli.parser import Parser, bids_label, from_namespace, given_settings, parser_of
 from hipsta_bids.errors import ExitCode, UsageError
 
 _DEMO_PROTOCOL = "freesurfer"  # the layout that the demo dataset has
@@ -50,8 +50,9 @@ def meta_parser() -> Parser:
     add("out", "OUT", type=Path)
     add("--random", choices=["reml", "dl"])
     add("--correction", choices=["fdr2", "bh"])
-    add("--fdr-scope", choices=["map", "hemispheres"])
+    add("--fdr-scope", choices=["map", "hemispheres", "all"])
     add("--settings", "FILE.toml")
+    add("--figures")
     return parser
 
 
@@ -64,6 +65,23 @@ def resample_parser() -> Parser:
     add("--sheet", "FILE", nargs="+", default=[])
     add("--column", "NAME", default="thickness")
     add("--settings", "FILE.toml")
+    return parser
+
+
+def figure_parser() -> Parser:
+    """Describe ``hipsta-bids figure``."""
+    parser, add = parser_of("figure")
+    add("what", "", choices=["participant", "group", "contrast", "registration", "roc"])
+    add("output_dir", "OUT_DIR", type=Path)
+    add("-o --output", "FILE", required=True)
+    add("--name", "NAME")
+    add("--participant-label", "LABEL", type=bids_label("sub-"))
+    add("--session-label", "LABEL", type=bids_label("ses-"))
+    add("--measures", "NAME", nargs="+", default=[])
+    add("--contrasts", "NAME", nargs="+", default=[])
+    add("--columns", "", type=int, choices=[1, 2])
+    add("--limits", "LOW HIGH", type=float)
+    add("--dpi", "N", default=300)
     return parser
 
 
@@ -202,7 +220,8 @@ def run_meta_analysis(arguments: Sequence[str]) -> ExitCode:
     }
     settings = load_group_settings(options.settings).changed(**given_settings(choices))
     paths = [_site(text) for text in options.sites]
-    page, notes = run_meta(paths, options.out, settings, ("hipsta-bids", "meta", *arguments))
+    command = "hipsta-bids", "meta", *arguments
+    page, notes = run_meta(paths, options.out, settings, command, figures=options.figures)
     for note in notes:
         echo(f"note: {note}")
     echo(f"results: {options.out / 'meta'}")
@@ -216,6 +235,36 @@ def _site(text: str) -> tuple[str | None, Path]:
     if equals and name and "/" not in name:
         return name, Path(path)
     return None, Path(text)
+
+
+def draw_figure(arguments: Sequence[str]) -> ExitCode:
+    """Draw a figure for a paper from results."""
+    options = figure_parser().parse_intermixed_args(arguments)
+    if options.dpi < 1:
+        raise UsageError(f"--dpi: {options.dpi} is not above 0; use 300 for print")
+    if options.limits and not options.limits[0] < options.limits[1]:
+        raise UsageError("--limits: the first value is not below the second; exchange them")
+    from hipsta_bids.api.figures import check_format, figure  # noqa: PLC0415  (heavy)
+
+    check_format(options.output)
+    try:
+        figure(
+            options.what,
+            options.output_dir,
+            name=options.name,
+            participant=options.participant_label,
+            session=options.session_label,
+            measures=options.measures,
+            contrasts=options.contrasts,
+            columns=options.columns,
+            limits=options.limits and tuple(options.limits),
+            dpi=options.dpi,
+            file=options.output,
+        )
+    except ValueError as error:  # a name that is not there
+        raise UsageError(str(error)) from error
+    echo(f"figure: {options.output}")
+    return ExitCode.OK
 
 
 def run_resample(arguments: Sequence[str]) -> ExitCode:

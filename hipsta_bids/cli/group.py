@@ -147,6 +147,12 @@ def _add_sheets(parser: Parser) -> None:
         "exclude: columns participant_id, perhaps session_id, hemi, protocol, region, reason",
     )
     add(
+        "--mask",
+        "MASK...",
+        "grid points to exclude: repaired (by the program), or a table with x, y (node numbers),"
+        " perhaps participant_id, session_id, hemi",
+    )
+    add(
         "--ratings",
         "FILE.tsv",
         (
@@ -261,7 +267,7 @@ def _add_methods(parser: Parser) -> None:
         "--fdr-scope",
         "",
         "one family of tests, for permutations too (default: map)",
-        choices=["map", "hemispheres"],
+        choices=["map", "hemispheres", "all"],
     )
     add(
         "--joint",
@@ -289,6 +295,12 @@ def _add_reports(parser: Parser) -> None:
         "--reports-only",
         "",
         "make these pages again from existing results, of all analyses or of --name, and end",
+    )
+    adder(group)(
+        "--figures",
+        "",
+        "also write all figures for print, as PDF and PNG (default: SVG of the page);"
+        " `hipsta-bids figure` draws one later",
     )
     adder(group)("-q --quiet", "", "print only problems")
 
@@ -448,6 +460,7 @@ def _options(parsed: argparse.Namespace, arguments: Sequence[str]) -> "GroupOpti
         excluded=tuple(parsed.exclude_participant_label),
         sessions=tuple(parsed.session_label),
         exclude_table=parsed.exclude,
+        masks=tuple(parsed.mask or ()),
     )
     model = from_namespace(
         ModelRequest,

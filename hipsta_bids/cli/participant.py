@@ -229,7 +229,12 @@ def _run(options: "Namespace", arguments: Sequence[str]) -> ExitCode:
 
     notes += tuple(f"not used: {entry.path}: {entry.reason}" for entry in findings.ignored)
     out, run_options = options.output_dir, _run_options(options, arguments, notes)
-    run_options = replace(run_options, inputs=tuple(inputs), is_whole=request.is_whole)
+    run_options = replace(
+        run_options,
+        inputs=tuple(inputs),
+        is_whole=request.is_whole,
+        pybids=request.uses_pybids,
+    )
     console.echo(counts)
     with console.Progress(-1 if options.quiet else options.verbose) as progress:
         if collects:

@@ -1,6 +1,7 @@
 """The files of a dataset as a whole: description, settings, methods text with references."""
 
 import os
+import re
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from importlib import resources
@@ -266,10 +267,6 @@ def source_address(path: Path, sources: Mapping[str, Path]) -> str:
     return str(path)
 
 
-#: Works that the methods of the participant level rest on.
-_CITED = ("method", "shapedna", "brainprint", "tetgen", "pybids")
-
-
 def references() -> dict[str, str]:
     """Read the entries of all works that methods rest on, by their keys."""
     path = resources.files("hipsta_bids.derivatives") / "references.toml"
@@ -277,40 +274,59 @@ def references() -> dict[str, str]:
 
 
 def _layer_rule(settings: BodySettings, protocols: Sequence[Protocol]) -> str:
-    """Say what became of the molecular layer, and in which protocols it was left out."""
-    rule: str = TEXTS["methods"]["layer"][settings.layer_rule]
+    """Describe the molecular layer, and the protocols with which it was excluded."""
+    texts: Mapping[str, str] = TEXTS["methods"]["layer"]
     separate = [
         protocol.name
         for protocol in protocols
         if Tissue.MOLECULAR_LAYER in protocol.interior and not protocol.layer
     ]
+    rule = texts[settings.layer_rule]
     if settings.join_every_layer or not separate:
         return rule
-    return f"{rule}, or excluded ({', '.join(separate)})"
+    return rule + texts["excluded"].format(names=", ".join(separate))
 
 
-def citation_text(settings: Settings, protocols: Sequence[Protocol]) -> str:
-    """Compose the methods paragraph, with all settings and the references."""
-    works = references()
-    entries = [works[key] for key in _CITED]
-    entries += [protocol.citation for protocol in protocols if protocol.citation not in entries]
-    number = {entry: i for i, entry in enumerate(entries, start=1)}
-    cite = {key: f"[{number[works[key]]}]" for key in _CITED}
-    titles = ", ".join(f"{s.title} [{number[s.citation]}]" for s in protocols) or "none"
-    about = TEXTS["methods"]
-    region = about["region"][settings.body.region].format(faces=about["faces"])
+def numbered(text: str, works: Mapping[str, str]) -> tuple[str, list[str]]:
+    """Return a text with its citations ``[@key]`` numbered in its order, and the works."""
+    entries: list[str] = []
+
+    def number(citation: re.Match[str]) -> str:
+        entry = works[citation[1]]
+        if entry not in entries:
+            entries.append(entry)
+        return f"[{entries.index(entry) + 1}]"
+
+    return re.sub(r"\[@([\w-]+)\]", number, text), entries
+
+
+def citation_text(
+    settings: Settings, protocols: Sequence[Protocol], *, pybids: bool = False
+) -> str:
+    """Compose the methods section, with all settings and the references; PyBIDS only if used."""
+    about, body, sheet = TEXTS["methods"], settings.body, settings.sheet
+    titles = "; ".join(f"{one.title} [@seg-{one.name}]" for one in protocols) or "none"
     text = about["text"].format(
-        **cite,
         version=__version__,
         titles=titles,
-        layer=_layer_rule(settings.body, protocols),
-        region=region,
-        end_rule=about["end_rule"][settings.body.end_rule],
-        mending=about["mending"][settings.body.mending],
+        pybids=about["pybids"] if pybids else "",
+        layer=_layer_rule(body, protocols),
+        region=about["region"][body.region].format(faces=about["faces"]),
+        end_rule=about["end_rule"][body.end_rule],
+        mending=about["mending"][body.mending],
+        spacing=settings.grid.spacing,
+        slices=settings.slices.min_ratio,
+        smoothing=settings.grid.smoothing,
+        least=settings.grid.min_smoothing,
         operator=about["operator"][settings.boundaries.operator],
         edges=about["edges"][settings.boundaries.edges],
-        x_coordinate=about["x_coordinate"][settings.sheet.x_coordinate],
+        x_coordinate=about["x_coordinate"][sheet.x_coordinate],
+        nodes=f"{sheet.x_nodes} x {sheet.y_nodes} x {sheet.z_nodes}",
+        order=settings.measures.curvature_order,
+        window=settings.measures.curvature_window,
     )
+    works = references() | {f"seg-{protocol.name}": protocol.citation for protocol in protocols}
+    text, entries = numbered(text, works)
     lines = [
         "# Methods",
         "",
@@ -318,13 +334,13 @@ def citation_text(settings: Settings, protocols: Sequence[Protocol]) -> str:
         "",
         text,
         "",
-        "All settings:",
+        "# Settings",
         "",
         *(f"- `{key}`: {value}" for key, value in flatten(resolve(settings)).items()),
         "",
         "# References",
         "",
-        *(f"{i}. {entry}" for entry, i in number.items()),
+        *(f"{i}. {entry}" for i, entry in enumerate(entries, start=1)),
     ]
     return "\n".join(lines) + "\n"
 
@@ -474,6 +490,11 @@ def describe_columns(columns: Mapping[str, Sequence[str]]) -> dict[str, dict[str
 
 #: Where the labels of a hemisphere come from: keys of ``provenance`` in its quality record.
 PROVENANCE = tuple(TABLES["provenance"])
+
+
+def counts_text(counts: Mapping[str, int]) -> str:
+    """List names with their numbers of hemispheres."""
+    return ", ".join(f"{name} ({n})" for name, n in sorted(counts.items()))
 
 
 def provenance_of(record: Mapping[str, Any]) -> dict[str, str]:

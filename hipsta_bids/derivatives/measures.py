@@ -14,14 +14,15 @@ from hipsta_bids.derivatives.names import DATASET_FILES, HemisphereName
 from hipsta_bids.errors import InputError
 from hipsta_bids.io import files
 
-_ORIGIN = "labels_"
-_COLUMNS = {
-    **dataset.TABLES["measures"],
-    **{f"{_ORIGIN}{name}": about for name, about in dataset.TABLES["provenance"].items()},
-    **{name: dataset.TABLES["status"][name] for name in ("version", "settings_hash", "input_hash")},
-}
 #: Cells that identify a hemisphere, as in ``ratings.tsv``.
 _KEY = ("participant_id", "session_id", "hemi", "protocol", "region")
+_ORIGIN = "labels_"
+_MEANINGS = dataset.TABLES["status"] | dataset.TABLES["measures"]
+_COLUMNS = {
+    **{name: _MEANINGS[name] for name in (*_KEY, "decision", "reason", "rating", "repairs")},
+    **{f"{_ORIGIN}{name}": about for name, about in dataset.TABLES["provenance"].items()},
+    **{name: _MEANINGS[name] for name in ("version", "settings_hash", "input_hash")},
+}
 
 
 def identify(name: HemisphereName) -> dict[str, str]:

@@ -309,9 +309,7 @@ def _over_body(row: SectionMeasure) -> SummaryMeasure:
 
 def _over_sheet(row: MapMeasure) -> SummaryMeasure:
     """Average a map over the part of the sheet where it is reliable: away from the edges."""
-    qualifier = (
-        "; mean over the mid-surface away from rims and ends, by half of measures.curvature_window"
-    )
+    qualifier = "; mean over the mid-surface without margins of half of measures.curvature_window"
     return _mean(row, qualifier, lambda m: m.mean(row.compute(m), m.away))
 
 

@@ -58,6 +58,11 @@ class InputRequest:
     """Table with the participant and session of each folder."""
 
     @property
+    def uses_pybids(self) -> bool:
+        """Whether PyBIDS selects participants or files."""
+        return self.bids_filter_file is not None or self.bids_database_dir is not None
+
+    @property
     def any_name(self) -> bool:
         """Whether an option takes folders of any name."""
         return any((self.freesurfer_dir, self.ashs_dir, self.hippunfold_dir))

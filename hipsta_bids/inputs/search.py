@@ -22,8 +22,8 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from hipsta_bids.derivatives.dataset import read_description
-from hipsta_bids.errors import InputError, NothingToDoError, UsageError
+from hipsta_bids.derivatives.dataset import PROVENANCE, counts_text, read_description
+from hipsta_bids.errors import InputError, NothingToDoError, UsageError, did_you_mean
 from hipsta_bids.inputs import scan, tree
 from hipsta_bids.inputs.account import looked_into, unused_of_visit
 from hipsta_bids.inputs.ashs import choose_atlas
@@ -221,7 +221,20 @@ def dataset_notes(request: InputRequest, items: Iterable[HemisphereInput]) -> tu
     expected = selection.subjects or scan.list_participants(request)
     without = sorted(expected - selection.excluded - {item.subject for item in items})
     if without:
-        notes.append(f"no segmentation found for {_count(without, 'participant')}")
+        hint = did_you_mean(selection.subjects.intersection(without), {i.subject for i in items})
+        notes.append(f"no segmentation found for {_count(without, 'participant')}{hint}")
+    usable = [item for item in items if item.problem is None]
+    segmentations = Counter(item.protocol.name for item in usable)
+    if len(segmentations) > 1:
+        notes.append(f"several protocols: {counts_text(segmentations)}; group takes one: --seg")
+    for name in PROVENANCE if len(segmentations) == 1 else ():
+        # Sizes of voxels vary a little within a protocol; the group level compares them.
+        kinds = Counter(item.origin[name] for item in usable if name != "voxel_size")
+        if len(kinds) > 1:
+            notes.append(
+                f"labels differ in {name}: {counts_text(kinds)}; group refuses this mix"
+                f" unless --mixed {name} allows it"
+            )
     return tuple(notes)
 
 
@@ -335,9 +348,11 @@ def _nothing(
         )
     if restricted:
         subjects = {folder.subject for source in sources for folder in source.folders()[0]}
+        named = (label.removeprefix("sub-") for label in request.participant_labels)
+        hint = did_you_mean((label for label in named if label not in subjects), subjects)
         return NothingToDoError(
-            f"no hippocampal segmentation matches {' '.join(restricted)} in {searched} "
-            f"(which hold {_count(sorted(subjects), 'subject')}; looked for {_LOOKED_FOR}){unused}"
+            f"no hippocampal segmentation matches {' '.join(restricted)} in {searched} (which hold"
+            f" {_count(sorted(subjects), 'subject')}; looked for {_LOOKED_FOR}){hint}{unused}"
         )
     return NothingToDoError(
         f"no hippocampal segmentation in {searched} (looked for {_LOOKED_FOR}); "

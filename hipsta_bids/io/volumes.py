@@ -347,15 +347,13 @@ def _check_scalar(image: Any, path: Path) -> None:  # noqa: ANN401 (nibabel's cl
         kind_text = "complex numbers" if kind.kind == "c" else "colors"
         raise InputError(
             f"{path}: its voxels are {kind_text}, a map needs one number each; "
-            "extract the magnitude or one channel",
-            reason="not-scalar",
+            "extract the magnitude or one channel"
         )
     shape = _axes(image)
     if not _SPACE <= len(shape) <= _SPACE + 1:
         raise InputError(
             f"{path}: has shape {' x '.join(map(str, shape))}; extract a map of three axes, "
-            "or four with one volume per column",
-            reason="too-many-axes",
+            "or four with one volume per column"
         )
     if 0 in shape:
         raise InputError(f"{path}: has no voxels; make the file again", reason="empty-image")

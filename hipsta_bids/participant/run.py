@@ -242,6 +242,8 @@ class RunOptions:
     """Rows of ``inputs.tsv``."""
     is_whole: bool = True
     """Whether these are about all participants."""
+    pybids: bool = False
+    """Whether PyBIDS selected the inputs, so that the methods text cites it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -446,7 +448,9 @@ def _prepare(
         digest = dataset.settle_settings(out_dir, settings)
         dataset.write_description(out_dir, sources)
         if options.shard is None or not (out_dir / DATASET_FILES["citation"]).exists():
-            text = dataset.citation_text(settings, [protocols[k] for k in sorted(protocols)])
+            text = dataset.citation_text(
+                settings, [protocols[k] for k in sorted(protocols)], pybids=options.pybids
+            )
             files.write_text(out_dir / DATASET_FILES["citation"], text)
         write_sidecar(out_dir)
         write_shared(out_dir)

@@ -156,7 +156,7 @@ def settings_from(values: Mapping[str, Any], kind: type[Table], *, origin: str) 
         return kind.model_validate(values)
     except ValidationError as error:
         mistake = first_mistake(error, kind)
-        raise SettingsError(f"{origin}: {mistake}", reason="setting-out-of-range") from error
+        raise SettingsError(f"{origin}: {mistake}") from error
 
 
 def resolve(settings: BaseModel) -> dict[str, Any]:

@@ -6,7 +6,6 @@ from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 from markupsafe import escape
 
 from hipsta_bids.io import files
@@ -14,6 +13,7 @@ from hipsta_bids.protocols.protocol import Tissue
 from hipsta_bids.reports.display import subfield_title
 
 if TYPE_CHECKING:
+    import pandas as pd
     from markupsafe import Markup
 
 #: Names of the sides in tables of maps; in those of summary measures LR may be a mean.
@@ -153,7 +153,7 @@ def limits_text(row: Mapping[str, Any], name: str, digits: int | None = None) ->
     return f"{value} ({low} to {high})"
 
 
-def _quartiles(values: pd.Series) -> str:
+def _quartiles(values: "pd.Series") -> str:
     """Write the median with the quartiles."""
     if not values.notna().any():
         return files.MISSING
@@ -176,7 +176,7 @@ def percent_text(share: float) -> str:
     return f"{share:.0%}" if np.isfinite(share) else files.MISSING
 
 
-def _deviations(scores: pd.Series) -> str:
+def _deviations(scores: "pd.Series") -> str:
     """Write the mean of scores with their SD, and how many are far from zero."""
     beyond = f"{(scores < -FAR).sum()} low, {(scores > FAR).sum()} high of {len(scores)}"
     spread = f"{number_text(scores.mean())} ({number_text(scores.std())})"

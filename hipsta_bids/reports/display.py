@@ -130,8 +130,11 @@ def known(values: Sequence[Float]) -> Float:
 
 def scale_of(kind: MapKind, values: Sequence[Float]) -> tuple[float, float]:
     """Return the values at both ends of the colors: fixed ones, or from the values shown."""
-    if kind.limits is not None:
-        return kind.limits
+    return span_of(kind, values) if kind.limits is None else kind.limits
+
+
+def span_of(kind: MapKind, values: Sequence[Float]) -> tuple[float, float]:
+    """Return the percentiles of the values shown that are at both ends of the colors."""
     joined = known(values)
     low, high = np.percentile(joined, kind.percentiles).tolist() if len(joined) else (-1.0, 1.0)
     if kind.centered:

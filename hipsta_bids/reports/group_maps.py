@@ -16,12 +16,12 @@ from hipsta_bids.types import Float
 
 #: Kinds of effect sizes, by the test.
 EFFECT_NAMES = {"t": "Cohen's d", "F": "partial eta squared", "z": "combined evidence, z"}
-_EFFECT_COLUMNS = {"t": "cohen_d", "F": "eta_squared", "z": "statistic"}
+EFFECT_COLUMNS = {"t": "cohen_d", "F": "eta_squared", "z": "statistic"}
 #: Kinds of maps.
 KINDS = ("mean", "effect", "significance")
 _SMALLEST_P = 1e-10
 #: Measures whose figures are shown at once, and at all; the folder has them all.
-_OPEN, _MOST_FIGURES = 2, 9
+_OPEN, MOST_FIGURES = 2, 9
 _HALF = 0.5  # of a cell, to its middle
 
 
@@ -30,9 +30,21 @@ def signed_logarithm(adjusted: Float, statistic: Float) -> Float:
     return np.asarray(-np.log10(np.clip(adjusted, _SMALLEST_P, 1)) * np.sign(statistic))
 
 
+def kind_of_test(measure: str, points: pd.DataFrame) -> str:
+    """Return the kind of the test in a table of points: ``t``, ``F``, or ``z`` of joint tests."""
+    return "z" if measure == cells.JOINT else "t" if points["cohen_d"].notna().any() else "F"
+
+
 def map_id(kind: str, index: int | str, hemi: str) -> str:
     """Name an unfolded map inside a drawing: a mean of a group, or a contrast's effect or p."""
     return f"map-{kind}-{index}-{hemi}"
+
+
+def measures_of(results: GroupResults) -> list[str]:
+    """List the maps of an analysis in the order of its page, joint evidence first."""
+    maps = results.table("maps")
+    names = maps["measure"].unique().tolist() if len(maps) else []
+    return sorted(map(str, names), key=lambda name: name != cells.JOINT)
 
 
 def map_scenes(results: GroupResults) -> Mapping[str, Any] | None:
@@ -41,8 +53,8 @@ def map_scenes(results: GroupResults) -> Mapping[str, Any] | None:
     if not len(maps):
         return None
     blocks, data = [], list[dict[str, Any]]()
-    measures = sorted(maps["measure"].unique().tolist(), key=lambda name: name != cells.JOINT)
-    for measure in measures[:_MOST_FIGURES]:
+    measures = measures_of(results)
+    for measure in measures[:MOST_FIGURES]:
         rows = maps[maps["measure"] == measure]
         means = results.table("means")
         means = means[means["measure"] == measure] if len(means) else means
@@ -57,7 +69,7 @@ def map_scenes(results: GroupResults) -> Mapping[str, Any] | None:
         title = cells.measure_title(measure)
         plates = [
             {"picture": picture, "spots": _spots(picture, scene, len(data)) if scene else []}
-            for number in range(1, _MOST_FIGURES)
+            for number in range(1, MOST_FIGURES)
             for name in [f"{measure}_maps" if number == 1 else f"{measure}_maps_{number}"]
             for picture in embedded(results, name, f"{title}, maps", _alternative(title, rows))
         ]
@@ -170,8 +182,7 @@ def _side(
 
 def _test(results: GroupResults, row: Mapping[str, Any]) -> dict[str, Any]:
     rows = results.table(str(row["file"]))
-    joint = row["measure"] == cells.JOINT
-    kind = "z" if joint else "t" if rows["cohen_d"].notna().any() else "F"
+    joint, kind = row["measure"] == cells.JOINT, kind_of_test(row["measure"], rows)
     significant = rows["significant"].to_numpy() == True  # noqa: E712  (may hold missing values)
     numbers = {
         name: rows[name].to_numpy(dtype=np.float64)
@@ -186,7 +197,7 @@ def _test(results: GroupResults, row: Mapping[str, Any]) -> dict[str, Any]:
         "kind": kind,
         "n_tests": int(row["n_tests"]),
         "n_significant": int(row["n_significant"]),
-        "effect": rows[_EFFECT_COLUMNS[kind]].to_numpy(dtype=np.float64),
+        "effect": rows[EFFECT_COLUMNS[kind]].to_numpy(dtype=np.float64),
         "parts": [
             [f"p of {cells.display_name(str(name)[2:])}", rows[name].to_numpy(np.float64)]
             for name in rows

@@ -13,10 +13,13 @@ import pandas as pd
 
 from hipsta_bids.io import files
 from hipsta_bids.reports import cells
+from hipsta_bids.types import FAMILY
 
 _ALPHA = 0.05  # of tests of summary measures and of models, for a word only
 _LEAST_SHARE = 0.01  # share of a map; what survives in less of it is no finding of the same rank
 _MOST_ROWS = 200  # of lists, so that pages stay small
+#: Summary measures of the thickness of the whole sheet.
+_THICKNESS = ("thickness_mean", "thickness_nodes")
 
 
 #: Columns that are never numbers.
@@ -113,8 +116,8 @@ def findings(results: GroupResults) -> Mapping[str, Any] | None:
     cards.sort(key=lambda card: -card["share"])
     settings = results.record.get("settings") or {}
     multiplicity = settings.get("multiplicity") or {}
-    scope = multiplicity.get("scope")
-    family = ["measure", "contrast", *(() if scope == "hemispheres" else ("hemi",))]
+    scope = multiplicity.get("scope", "map")
+    family = list(FAMILY.get(scope, FAMILY["map"]))
     measures = results.table("measures")
     return {
         "n": len(cards),
@@ -123,10 +126,11 @@ def findings(results: GroupResults) -> Mapping[str, Any] | None:
         "none": [card for card in cards if not card["share"]],
         "least": _LEAST_SHARE,
         "families": maps[family].drop_duplicates().shape[0] if len(maps) else 0,
-        "together": scope == "hemispheres",
+        "scope": scope,
         "tested": len(measures),
         "contrasts": measures["contrast"].nunique() if len(measures) else 0,
         "summaries": list(_summaries(results)),
+        "opposite": opposite_changes(measures),
         "classification": list(_classification(results)),
         "method": multiplicity.get("method"),
         "alpha": multiplicity.get("alpha"),
@@ -229,6 +233,33 @@ def _summaries(results: GroupResults) -> Iterator[str]:
             suffix = f", model {model}" if len(table["model"].unique()) > 1 else ""
             title = f"{cells.display_name(str(measure))}, {contrast}{suffix}"
             yield f"{title}: {'; '.join(texts)}"
+
+
+def opposite_changes(measures: pd.DataFrame) -> list[str]:
+    """List contrasts in which volume and mean thickness change in opposite directions.
+
+    Both have corrected p-values below the level, in one hemisphere or in the mean of both.
+    """
+    if not len(measures):
+        return []
+    low = measures[(measures["test"] == "t") & (measures["p_fdr"] < _ALPHA)]
+    lines = []
+    for contrast, rows in low.groupby("contrast", sort=False):
+        sides = []
+        for row in records(rows[rows["measure"].isin(_THICKNESS)]):
+            volumes = rows[(rows["measure"] == "volume") & (rows["hemi"] == row["hemi"])]
+            for volume in volumes["effect_size"][volumes["estimate"] * row["estimate"] < 0]:
+                name, d = str(row["measure"]), cells.number_text(row["effect_size"])
+                side = cells.summary_side(row["hemi"], name)
+                sides.append(f"{side}: volume d {cells.number_text(volume)}, {name} d {d}")
+        if sides:
+            lines.append(
+                f"{contrast}: volume and mean thickness change in opposite directions"
+                f" ({'; '.join(sides)}). Possible causes: labels that miss thin edges, rounded or"
+                " coarse labels, and loss of thin parts of the sheet. Check the labels of both"
+                " edges; see Validation, Thickness and loss of tissue."
+            )
+    return lines
 
 
 def _classification(results: GroupResults) -> Iterator[str]:

@@ -2,7 +2,7 @@
 
 A hemisphere with a flag is one to look at, whatever was repaired. Its headline is the flag with the
 largest consequence: by how much the mean thickness could be off, then the share of the map. What
-repairs touch does not count: it does not go along with errors (docs/running.md).
+repairs touch does not count: it does not go along with errors (docs/quality.md).
 """
 
 from dataclasses import dataclass

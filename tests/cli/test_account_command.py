@@ -109,6 +109,33 @@ def test_participants_by_the_name_of_the_folder(study, capsys, label):
     assert "inputs: 2 used, 0 failed, 0 not used, 1 not a segmentation" in said
 
 
+def test_kinds_of_segmentation_are_noted_before_the_group_level_refuses_them(tmp_path, capsys):
+    bids = tmp_path / "bids"
+    for number, analysis in enumerate(["T1.v22", "T1.v22", "T1-T2.v22"], start=1):
+        for side in "lr":
+            folder = bids / "derivatives" / "fs" / f"sub-0{number}" / "mri"
+            folder.mkdir(parents=True, exist_ok=True)
+            (folder / f"{side}h.hippoAmygLabels-{analysis}.mgz").touch()
+    arguments = [str(bids), str(tmp_path / "out"), "participant", "--dry-run"]
+    assert main.main(arguments) == ExitCode.OK
+    notes = [line for line in capsys.readouterr().out.splitlines() if "labels differ" in line]
+    note = "labels differ in analysis: T1 (4), T1-T2 (2); group refuses this mix unless"
+    assert notes == [f"note: {note} --mixed analysis allows it"]
+    assert main.main([*arguments, "--participant-label", "01", "02"]) == ExitCode.OK
+    assert "labels differ" not in capsys.readouterr().out
+    assert main.main([*arguments, "--participant-label", "1", "02"]) == ExitCode.OK
+    assert "no segmentation found for 1 participant (1)" in capsys.readouterr().out
+    assert main.main([*arguments, "--participant-label", "1"]) == ExitCode.NOTHING_TO_DO
+    assert "; did you mean 01?" in capsys.readouterr().err
+    labels = bids / "derivatives" / "hippunfold" / "sub-01" / "anat"
+    labels.mkdir(parents=True)
+    name = "sub-01_hemi-L_space-cropT1w_desc-subfields_atlas-bigbrain_dseg.nii.gz"
+    (labels / name).touch()
+    assert main.main(arguments) == ExitCode.OK
+    said = capsys.readouterr().out
+    assert "note: several protocols: freesurfer (6), hippunfold (1); group takes one: --seg" in said
+
+
 def test_two_folders_of_one_visit_in_the_table_are_refused(study, capsys):
     people = study / "people.tsv"
     people.write_text(

@@ -167,6 +167,7 @@ def test_everything_reaches_its_place(seen, tmp_path):
     )
     assert replace(seen["options"], inputs=()) == RunOptions(
         is_whole=False,
+        pybids=True,
         n_procs=3,
         mem_gb=4.0,
         work_dir=tmp_path / "work",

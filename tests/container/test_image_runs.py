@@ -39,7 +39,7 @@ def ended(done, code=ExitCode.OK):
 def test_participant_level(participants):
     _, done = participants
     assert ended(done), done
-    assert "24 hemispheres: 24 ok\n" in done.stdout
+    assert "24 hemispheres: 24 use\n" in done.stdout
 
 
 def test_group_level(both_levels):

@@ -1,5 +1,6 @@
 import json
 import multiprocessing
+import re
 from email.message import Message
 from pathlib import Path
 
@@ -205,18 +206,36 @@ def test_citation_states_settings_and_protocols():
     assert f"hipsta_bids {__version__}" in text
     assert "the dentate gyrus and CA4 included" in text
     assert "`body.layer_rule`: nearest-label" in text
-    for reference in ("120182", "BrainPrint", "TetGen", "10.21105/joss.01294", "Nobody N"):
+    for reference in ("120182", "BrainPrint", "TetGen", "Nobody N"):
         assert reference in text
-    assert "{" not in text
+    for sign in ("{", "[@"):
+        assert sign not in text
+
+
+def test_citation_numbers_works_as_the_text_names_them():
+    protocols = [load_protocol(name) for name in ("freesurfer", "freesurferCA", "hippunfold")]
+    text = dataset.citation_text(Settings(), protocols)
+    prose, _, bibliography = text.partition("# References")
+    cited = [int(number) for number in re.findall(r"\[(\d+)\]", prose.split("# Settings")[0])]
+    works = bibliography.split("\n")
+    assert list(dict.fromkeys(cited)) == list(range(1, max(cited) + 1))
+    assert sum(bool(re.match(r"\d+\. ", work)) for work in works) == max(cited)
+    assert sum("Iglesias JE" in work for work in works) == 1  # of both protocols of FreeSurfer
+
+
+def test_citation_names_pybids_only_where_it_was_used():
+    for pybids in (True, False):
+        text = dataset.citation_text(Settings(), [make_scheme()], pybids=pybids)
+        assert ("selected with PyBIDS" in text) == ("10.21105/joss.01294" in text) == pybids
 
 
 def test_citation_says_whose_molecular_layer_was_left_out():
     protocols = [load_protocol("freesurfer"), load_protocol("hippunfold")]
     text = dataset.citation_text(Settings(), protocols)
-    assert "given to the nearest subfield of the sheet, or excluded (hippunfold)." in text
+    assert "assigned to the nearest subfield of the sheet; with hippunfold it was excluded." in text
     joined = Settings(body=BodySettings(join_every_layer=True))
     for settings, chosen in ((joined, protocols), (Settings(), protocols[:1])):
-        assert "left out" not in dataset.citation_text(settings, chosen)
+        assert "excluded" not in dataset.citation_text(settings, chosen)
 
 
 def row(subject, hemi="L", **more):

@@ -1,6 +1,7 @@
 """Small cohorts of sheets as the participant level leaves them; nothing is measured."""
 
 import json
+import re
 from pathlib import Path
 from typing import NamedTuple
 
@@ -142,3 +143,12 @@ def read_participants(data):
 def table(path):
     """Read a table of results."""
     return pd.read_csv(path, sep="\t", na_values="n/a")
+
+
+def methods_of(folder):
+    """Read the methods text of results, whose works are numbered in its order and all cited."""
+    text = (folder / "methods.md").read_text(encoding="utf-8")
+    prose, _, works = text.partition("# References")
+    cited = dict.fromkeys(re.findall(r"\[(\d+)\]", prose))
+    assert list(cited) == re.findall(r"^(\d+)\. ", works, re.MULTILINE)
+    return text

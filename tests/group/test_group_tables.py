@@ -208,6 +208,6 @@ def test_methods_show_names_of_tables_as_they_are(study, capsys):
         words = unescape(re.sub(r"<[^>]+>", "", method))
         assert f"(16 {groups['CN']}, 14 {groups['AD']})" in words
         assert f"(reference levels: group {groups['CN']}, site ![i](j))" in words
-        assert "; contrasts: `my age_`, age_diff_." in words
-        assert "Points that survive: thickness, `my age_`, L: " in words
+        assert "Contrasts were `my age_` and age_diff_." in words
+        assert "thickness, `my age_`, L: " in words.partition("Significant points")[2]
     assert "$1$" not in source  # GitHub's formulas, which the parser above does not know

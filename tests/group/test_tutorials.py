@@ -170,22 +170,24 @@ def test_the_sentences_of_the_phantom_tutorial_say_what_came_out(study):
     beside = [int((signs[~where] > 0).sum()) for signs in (left, right)]
     near = ndimage.binary_dilation(where, np.ones((3, 3)), iterations=2)
     assert not any((signs[~near] > 0).any() for signs in (left, right))
-    assert inside[0] == where.sum() == int(THINNED)
+    assert where.sum() == int(THINNED)
+    assert min(inside) > 0.9 * where.sum()
     assert (
-        f"of its {THINNED} points (`phantom_effect.tsv`), all on the left and {inside[1]}" in page
+        f"The planted region has {THINNED} points (`phantom_effect.tsv`). The analysis found"
+        f" {inside[0]} of them on the left and {inside[1]} on the right." in page
     )
-    assert f"with {beside[0]} and {beside[1]} within two nodes of its border" in page
+    assert f"A further {beside[0]} and {beside[1]} points lie within two nodes of its" in page
     measures = table(folder / "measures.tsv").set_index(["measure", "hemi"]).p
-    assert f"(left: p = {measures['thickness_mean', 'L']:.2f})" in page
+    assert f"(left: p = {measures['thickness_mean', 'L']:.2f};" in page
     assert f"on the left (p = {measures['thickness_mean_CA1', 'L']:.3f})" in page
     assert f"on the right (p = {measures['thickness_mean_CA1', 'R']:.2f})" in page
-    assert f"and {int((right < 0).sum())} points of this survive" in page
+    assert f"{int((right < 0).sum())} points survive where patients are thicker" in page
     assert not (left < 0).any()
     curved = table(folder / "maps.tsv").query("measure == 'curvature'")
     assert curved.n_significant.sum() == 0
     strict = [found(study, "tfce", hemi)[0] for hemi in "LR"]
     counts = [int((signs > 0).sum()) for signs in strict], int((strict[1] < 0).sum())
-    assert f"{counts[0][0]} points remain on the left and {counts[0][1]} on the right" in page
+    assert f"{counts[0][0]} points survive on the left and {counts[0][1]} on the right" in page
     assert f"and {counts[1] or 'no'} violet ones" in page
 
 
@@ -292,13 +294,15 @@ def check_norms(folder, page, thinned):
     reference = len(table(norms / "covariates.tsv"))
     first, *_, last = json.loads((norms / "norms.json").read_text())["knots"]
     assert f"{reference} of the 100 controls" in page
-    assert f"of ages of {first:g} to {last:g} years" in page
+    assert f"at ages of {first:g} to {last:g} years" in page
     people = table(folder / "paris" / "participants.tsv").set_index("participant_id").group
     z = pd.read_parquet(scores / "zscores.parquet")
     scored = z[z.thickness_z.notna()].participant_id.unique()
     left_out = table(scores / "excluded.tsv").participant_id.nunique()
     controls = int((people[scored] == "control").sum())
-    words = f"{len(scored)} people are scored, {controls} of them controls; the other {left_out}"
+    words = (
+        f"{len(scored)} participants are scored, {controls} of them controls; the other {left_out}"
+    )
     assert words in page
     means, low, beside, healthy = [], [], [], []
     for hemi in "LR":
@@ -316,4 +320,4 @@ def check_norms(folder, page, thinned):
     assert f"mean z of {means[0]} on the left and {means[1]} on the right" in page
     assert f"{low[0]} and {low[1]} of its points are below the 5th centile" in page
     assert f"elsewhere {beside[0]} and {beside[1]} are" in page
-    assert f"points in the region {healthy[0]} and {healthy[1]}." in page
+    assert f"For controls, {healthy[0]} and {healthy[1]} in the region are." in page

@@ -143,6 +143,19 @@ def test_without_threads_workers_are_forked_and_nothing_is_loaded_twice(tmp_path
     ]
 
 
+def test_the_command_starts_no_thread_that_would_keep_workers_from_being_forked():
+    """Libraries such as pyarrow start threads when they are loaded, and pandas loads it."""
+    code = (
+        "import psutil; from hipsta_bids.participant.pool import pin_threads; pin_threads();"
+        "import hipsta_bids.cli.participant, hipsta_bids.participant.run;"
+        "import hipsta_bids.inputs.search;"
+        "print(psutil.Process().num_threads())"
+    )
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "1"
+
+
 def test_what_is_in_work_is_told(tmp_path):
     jobs = ["square 3", "square 4", "square 5"]
     HEARD.clear()

@@ -49,7 +49,7 @@ def test_a_published_run_says_so_and_no_other_run_joins_it(bids_dir, tmp_path, c
     text = (out / "CITATION.md").read_text()
     assert "dilated and eroded" in text
     assert "without a threshold of curvature" in text
-    assert "solved for again on the mid-surface" not in text
+    assert "solved for on the mid-surface" not in text
     capsys.readouterr()
     assert run(bids_dir, out) == ExitCode.USAGE
     said = capsys.readouterr().err

@@ -58,7 +58,7 @@ def test_the_page_is_what_the_code_says(shown):
     hint = "run tools/make_measures.py docs"
     assert without_numbers(written) == without_numbers(fresh), hint
     # The table of errors is of other phantoms; above it, a change of 1 % is news.
-    above = [text.split("## How near they are")[0] for text in (written, fresh)]
+    above = [text.split("## Errors on phantoms")[0] for text in (written, fresh)]
     before, now = ([float(number) for number in NUMBER.findall(text)] for text in above)
     assert before == pytest.approx(now, rel=0.01, abs=0.001), hint
 

@@ -121,6 +121,18 @@ def test_settings_toml_templates_and_scripts() -> None:
     ]
 
 
+@pytest.mark.parametrize(
+    ("text", "prose"),
+    [
+        ("with `a` (mm), `b` (1/mm), `c`, and `d` each", "with X1 each"),
+        ("`a`, `b` or `c`", "X1 or X1"),
+        ("`a` and `b` (millimeters), `c`", "X1 and X1 (millimeters), X1"),
+    ],
+)
+def test_a_list_of_code_is_a_word(text: str, prose: str) -> None:
+    assert words._prose(text) == prose
+
+
 PAGE = """# What is used, and what is not
 
 The first paragraph
@@ -175,6 +187,15 @@ def test_only_a_count_above_the_budget_fails(
     assert f"--list {page}" in capsys.readouterr().out
     assert words.main(["--list", str(page)]) == 0
     assert capsys.readouterr().out.splitlines()[2] == f"{page}:3 banned: 'Those' (write: the noun)"
+
+
+def test_folders_are_listed(page: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    Path("README.md").write_text("Those maps.\n")
+    assert words.main(["--list", "docs"]) == 0
+    assert {line.split(":")[0] for line in capsys.readouterr().out.splitlines()} == {str(page)}
+    assert words.main(["--list"]) == 0
+    listed = {line.split(":")[0] for line in capsys.readouterr().out.splitlines()}
+    assert listed == {str(page), "README.md"}
 
 
 def test_budgets_are_lowered_and_never_raised(page: Path) -> None:

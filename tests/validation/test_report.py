@@ -1,8 +1,10 @@
-"""From suites to the page, with suites that take no time."""
+"""From suites to their files, with suites that take no time; and the files in docs/validation."""
 
+import json
 import re
 import struct
 import sys
+from dataclasses import replace
 from inspect import signature
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,26 +12,28 @@ from types import SimpleNamespace
 import pytest
 
 from hipsta_bids.errors import ExitCode
+from hipsta_bids.io.files import read_tsv
 from validation import __main__ as command
 from validation import cases
 from validation.cases import Refusal
 from validation.report import (
+    _TABLE,
     QUESTIONS,
     SUITES,
     WITH_LABELS,
     Picture,
     Suite,
     Table,
+    commit,
     markdown,
-    opening,
-    overview,
-    page,
     render,
     run_suite,
     show,
+    write,
 )
 
 TABLE = Table(
+    name="bias",
     title="Bias",
     rows=[
         {"case": "a|b", "|mm|": 0.01234, "target": "≤ 0.02", "met": True},
@@ -43,27 +47,11 @@ def line(figure):
     figure.subplots().plot([0, 1], [1, 0])
 
 
-PAGE = (Path(__file__).parents[2] / "docs" / "validation.md").read_text(encoding="utf-8")
-WORDS = {"yes": True, r"**no**": False, "n/a": None}
+FOLDER = Path(__file__).parents[2] / "docs" / "validation"
 
+PICTURE = Picture(name="toy", caption="A falling line.", draw=line, size=(3.0, 2.0))
 
-def suites_of(text):
-    """The suites that a page shows, as far as their tables."""
-    for name, section in zip(SUITES, text.split("\n## ")[1:], strict=True):
-        title, _, content = section.partition("\n")
-        found = re.findall(r"^\*\*(.+)\*\*\n\n((?:\|.*\n)+)", content + "\n", re.MULTILINE)
-        tables = tuple(table_of(heading, lines.splitlines()) for heading, lines in found)
-        yield Suite(name=name, title=title, tables=tables)
-
-
-def table_of(title, lines):
-    cells = [[cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]] for line in lines]
-    headings, _, *rows = cells
-    own = [{h: WORDS.get(c, c) for h, c in zip(headings, row, strict=True)} for row in rows]
-    return Table(title=title, rows=own)
-
-
-PICTURE = Picture(name="line", caption="A falling line.", draw=line, size=(3.0, 2.0))
+TOYS = Suite(name="toy", title="Toys", text="Why.", tables=(TABLE,), pictures=(PICTURE,))
 
 
 @pytest.fixture
@@ -73,7 +61,7 @@ def one_suite(monkeypatch):
 
     def run(full):
         calls.append(full)
-        return Suite(name="toy", title="Toys", text="Why.", tables=(TABLE,), pictures=(PICTURE,))
+        return TOYS
 
     monkeypatch.setitem(sys.modules, "validation.toys", SimpleNamespace(run=run))
     monkeypatch.setattr("validation.report.SUITES", {"toy": "toys:run"})
@@ -86,8 +74,8 @@ def test_a_table_in_markdown():
         "",
         r"| case | \|mm\| | target | met |",
         "| --- | --- | --- | --- |",
-        r"| a\|b | 0.012 | ≤ 0.02 | yes |",
-        "| c | n/a | ≤ 0.02 | **no** |",
+        r"| a\|b | 0.012 | ≤ 0.02 | met |",
+        "| c | n/a | ≤ 0.02 | **missed** |",
         "",
         "Read it so.",
     ]
@@ -95,7 +83,7 @@ def test_a_table_in_markdown():
 
 @pytest.mark.parametrize(
     ("cell", "text"),
-    [(None, "n/a"), (float("nan"), "n/a"), (3, "3"), (1.0, "1.00"), (True, "yes"), ("≤ 1", "≤ 1")],
+    [(None, "n/a"), (float("nan"), "n/a"), (3, "3"), (1.0, "1.00"), (True, "met"), ("≤ 1", "≤ 1")],
 )
 def test_cells(cell, text):
     assert show(cell, 2) == text
@@ -112,56 +100,59 @@ def test_a_heading_that_the_longest_row_lacks_is_refused():
         Table(title="t", rows=[{"a": 1, "b": 2}, {"c": 3}])
 
 
-def test_page_says_that_it_is_generated_and_shows_all():
-    text = page([Suite(name="toy", title="Toys", tables=(TABLE,), pictures=(PICTURE,))], full=True)
-    assert text.startswith("<!-- Written by `hipsta-bids validate --full --suite toy`; do not")
-    assert "| Toys | Bias | 2 | 1 |" in text
-    assert "![A falling line.](images/validation-line.png)" in text
-    assert text.count("**Bias**") == 1
-
-
-def test_a_page_opens_with_what_was_asked_and_what_was_missed():
-    good = Table(title="Good", rows=[{"case": "x", "met": True}])
-    many = Table(title="Many, mm", rows=[{"case": str(i), "met": i > 3} for i in range(6)])
-    suites = [
-        Suite(name="toy", title="Toys", tables=(TABLE, many)),
-        Suite(name="limits", title="Fine things", tables=(good,)),
-        Suite(name="none", title="Not judged"),
+def test_a_suite_replaces_its_files_and_leaves_those_of_others(tmp_path):
+    for name in ("toy--old.tsv", "toys--bias.tsv", "toys.json"):
+        (tmp_path / name).write_text("before")
+    write(TOYS, tmp_path, "the command", "1234abc")
+    assert {path.name for path in tmp_path.iterdir()} == {
+        *("toy.json", "toy--bias.tsv", "toy.png", "toys.json", "toys--bias.tsv")
+    }
+    assert (tmp_path / "toys--bias.tsv").read_text() == "before"
+    assert read_tsv(tmp_path / "toy--bias.tsv") == [
+        {"case": "a|b", "|mm|": "0.012", "target": "≤ 0.02", "met": "met"},
+        {"case": "c", "|mm|": "n/a", "target": "≤ 0.02", "met": "missed"},
     ]
-    holds, misses = opening(suites).split("What does not hold everywhere:")
-    assert holds.startswith("**4 of 9 targets are met.**")
-    assert f"- [{QUESTIONS['limits']}](#fine-things) (1)" in holds
-    assert "- [Toys](#toys): 3 of 8. Missed: Bias (1 of 2: c), Many (4 of 6)." in misses
-    assert "Not judged" not in holds + misses
-    assert render(overview(suites))[:4] == b"\x89PNG"
+    record = json.loads((tmp_path / "toy.json").read_text("utf-8"))
+    assert record["tables"] == [{"file": "toy--bias.tsv", "title": "Bias", "notes": "Read it so."}]
+    assert record["figures"] == [{"file": "toy.png", "caption": "A falling line."}]
+    assert (record["title"], record["text"], record["command"]) == (
+        "Toys",
+        "Why.",
+        "the command",
+    )
+    assert re.fullmatch(r"\d{4}-\d\d-\d\d", record["date"])
+    assert record["commit"] == "1234abc"
 
 
-def test_misses_are_named_by_what_tells_rows_apart():
-    rows = [
-        {"a": "x", "b": 1.0, "c": "u", "met": False},
-        {"a": "x", "b": 2.0, "c": "u", "met": True},
-    ]
-    assert Table(title="t", rows=rows, digits=1).misses == ["x, 1.0"]
-    both = [{"a": "x", "one": False, "two": False}, {"a": "y", "one": True, "two": True}]
-    assert Table(title="t", rows=both).misses == ["x"]
+def test_the_commit_is_that_of_the_checkout_if_git_is_there(tmp_path, monkeypatch):
+    assert re.fullmatch(r"[0-9a-f]{7,40}(-dirty)?|n/a", commit())
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert commit() == "n/a"
 
 
 def test_every_suite_asks_something():
     assert QUESTIONS.keys() == SUITES.keys()
 
 
-def test_the_page_in_the_documentation_opens_with_the_counts_of_its_tables():
-    suites = list(suites_of(PAGE))
-    assert [suite.name for suite in suites] == list(SUITES)
-    assert opening(suites) in PAGE
-    counted = re.findall(
-        r"^\| (.+) \| (.+) \| (\d+) \| (\d+) \|$", PAGE.split("\n## ")[0], re.MULTILINE
-    )
-    assert [
-        (one.title, table.title, str(table.targets), str(table.missed))
-        for one in suites
-        for table in one.tables
-    ] == counted
+def test_files_of_the_documentation_are_those_that_records_or_pages_name():
+    records = {path.stem: json.loads(path.read_text("utf-8")) for path in FOLDER.glob("*.json")}
+    assert SUITES.keys() <= records.keys()
+    entries = [e for r in records.values() for e in (*r["tables"], *r["figures"])]
+    named = {entry["file"] for entry in entries}
+    found = {path.name for path in FOLDER.iterdir() if path.suffix in {".tsv", ".png"}}
+    assert named <= found
+    pages = "".join(path.read_text("utf-8") for path in FOLDER.parent.glob("*.md"))
+    assert all(f"(validation/{name})" in pages for name in found - named)
+    assert all(read_tsv(FOLDER / name) for name in found if name.endswith(".tsv"))
+
+
+@pytest.mark.parametrize("name", SUITES)
+def test_tables_of_the_documentation_are_those_of_the_suite(name):
+    record = json.loads((FOLDER / f"{name}.json").read_text("utf-8"))
+    texts = _TABLE[name]
+    assert (record["title"], record["question"]) == (texts["title"], texts["question"])
+    titles = {f"{name}--{key}.tsv": table["title"] for key, table in texts["tables"].items()}
+    assert {entry["file"]: entry["title"] for entry in record["tables"]}.items() <= titles.items()
 
 
 def test_figures_are_png_and_the_same_each_time():
@@ -175,12 +166,11 @@ def test_command_writes_the_report(tmp_path, capsys, one_suite):
     assert command.main(["--full", "--out", str(tmp_path / "a b")]) == ExitCode.OK
     said = capsys.readouterr().out.splitlines()
     assert said[0] == "Toys: 1 of 2 targets met"
-    assert said[1] == f"targets missed: 1; report: {tmp_path / 'a b' / 'validation.md'}"
+    assert said[1] == f"targets missed: 1; report: {tmp_path / 'a b'}"
     assert one_suite == [True]
-    assert (tmp_path / "a b/images/validation-line.png").read_bytes() == render(PICTURE)
-    text = (tmp_path / "a b/validation.md").read_text(encoding="utf-8")
-    assert "`hipsta-bids validate --full`" in text  # all suites there are
-    assert "## Toys\n\nWhy." in text
+    assert (tmp_path / "a b/toy.png").read_bytes() == render(PICTURE)
+    record = json.loads((tmp_path / "a b/toy.json").read_text("utf-8"))
+    assert record["command"] == "python -m validation --suite toy --full"
 
 
 def test_command_is_quick_by_default(tmp_path, one_suite):
@@ -212,13 +202,14 @@ def test_every_suite_can_be_imported(name):
 @pytest.mark.parametrize(
     "name", ["accuracy", "limits", "slices", "convergence", "invariance", "uncertainty"]
 )
-def test_a_suite_of_which_nothing_is_measured_misses_all_targets(monkeypatch, name):
+def test_a_suite_of_which_nothing_is_measured_misses_all_targets(monkeypatch, tmp_path, name):
     lost = Refusal(reason="crash", message="a bug")
     monkeypatch.setattr(cases, "run_cases", lambda _, given, **__: [lost for _ in given])
     suite = run_suite(name, full=False)
     assert suite.missed == suite.targets > 0
     # All that texts name in braces is known.
-    assert not re.search(r"\{\w", page([suite], full=False))
+    write(replace(suite, pictures=()), tmp_path, "the command", "1234abc")
+    assert not re.search(r"\{\w", (tmp_path / f"{name}.json").read_text("utf-8"))
 
 
 @pytest.mark.usefixtures("one_suite")

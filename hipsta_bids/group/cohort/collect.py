@@ -2,14 +2,14 @@
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from sys import intern
 from typing import Any
 
 import pandas as pd
 
-from hipsta_bids.derivatives import hemisphere
+from hipsta_bids.derivatives import dataset, hemisphere
 from hipsta_bids.derivatives.dataset import NOT_FINISHED, name_of, provenance_of, read_status
 from hipsta_bids.derivatives.names import DATASET_FILES, HemisphereName
 from hipsta_bids.errors import InputError, MissingFileError, NothingToDoError
@@ -43,6 +43,8 @@ class GroupRequest:
     exclude_qc: tuple[Condition, ...] = ()
     exclude_table: Path | None = None
     """Participants, or single sessions and hemispheres, to leave out."""
+    masks: tuple[str, ...] = ()
+    """Grid points that count as missing: ``repaired``, or tables."""
     ratings: Path | None = None
     """Ratings of hemispheres, saved from the report."""
     segmentations: tuple[Path, ...] = ()
@@ -112,6 +114,8 @@ class Collection:
     versions: tuple[str, ...] = ()
     ratings: Mapping[str, int] | None = None
     """Numbers of hemispheres by rating, if there is a table of these."""
+    quality: pd.DataFrame = field(default_factory=pd.DataFrame)
+    """Participant, session, side, decision and rating of each hemisphere, also of failed ones."""
     notes: tuple[str, ...] = ()
     """What to know, one line each."""
     warnings: tuple[str, ...] = ()
@@ -137,8 +141,11 @@ def collect_sheets(request: GroupRequest, *, may_lack: bool = False) -> Collecti
     choices = Choices(request.exclude_table, request.ratings)
     records: list[SheetRecord] = []
     left_out: list[Exclusion] = []
+    quality = []
     for result in sorted(places, key=_key):
-        entry = _judge(result, request, choices)
+        record = hemisphere.read_record(result)
+        entry = _judge(result, record, request, choices)
+        quality.append(_quality(result.name, record, choices))
         if isinstance(entry, Exclusion):
             left_out.append(entry)
         else:
@@ -155,6 +162,7 @@ def collect_sheets(request: GroupRequest, *, may_lack: bool = False) -> Collecti
         exclusions=tuple(left_out),
         grid=grid_of(records[0].result.root),
         settings_hash=digest,
+        quality=pd.DataFrame(quality),
         versions=tuple(sorted({record.version for record in records})),
         ratings=choices.counts((result.name, _digest(result)) for result in places),
         notes=(
@@ -166,9 +174,17 @@ def collect_sheets(request: GroupRequest, *, may_lack: bool = False) -> Collecti
     )
 
 
-def counts_text(counts: Mapping[str, int]) -> str:
-    """List names with their numbers of hemispheres."""
-    return ", ".join(f"{name} ({n})" for name, n in sorted(counts.items()))
+def _quality(
+    name: HemisphereName, record: Mapping[str, Any], choices: Choices
+) -> dict[str, str | None]:
+    """Return who, which side, the decision and the rating of a hemisphere."""
+    return {
+        PARTICIPANT: f"sub-{name.subject}",
+        SESSION: f"ses-{name.session}" if name.session else None,
+        "side": name.hemi,
+        "decision": str(record.get("decision")),
+        "rating": choices.rating(name, record.get("input_hash")),
+    }
 
 
 def _digest(result: hemisphere.ResultPlace) -> str | None:
@@ -185,7 +201,7 @@ def _several_versions(records: Sequence[SheetRecord]) -> tuple[str, ...]:
     usual = counts.most_common(1)[0][0]
     stems = [record.result.name.stem for record in records if record.version != usual]
     text = (
-        f"hemispheres were measured by several versions, {counts_text(counts)}; measure"
+        f"hemispheres were measured by several versions, {dataset.counts_text(counts)}; measure"
         f" {listed(stems, SHOWN)} with {usual}: a version may change numbers"
     )
     return (text,)
@@ -250,8 +266,8 @@ def _one_protocol(
         raise NothingToDoError(f"{request.roots[0]}: no hemisphere{request_text}; {hint}")
     if request.seg is None and len(counts) > 1:
         raise InputError(
-            f"{request.roots[0]}: hemispheres of several protocols, {counts_text(counts)}; choose"
-            " one by --seg"
+            f"{request.roots[0]}: hemispheres of several protocols,"
+            f" {dataset.counts_text(counts)}; choose one by --seg"
         )
     return request.seg or next(iter(counts))
 
@@ -268,9 +284,11 @@ def _refuse_twice(places: Sequence[hemisphere.ResultPlace]) -> None:
 
 
 def _judge(
-    result: hemisphere.ResultPlace, request: GroupRequest, choices: Choices
+    result: hemisphere.ResultPlace,
+    record: Mapping[str, Any],
+    request: GroupRequest,
+    choices: Choices,
 ) -> SheetRecord | Exclusion:
-    record = hemisphere.read_record(result)
     decision = record.get("decision")
     reason, message = record.get("reason") or str(decision), record.get("message") or ""
     rated = result.name, record.get("input_hash")

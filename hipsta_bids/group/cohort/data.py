@@ -115,10 +115,19 @@ def modeled_table(table: pd.DataFrame, comparison: Comparison) -> pd.DataFrame:
     return first.set_axis(first[PARTICIPANT])
 
 
-def compare_sessions(cohort: Cohort, comparison: Comparison) -> Cohort:
-    """Take differences of two sessions, if these are compared."""
+def compare_sessions(
+    cohort: Cohort, comparison: Comparison, covariates: Sequence[str] = ()
+) -> Cohort:
+    """Take differences of two sessions, if these are compared.
+
+    Maps that are covariates are of the first session, as other covariates are.
+    """
     if comparison.pair is None:
-        return cohort
+        sides = {
+            hemi: replace(side, covariates={name: side.maps[name] for name in covariates})
+            for hemi, side in cohort.sides.items()
+        }
+        return replace(cohort, sides=sides) if covariates else cohort
     table = modeled_table(cohort.table, comparison)
     if not cohort.sides:
         return replace(cohort, table=table)
@@ -132,7 +141,9 @@ def compare_sessions(cohort: Cohort, comparison: Comparison) -> Cohort:
         )
         common, a, b = np.intersect1d(rows[first], rows[second], return_indices=True)
         if len(common):
-            sides[hemi] = _change(side, common, first[a], second[b])
+            changes = _change(side, common, first[a], second[b])
+            baseline = {name: side.maps[name][first[a]] for name in covariates}
+            sides[hemi] = replace(changes, covariates=baseline)
     if not sides:
         raise ModelError(
             f"no hemisphere was measured in both sessions {' and '.join(comparison.pair)}"
@@ -147,6 +158,7 @@ def _change(side: SideMaps, rows: Int, first: Int, second: Int) -> SideMaps:
         rows=rows,
         maps={name: m[second] - m[first] for name, m in side.maps.items()},
         subfield=side.subfield[first],
+        unmasked=None,
         summary=pd.DataFrame(summary, columns=side.summary.columns),
     )
 

@@ -115,14 +115,18 @@ class Choices:
         """Check whether all ratings of a hemisphere, given the hash of its input, are for use."""
         return {row[_RATING] for row in self.rated.applying(name, digest)} == {RATINGS[0]}
 
+    def rating(self, name: HemisphereName, digest: str | None) -> str:
+        """Return the strictest rating of a hemisphere, ``unrated`` without one."""
+        ratings = {row[_RATING] for row in self.rated.applying(name, digest)}
+        return next((word for word in reversed(RATINGS) if word in ratings), _NO_RATING)
+
     def counts(self, names: Iterable[tuple[HemisphereName, str | None]]) -> dict[str, int] | None:
         """Count hemispheres by rating, the strictest of several; ``None`` without a table."""
         if self.rated.path is None:
             return None
         counts = dict.fromkeys((*RATINGS, _NO_RATING), 0)
         for name, digest in names:
-            ratings = {row[_RATING] for row in self.rated.applying(name, digest)}
-            counts[next((word for word in reversed(RATINGS) if word in ratings), _NO_RATING)] += 1
+            counts[self.rating(name, digest)] += 1
         return counts
 
 

@@ -13,6 +13,8 @@ from formulaic import Formula
 from numpy.typing import NDArray
 
 from hipsta_bids.errors import ModelError
+from hipsta_bids.group.design import contrasts as texts
+from hipsta_bids.group.design.contrasts import ContrastSpec, contrast_json, refusal
 from hipsta_bids.group.design.grammar import CONTEXT, closed_formula
 from hipsta_bids.group.design.settings import DefaultModelSettings, DesignSettings
 from hipsta_bids.io.files import MISSING
@@ -23,15 +25,9 @@ NUMERIC_SHARE = 0.5
 #: A note names other columns of three to this many different numbers, fitted as a line.
 FEW_VALUES = 5
 
-_VERSION = "1.0.0"
-#: A weight and a name such as ``age``, ``group[CU]`` or ``group[T.CU]:age``; with blanks, columns
-#: are in backticks.
-_TERM = re.compile(
-    r"\s*(?P<sign>[+-])?\s*(?:(?P<weight>\d+\.?\d*|\.\d+)\s*\*?\s*)?"
-    r"(?P<name>(?:[^\W\d]|`[^`]+`)(?:[\w.:]|`[^`]+`|\[[^\]]*\]|\([^)]*\))*)"
-)
-#: Outside of brackets, where it belongs to a level such as ``group[>=24]``.
-_EQUALS = re.compile(r"=(?![^\[]*\])")
+
+#: A map as a covariate, with the sign before it.
+_MAP = re.compile(r"\+\s*map\(\s*(\w+)\s*\)(?=\s*(?:\+|$))")
 
 #: Numbers from here on overflow when they are squared and summed.
 _LARGEST = 1e100
@@ -41,49 +37,10 @@ INTERCEPT = "Intercept"
 _NAMED = 8
 #: Two values are the same on a line and as a factor.
 _LEAST_LINE = 3
-#: Smallest and largest size of a weight: products of weights and variables have to be finite.
-_WEIGHTS = (1e-9, 1e9)
 
 #: Whole numbers as spreadsheets may write them, and dates.
 _WHOLE = re.compile(r"(-?\d+)\.0+")
 _DATE = re.compile(r"\d{4}-\d{1,2}-\d{1,2}\b.*|\d{1,2}[./]\d{1,2}[./]\d{2,4}")
-
-
-@dataclass(frozen=True)
-class Contrast:
-    """One hypothesis: that ``weights @ coefficients`` is zero."""
-
-    name: str
-    weights: Float
-    """(rows, columns of the design); one row is tested by t, several together by F."""
-
-    def __post_init__(self) -> None:
-        weights = np.atleast_2d(np.array(self.weights, dtype=np.float64))
-        if np.linalg.matrix_rank(weights) < weights.shape[0]:
-            raise ModelError(
-                f"contrast {self.name!r}: its rows repeat each other, or one is all zero; "
-                "remove the redundant row"
-            )
-        weights.flags.writeable = False
-        object.__setattr__(self, "weights", weights)
-
-    @property
-    def n_rows(self) -> int:
-        """Degrees of freedom of the hypothesis."""
-        return int(self.weights.shape[0])
-
-
-@dataclass(frozen=True)
-class ContrastSpec:
-    """A contrast by the names of the columns that it combines."""
-
-    name: str
-    conditions: tuple[str, ...]
-    """Columns of the design, or levels such as ``group[CU]``: then means of the model there."""
-    weights: tuple[tuple[float, ...], ...]
-    """Rows; one for t, several for F."""
-    test: str
-    """``t`` or ``F``."""
 
 
 @dataclass(frozen=True)
@@ -98,6 +55,13 @@ class ModelSpec:
     """Also test each column by itself, with this test."""
     measures: tuple[str, ...] = ()
     """Left-hand side: what the model is fitted to; empty for the default."""
+    maps: tuple[str, ...] = ()
+    """Maps that are covariates at each point, as ``map(curvature)`` in the formula."""
+
+    @property
+    def text(self) -> str:
+        """Right-hand side with the maps."""
+        return " + ".join([self.formula, *(f"map({name})" for name in self.maps)])
 
 
 def model_from_shortcut(formula: str, contrasts: Sequence[str], name: str) -> dict[str, Any]:
@@ -109,46 +73,59 @@ def model_from_shortcut(formula: str, contrasts: Sequence[str], name: str) -> di
         "Model": {"Type": "glm", "X": [1], "Formula": formula},
     }
     if contrasts:
-        node["Contrasts"] = [_contrast_json(text) for text in contrasts]
+        node["Contrasts"] = [contrast_json(text) for text in contrasts]
     else:
         node["DummyContrasts"] = {"Test": "t"}
-    return {"Name": name, "BIDSModelVersion": _VERSION, "Nodes": [node]}
+    return {"Name": name, "BIDSModelVersion": texts.VERSION, "Nodes": [node]}
 
 
 def parse_model(document: Mapping[str, Any]) -> ModelSpec:
     """Read a BIDS Stats Model: one node at dataset level, with ``Model.X`` or ``Model.Formula``."""
     nodes = document.get("Nodes")
     if not isinstance(nodes, list) or len(nodes) != 1 or not isinstance(nodes[0], Mapping):
-        raise _refusal("needs exactly one node, at dataset level")
+        raise refusal("needs exactly one node, at dataset level")
     node = nodes[0]
     if str(node.get("Level", "")).lower() != "dataset":
-        raise _refusal(f"has a node at level {node.get('Level')!r}; only Dataset is supported")
+        raise refusal(f"has a node at level {node.get('Level')!r}; only Dataset is supported")
     if node.get("Transformations"):
-        raise _refusal("has transformations; write them into the formula instead, as log(age)")
+        raise refusal("has transformations; write them into the formula instead, as log(age)")
     model = node.get("Model")
     if not isinstance(model, Mapping) or str(model.get("Type", "glm")).lower() != "glm":
-        raise _refusal("needs a Model of Type glm")
+        raise refusal("needs a Model of Type glm")
     dummy = node.get("DummyContrasts")
     contrasts = node.get("Contrasts", [])
     if not isinstance(contrasts, list):
-        raise _refusal("has Contrasts that are no list")
-    specs = tuple(_parse_contrast(one) for one in contrasts)
+        raise refusal("has Contrasts that are no list")
+    specs = tuple(texts.parse_contrast(one) for one in contrasts)
     names = [spec.name for spec in specs]
     if repeated := sorted({one for one in names if names.count(one) > 1}):
-        raise _refusal(f"has contrasts of the same name: {', '.join(repeated)}")
+        raise refusal(f"has contrasts of the same name: {', '.join(repeated)}")
     labels = [file_label(one) for one in names]
     if alike := [one for one in names if labels.count(file_label(one)) > 1]:
-        raise _refusal(
+        raise refusal(
             f"has contrasts whose files would have one name: {listed(alike)}; give one"
             " a name, as other=group[A]:age"
         )
     return ModelSpec(
         name=str(node.get("Name") or document.get("Name") or "model"),
-        formula=_formula(model),
+        formula=split_maps(_formula(model))[0],
+        maps=split_maps(_formula(model))[1],
         measures=left_side(str(model.get("Formula") or "")),
         contrasts=specs,
         dummy=str(dummy.get("Test", "t")) if isinstance(dummy, Mapping) else None,
     )
+
+
+def split_maps(formula: str) -> tuple[str, tuple[str, ...]]:
+    """Take the terms ``map(NAME)`` out of the right-hand side of a formula, and list the maps."""
+    right = formula.rpartition("~")[2]
+    names = tuple(dict.fromkeys(_MAP.findall(f"+{right}")))
+    plain = _MAP.sub(" ", f"+{right}")
+    if re.search(r"(?<![\w.])map\s*\(", plain):
+        raise ModelError(
+            f"formula {right.strip()!r}: add map(NAME) to other terms, as group + map(curvature)"
+        )
+    return re.sub(r"^[\s+]+", "", plain).strip() or "1", names
 
 
 def left_side(formula: str) -> tuple[str, ...]:
@@ -165,85 +142,16 @@ def left_side(formula: str) -> tuple[str, ...]:
     return names
 
 
-def parse_expression(text: str) -> dict[str, float]:
-    """Read a linear combination, such as ``0.5*a + 0.5*b - group[CU]``."""
-    weights: dict[str, float] = {}
-    position = 0
-    while position < len(text.rstrip()):
-        match = _TERM.match(text, position)
-        if match is None or (position and match["sign"] is None):
-            raise ModelError(
-                f"contrast {text!r}: cannot read {text[position:].strip()!r}; write it as"
-                " group[A]-group[B] or 0.5*age, and names with blanks in backticks"
-            )
-        weight = float(match["weight"] or 1) * (-1 if match["sign"] == "-" else 1)
-        name = match["name"].replace("`", "")
-        weights[name] = weights.get(name, 0.0) + weight
-        position = match.end()
-    if not weights:
-        raise ModelError("contrast: empty; name what to compare")
-    return weights
-
-
-def _contrast_json(text: str) -> dict[str, Any]:
-    *given, body = _EQUALS.split(text)
-    rows = [parse_expression(row) for row in re.split(r",(?![^\[(]*[\])])", body)]
-    names = list(dict.fromkeys(name for row in rows for name in row))
-    weights = [[row.get(name, 0.0) for name in names] for row in rows]
-    return {
-        "Name": "=".join(given).strip() or body.strip(),
-        "ConditionList": names,
-        "Weights": weights[0] if len(rows) == 1 else weights,
-        "Test": "t" if len(rows) == 1 else "F",
-    }
-
-
-def _parse_contrast(contrast: Mapping[str, Any]) -> ContrastSpec:
-    if not isinstance(contrast, Mapping) or not contrast.get("Name"):
-        raise _refusal("has a contrast without a name")
-    name = str(contrast["Name"])
-    test = str(contrast.get("Test", "t"))
-    if test not in {"t", "F"}:
-        raise _refusal(f"has contrast {name!r} with test {test!r}; use t or F")
-    try:
-        conditions = tuple(map(str, contrast.get("ConditionList", ())))
-        given = contrast.get("Weights", [1] * len(conditions))
-        rows = given if given and isinstance(given[0], list) else [given]
-        weights = tuple(tuple(map(_number, row)) for row in rows)
-    except (TypeError, ValueError, LookupError, ZeroDivisionError):
-        limits = f"{_WEIGHTS[0]:g} to {_WEIGHTS[1]:g}, or 0"
-        problem = f"has contrast {name!r} without lists of names and numbers (sizes {limits})"
-        raise _refusal(problem) from None
-    if not conditions or any(len(row) != len(conditions) for row in weights):
-        raise _refusal(f"has contrast {name!r} with {len(conditions)} conditions and other weights")
-    if test == "t" and len(weights) > 1:
-        raise _refusal(f"has contrast {name!r} with several rows; its test must be F")
-    return ContrastSpec(name, conditions, weights, test)
-
-
-def _number(value: object) -> float:
-    """Weights may be fractions such as ``1/3``."""
-    above, _, below = str(value).partition("/")
-    number = float(above) / float(below or 1)
-    if number and not _WEIGHTS[0] <= abs(number) <= _WEIGHTS[1]:  # NaN, too
-        raise ValueError(number)
-    return number
-
-
 def _formula(model: Mapping[str, Any]) -> str:
     if text := model.get("Formula"):
         return str(text).rpartition("~")[2].strip()
     terms = model.get("X")
     if not isinstance(terms, list) or not terms:
-        raise _refusal("needs Model.X or Model.Formula")
+        raise refusal("needs Model.X or Model.Formula")
     names = [str(term) for term in terms if str(term) != "1"]
     if bad := [name for name in names if not re.fullmatch(r"[\w.*: ]+", name)]:
-        raise _refusal(f"has {bad[0]!r} in X; use names of columns, or a Formula")
+        raise refusal(f"has {bad[0]!r} in X; use names of columns, or a Formula")
     return " + ".join(["1" if len(names) < len(terms) else "0", *names])
-
-
-def _refusal(problem: str) -> ModelError:
-    return ModelError(f"model file {problem} (BIDS Stats Models {_VERSION})")
 
 
 def file_label(text: str) -> str:

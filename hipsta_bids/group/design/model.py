@@ -1,9 +1,7 @@
 """Which model is fitted, the user's or the paper's default, and its design matrix."""
 
-import difflib
 import itertools
 import math
-import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -12,12 +10,13 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from formulaic import Formula, ModelMatrix
-from scipy.linalg import null_space
+from formulaic import Formula
 
 from hipsta_bids.errors import ModelError, UsageError
 from hipsta_bids.group.design import formula as formulas
+from hipsta_bids.group.design.contrasts import Contrast, ContrastSpec
 from hipsta_bids.group.design.grammar import CONTEXT, closed_formula, term_text
+from hipsta_bids.group.design.marginal import NONLINEAR, Terms
 from hipsta_bids.group.design.settings import DefaultModelSettings, DesignSettings, GroupSettings
 from hipsta_bids.io import files
 from hipsta_bids.types import PARTICIPANT, SESSION, Float, Int64
@@ -25,15 +24,12 @@ from hipsta_bids.types import PARTICIPANT, SESSION, Float, Int64
 #: A column is a combination of other columns if less than this fraction of its length is its own.
 DEPENDENCE = 1e-9
 
-#: How a contrast asks whether a variable bends, and the ages that the default model may bend.
-_NONLINEAR = "nonlinear"
 #: Age at the first visit, where that of each visit is known.
 FIRST_AGE = "age_first"
+#: Columns of ages, which the default model may bend.
 _AGES = ("age", FIRST_AGE)
 _HEADS = DefaultModelSettings.model_fields["icv_columns"].default
 _OLDEST = 130.0  # years
-#: A line is in the span of columns if it is off by less, in standard deviations.
-_EXACT = 1e-6
 #: Head volumes differ by less, in one unit.
 _UNITS = 50.0
 #: A note names covariates that correlate by more, and columns for which there are fewer people.
@@ -124,7 +120,7 @@ def default_contrasts(
 
     Groups, changes over time in each, their differences, and whether covariates bend.
     """
-    bends = [f"{name} nonlinear = {_NONLINEAR}({name})" for name in nonlinear]
+    bends = [f"{name} nonlinear = {NONLINEAR}({name})" for name in nonlinear]
     if groups is None:
         return [*([time] if time else []), *bends]
     contrasts = [*groups.contrasts(), *bends]
@@ -213,6 +209,13 @@ def wanted_measures(request: ModelRequest, options: tuple[str, ...]) -> tuple[st
     return options or left
 
 
+def covariate_maps(request: ModelRequest) -> tuple[str, ...]:
+    """Names of maps that are covariates at each point."""
+    if request.file is not None:
+        return formulas.parse_model(files.read_json(request.file)).maps
+    return formulas.split_maps(request.formula or "")[1]
+
+
 def choose_model(
     request: ModelRequest,
     table: pd.DataFrame,
@@ -258,8 +261,10 @@ def model_document(
             raise UsageError("--formula is empty; write it as group + age")
         formula = request.formula
         contrasts = list(request.contrasts)
-        if not contrasts and groups is not None and groups.column in formula:
-            contrasts = groups.contrasts()
+        plain, maps = formulas.split_maps(formula)
+        if not contrasts and groups is not None and groups.column in plain:
+            contrasts = [*groups.contrasts(), *interactions(plain)]
+            contrasts += [f"map({name})" for name in maps]
         return formulas.model_from_shortcut(
             formula, contrasts, request.name or folder_name(formula)
         )
@@ -290,6 +295,18 @@ def model_document(
     return formulas.model_from_shortcut(formula, contrasts, request.name or folder_name(formula))
 
 
+def interactions(formula: str) -> list[str]:
+    """List the interactions of a formula by their variables, as contrasts."""
+    closed = closed_formula(formula.rpartition("~")[2])
+    try:
+        terms = list(Formula(closed.text))
+    except Exception:  # noqa: BLE001  (formulaic raises all kinds; the design refuses it, with words)
+        return []
+    variables = (closed_formula(term_text(term)).names for term in terms)
+    sets = {frozenset(names): names for names in variables if len(names) > 1}
+    return [":".join(f"`{name}`" for name in names) for names in sets.values()]
+
+
 def folder_name(formula: str, measures: tuple[str, ...] = ()) -> str:
     """Spell measures and a formula as the name of a folder; products must not look like sums."""
     right = formula.rpartition("~")[2].replace("*", " x ").replace(":", " by ")
@@ -311,7 +328,7 @@ class Design:
     """Labels of rows left out, by the variable that they lack (the first one)."""
     references: Mapping[str, str]
     """Reference level of each factor."""
-    contrasts: tuple[formulas.Contrast, ...]
+    contrasts: tuple[Contrast, ...]
     notes: Mapping[str, str] = field(default_factory=dict)
     """What to know about the coding of variables, by their names."""
     levels: Mapping[str, Sequence[str]] = field(default_factory=dict)
@@ -366,7 +383,7 @@ def build_design(
         raise ModelError(
             f"formula {model.formula!r}: {str(error).partition(chr(10))[0]}"
         ) from error
-    terms = _Terms(model_matrix, variables, levels_used)
+    terms = Terms(model_matrix, variables, levels_used, model.maps)
     matrix, columns = terms.matrix, terms.columns
     _check_matrix(matrix, columns, variables.index, settings)
     people = table.loc[complete, PARTICIPANT].nunique() if PARTICIPANT in table else len(matrix)
@@ -374,8 +391,8 @@ def build_design(
     specs = model.contrasts
     if model.dummy is not None:
         specs += tuple(
-            formulas.ContrastSpec(name, (name,), ((1.0,),), model.dummy)
-            for name in columns
+            ContrastSpec(name, (name,), ((1.0,),), model.dummy)
+            for name in terms.names
             if name != formulas.INTERCEPT
         )
     return Design(
@@ -388,87 +405,6 @@ def build_design(
         notes={name: note for name, note in notes.items() if note} | doubts,
         levels=levels_used,
     )
-
-
-class _Terms:
-    """What contrasts can name, as rows of weights of the columns."""
-
-    def __init__(
-        self, matrix: ModelMatrix, table: pd.DataFrame, levels: Mapping[str, list[str]]
-    ) -> None:
-        self.matrix: Float = np.asarray(matrix, dtype=np.float64)
-        self.columns = tuple(str(column) for column in matrix.columns)
-        self.spec, self.table, self.levels = matrix.model_spec, table, levels
-
-    def contrast(self, spec: formulas.ContrastSpec) -> formulas.Contrast:
-        variable = re.fullmatch(rf"{_NONLINEAR}\(`?([^`]+)`?\)", spec.conditions[0])
-        if variable and len(spec.conditions) == 1:
-            return formulas.Contrast(spec.name, self._nonlinear(variable[1], spec.name))
-        rows = np.array([self._row(name, spec.name) for name in spec.conditions])
-        weights: Float = np.array(spec.weights) @ rows
-        return formulas.Contrast(spec.name, weights)
-
-    def _nonlinear(self, variable: str, contrast: str) -> Float:
-        """Weights that are zero where the columns of a variable make a line of it.
-
-        If ``line`` are the coefficients that give the variable itself, these are the directions of
-        its coefficients at right angles to ``line``. A single one is scaled to the coefficient of
-        the square.
-        """
-        columns = [
-            column
-            for structure in self.spec.structure
-            if closed_formula(term_text(structure.term)).names == (variable,)
-            for column in structure.columns
-        ]
-        places = [i for i, column in enumerate(self.columns) if column in columns]
-        if variable not in self.table or len(places) < 2:  # noqa: PLR2004 -- a line is one
-            raise ModelError(
-                f"contrast {contrast!r}: {variable!r} is in the formula as a line at most; write it"
-                f" as poly({variable}, 2) or cr({variable}, df=3)"
-            )
-        values = self.table[variable].to_numpy(dtype=np.float64)
-        spread = float(values.std())
-        values = (values - values.mean()) / spread
-        powers = np.column_stack([values, values**2])
-        found = np.linalg.lstsq(self.matrix, powers, rcond=None)[0]
-        if np.abs(self.matrix @ found[:, 0] - values).max() > _EXACT:
-            raise ModelError(
-                f"contrast {contrast!r}: no line of {variable!r} is in the formula to compare with"
-            )
-        line, square = found[places].T
-        across = null_space(line[None]).T
-        if len(across) == 1:
-            across = across / float(across[0] @ square) / spread**2
-        weights = np.zeros((len(across), len(self.columns)))
-        weights[:, places] = across
-        return weights
-
-    def _row(self, name: str, contrast: str) -> Float:
-        if name in self.columns:
-            return np.asarray(np.eye(len(self.columns))[self.columns.index(name)])
-        factor, level = self._split(name)
-        if factor is None:
-            names = [
-                *self.columns,
-                *(f"{f}[{x}]" for f, levels in self.levels.items() for x in levels),
-            ]
-            near = difflib.get_close_matches(name, names, n=1)
-            hint = f"did you mean {near[0]}?" if near else f"known are {formulas.listed(names)}"
-            raise ModelError(f"contrast {contrast!r}: nothing is called {name!r}; {hint}")
-        # The mean of the model over all rows if every one had this level.
-        moved = self.table.copy()
-        moved[factor] = pd.Categorical([level] * len(moved), categories=self.levels[factor])
-        matrix = self.spec.get_model_matrix(moved, context=dict(CONTEXT))
-        return np.asarray(np.asarray(matrix, dtype=np.float64).mean(axis=0))
-
-    def _split(self, name: str) -> tuple[str | None, str]:
-        """Factor and level of ``factor[level]`` or ``factor.level``."""
-        for factor, levels in self.levels.items():
-            for level in levels:
-                if name in {f"{factor}[{level}]", f"{factor}.{level}"}:
-                    return factor, level
-        return None, ""
 
 
 def _doubts(numeric: pd.DataFrame, n_columns: int, n_people: int) -> dict[str, str]:

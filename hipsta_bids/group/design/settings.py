@@ -93,8 +93,8 @@ class DefaultModelSettings(toml.SettingsTable):
     group_columns: toml.Texts = ("group", "diagnosis", "dx", "diagnostic_group")
     """The first of these columns, in any case of letters, has the groups."""
     reference_levels: toml.Texts = ("CN", "CU", "HC", "NC", "CTRL", "control", "healthy")
-    """The reference level of the groups is the first of these, in any case and number; else the
-    most frequent one."""
+    """The reference level of the groups: the first of these, in any case and number; else the
+    most frequent level."""
     covariates: toml.Texts = ("age", "sex", "site")
     """Further columns of the model, where the table has them and they vary."""
     age: Literal["linear", "quadratic", "spline"] = "linear"
@@ -141,9 +141,9 @@ class MultiplicitySettings(toml.SettingsTable):
     paper's), or ``bh`` (Benjamini and Hochberg 1995). Family-wise error by permutation:
     ``permutation-tfce`` (threshold-free cluster enhancement), or ``permutation-max`` (largest
     t)."""
-    scope: Literal["map", "hemispheres"] = "map"
-    """One family of tests: each ``map`` (measure, contrast and hemisphere), or both ``hemispheres``
-    together."""
+    scope: Literal["map", "hemispheres", "all"] = "map"
+    """One family of tests: each ``map`` (measure, contrast and hemisphere), both ``hemispheres``
+    together, or ``all`` maps of a contrast."""
     alpha: toml.OpenFraction = 0.05
     """False discovery rate, or family-wise error rate of permutation tests."""
     permutations: AtLeastTwo = 5000

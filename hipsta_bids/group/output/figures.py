@@ -1,252 +1,272 @@
-"""Figures of an analysis, as a paper prints them: sizes, type, files, and all that show curves.
+"""Figures of an analysis: the list of all, and those that show curves.
 
-Those of maps are in ``panels``. Colors are those of the pages (``reports.display``).
+Figures of maps are in ``maps`` and ``panels``. Colors are those of the pages (``reports.display``).
 """
 
-import io
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from itertools import cycle
+from textwrap import wrap
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 
-from hipsta_bids.group.cohort.data import Cohort
-from hipsta_bids.group.output import panels
-from hipsta_bids.group.output.results import Analysis, ScoredMaps, members_of, profiles_of
+from hipsta_bids.group.cohort.data import SHEET, Cohort
+from hipsta_bids.group.output import panels, style
+from hipsta_bids.group.output.maps import draw_measure
+from hipsta_bids.group.output.results import Analysis, ScoredMaps
 from hipsta_bids.group.output.shapes import AverageShape
 from hipsta_bids.group.stats.arrays import Float, describe_known, mean_of_known
-from hipsta_bids.group.stats.classify import ClassifierResult, ModelComparison
 from hipsta_bids.group.stats.glm import FittedMaps
 from hipsta_bids.io.files import MISSING
+from hipsta_bids.reports import display
 from hipsta_bids.reports.cells import SIDES, display_name, with_brackets
 from hipsta_bids.reports.display import COLORS, HEMISPHERE_COLORS, X_ENDS, kind_of, parts_of
-from hipsta_bids.reports.maps import new_figure
+from hipsta_bids.reports.group_maps import MOST_FIGURES, measures_of
+from hipsta_bids.reports.group_tables import GroupResults, records
+from hipsta_bids.types import PARTICIPANT
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_STYLE: Any = {
-    "font.family": "sans-serif",
-    # The first is everywhere; the other fonts are for readers of drawings who lack them.
-    # Chinese, Japanese and Korean characters come from the first of these that is installed.
-    "font.sans-serif": [
-        "DejaVu Sans",
-        "Verdana",
-        "Arial",
-        "Helvetica",
-        "Noto Sans CJK SC",
-        "Source Han Sans SC",
-        "Microsoft YaHei",
-        "PingFang SC",
-        "Malgun Gothic",
-    ],
-    "font.size": panels.SMALL,
-    "axes.titlesize": panels.TITLE,
-    "axes.titley": 1.0,  # no search for a place: nothing is above the panels
-    "axes.labelsize": panels.SMALL,
-    "xtick.labelsize": panels.SMALL,
-    "ytick.labelsize": panels.SMALL,
-    "legend.fontsize": panels.SMALL,
-    "legend.title_fontsize": panels.SMALL,
-    "legend.frameon": False,
-    "axes.linewidth": 0.6,
-    "xtick.major.width": 0.6,
-    "ytick.major.width": 0.6,
-    "xtick.major.size": 2.5,
-    "ytick.major.size": 2.5,
-    "image.composite_image": False,  # views in one picture with what lies between take longer
-    "text.parse_math": False,  # names of groups are no formulas
-    "pdf.fonttype": 42,
-    "svg.fonttype": "none",
-    "svg.hashsalt": "hipsta_bids",
-}
-#: What of a file would change from day to day, or with the version of a library.
-_METADATA: Mapping[str, Any] = {
-    "png": {"Software": None},
-    "svg": {"Date": None, "Creator": None},
-    "pdf": {"CreationDate": None, "Producer": None, "Creator": None},
-}
-_INCH = 25.4  # mm
 #: Positions of cross-sections along the long axis, as a fraction from posterior to anterior.
 _SECTIONS = {0.1: "posterior", 0.5: "middle", 0.9: "anterior"}
 _WIDTHS = (1.2, 0.7, 1.2)  # of the lines of interior, middle and exterior, points
 _STYLES = ("-", ":", "-")
+_SCREEN = 150  # dots per inch of pictures that the page alone shows
+_SIDE_MARK = "\t"  # of entries of legends that have no line
 _MOST_LINES = 500  # of single warps on a panel: more hide each other
-_LETTERS = "abcdefghijklmnopqrstuvwxyz"
 
 #: Deviation of the 5th centile.
 _LOW = -1.645
 
-Drawing = Callable[[], "list[Figure]"]
 
-
-def encode(name: str, draw: Drawing) -> list[tuple[str, bytes]]:
-    """Draw figures and encode each as PDF, PNG and SVG; the same results give the same bytes."""
-    new_figure((1.0, 1.0), None)  # loads the library with settings of its own
-    from matplotlib import rc_context  # noqa: PLC0415
-
-    encoded = []
-    with rc_context(_STYLE):
-        for number, figure in enumerate(draw(), start=1):
-            title = name if number == 1 else f"{name}_{number}"
-            for kind, metadata in _METADATA.items():
-                buffer = io.BytesIO()
-                options: Any = {"pil_kwargs": {"compress_level": 4}} if kind == "png" else {}
-                figure.savefig(
-                    buffer, format=kind, dpi=panels.DOTS_PER_INCH, metadata=metadata, **options
-                )
-                encoded.append((f"{title}.{kind}", buffer.getvalue()))
-                figure.set_layout_engine(None)  # that of the first is for all: it takes long
-    return encoded
-
-
-def _panels(n_rows: int, n_columns: int, size: tuple[float, float]) -> tuple["Figure", Any]:
-    """Return an empty figure of a size in mm, and its panels."""
-    figure = new_figure((size[0] / _INCH, size[1] / _INCH), "constrained")
-    return figure, figure.subplots(n_rows, n_columns, squeeze=False)
-
-
-def _explain(figure: "Figure", axis: "Axes", title: str | None = None) -> None:
-    """Put the legend of a panel below all, where it covers no curve."""
-    handles = dict(zip(*axis.get_legend_handles_labels()[::-1], strict=True))
-    legend = figure.legend(
-        handles.values(), handles, loc="outside lower center", ncols=len(handles)
-    )
-    legend.set_title(title or "")
-
-
-def _name(axes: "Sequence[Axes]") -> None:
-    """Put letters on panels, beside their titles."""
-    for axis, letter in zip(axes, cycle(_LETTERS), strict=False):
-        axis.set_title(letter, loc="left", fontsize=panels.LETTER, weight="bold")
-
-
-def mark_medial(axis: "Axes", cohort: Cohort) -> None:
-    """Say on the x axis which end is medial."""
-    axis.set_xticks([cohort.x[0], cohort.x[-1]], X_ENDS)
+def mark_medial(axis: "Axes", x: Float) -> None:
+    """Mark the medial end on the x axis."""
+    axis.set_xticks([x[0], x[-1]], X_ENDS)
     left, right = axis.get_xticklabels()
     left.set_horizontalalignment("left")
     right.set_horizontalalignment("right")
 
 
-def draw_roc(analysis: Analysis) -> "list[Figure]":
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Curve:
+    """A curve of a classifier, with the text of its legend."""
+
+    hemi: str
+    pair: tuple[str, str]
+    """Control and case."""
+    added: str
+    full: bool
+    """Whether the measure was added to the base model."""
+    points: tuple[Float, Float]
+    text: str
+    separated: bool
+
+
+def read_roc(results: GroupResults) -> list[Curve]:
+    """Read receiver operating characteristics, with areas and their limits."""
+    keys, curves = ["hemi", "control", "case", "added"], list[Curve]()
+    table = records(results.table("classification"))
+    rows = {tuple(row[key] for key in keys): row for row in table}
+    for group, points in results.table("roc").groupby([*keys, "classifier"], sort=False):
+        hemi, control, case, added, name = map(str, group)
+        row = rows[hemi, control, case, added]
+        ends = ("", "_low", "_high", "_cv")
+        area, low, high, left_out = (row[f"auc_{name}{end}"] for end in ends)
+        curves.append(
+            Curve(
+                hemi=hemi,
+                pair=(control, case),
+                added=added,
+                full=name == "full",
+                points=(points["false_positives"].to_numpy(), points["true_positives"].to_numpy()),
+                text=f"{area:.2f} ({low:.2f} to {high:.2f}),\n   cross-validated {left_out:.2f}",
+                separated=bool(row["separated"]),
+            )
+        )
+    return curves
+
+
+def draw_roc(results: GroupResults, width: float | None = None) -> "list[Figure]":
     """Draw the curves of the first added measure."""
-
-    def line(axis: "Axes", result: ClassifierResult, color: str) -> str:
-        axis.plot(*result.curve, color=color)
-        area, left_out = result.auc, result.validated[0]
-        return f"{area.area:.2f} ({area.low:.2f} to {area.high:.2f}),\n   left out {left_out:.2f}"
-
     labels = "1 - specificity", "sensitivity"
-    return _draw_pairs(analysis, labels, "area (95 % limits), participants fitted", line)
+    title = "area (95 % limits), fitted"
+    return _draw_pairs(read_roc(results), labels, title, width=width)
 
 
 def draw_calibration(analysis: Analysis) -> "list[Figure]":
     """Draw predicted chances, cross-validated, against what happened; of large groups only."""
-
-    def line(axis: "Axes", result: ClassifierResult, color: str) -> str:
-        calibration = result.calibration
-        axis.plot(calibration.predicted, calibration.observed, "o-", color=color, markersize=3)
-        return f"{calibration.slope:.2f}, {calibration.brier:.2f}"
-
-    judged = [one for one in analysis.pairs if one[-1].full.calibration.judged]
+    curves = [
+        Curve(
+            hemi=hemi,
+            pair=pair,
+            added=measure,
+            full=full,
+            points=(result.calibration.predicted, result.calibration.observed),
+            text=f"{result.calibration.slope:.2f}, {result.calibration.brier:.2f}",
+            separated=bool(comparison.columns["separated"]),
+        )
+        for hemi, measure, pair, comparison in analysis.pairs
+        if comparison.full.calibration.judged
+        for full, result in ((False, comparison.base), (True, comparison.full))
+    ]
     labels = "predicted chance, cross-validated", "share of cases"
-    return _draw_pairs(replace(analysis, pairs=judged), labels, "slope, Brier score", line)
+    return _draw_pairs(curves, labels, "slope, Brier score", marker="o", markersize=3)
 
 
 def _draw_pairs(
-    analysis: Analysis,
+    curves: Sequence[Curve],
     labels: tuple[str, str],
     title: str,
-    line: "Callable[[Axes, ClassifierResult, str], str]",
+    width: float | None = None,
+    **options: Any,  # noqa: ANN401  (of matplotlib)
 ) -> "list[Figure]":
     """Draw a row for each pair of groups, with its legend beside it: the first added measure."""
-    first: dict[tuple[str, str], dict[str, tuple[str, ModelComparison]]] = {}
-    for hemi, measure, pair, comparison in analysis.pairs:
-        first.setdefault(pair, {}).setdefault(hemi, (measure, comparison))
+    from matplotlib.lines import Line2D  # noqa: PLC0415  (slow to load)
+
+    first: dict[tuple[str, str], dict[str, list[Curve]]] = {}
+    for curve in curves:
+        side_curves = first.setdefault(curve.pair, {}).setdefault(curve.hemi, [])
+        if not side_curves or side_curves[0].added == curve.added:
+            side_curves.append(curve)
     n = max(map(len, first.values()))
-    width = panels.TWO_COLUMNS if n > 1 else panels.ONE_COLUMN
-    side = (width - 6.0) / (n + 1)
-    figure, axes = _panels(len(first), n + 1, (width, len(first) * max(side + 13, 18 + 14 * n)))
-    for row, ((control, case), by_side) in zip(axes, first.items(), strict=True):
-        texts: dict[str, list[str]] = {}
-        for axis, (hemi, (measure, comparison)) in zip(row, by_side.items(), strict=False):
-            where = {"L": "left", "R": "right"}.get(hemi, "both sides")
+    width = width or (style.TWO_COLUMNS if n > 1 else style.ONE_COLUMN)
+    beside = n == 1 or width > style.ONE_COLUMN  # is the legend
+    side = (width - 6.0) / (n + beside)
+    letters = int((side if beside else width - 12.0) / (0.22 * style.SMALL))
+    legends = {pair: _legend(pair, by_side, title, letters) for pair, by_side in first.items()}
+    lines = max("\n".join(legend).count("\n") + 1 for legend in legends.values())
+    text = 18.0 + 3.2 * lines
+    height = max(side + 13, text) if beside else side + 13 + text
+    ratios = None if beside else [side + 13, text] * len(first)
+    shape = (len(first), n + 1) if beside else (2 * len(first), n)
+    figure, axes = style.new_panels(*shape, (width, len(first) * height), ratios)
+    for number, (pair, by_side) in enumerate(first.items()):
+        row = axes[number] if beside else axes[2 * number]
+        for axis, (hemi, side_curves) in zip(row, by_side.items(), strict=False):
             axis.plot([0, 1], [0, 1], color="0.6", linewidth=0.5)
-            for color, name, result in (
-                (COLORS[0], "base model", comparison.base),
-                (COLORS[1], f"with {display_name(measure)}", comparison.full),
-            ):
-                text = line(axis, result, color)
-                texts.setdefault(name, []).append(f"{where}: {text}")
-            axis.set_title(where)
+            for curve in side_curves:
+                axis.plot(*curve.points, color=COLORS[curve.full], **options)
+            axis.set_title(_sides_name(hemi), loc="center" if beside else "right")
             axis.set(xlabel=labels[0], aspect="equal")
             axis.set_xticks([0, 0.5, 1])
             axis.set_yticks([0, 0.5, 1])
         row[0].set_ylabel(labels[1])
-        for axis in row[len(by_side) :]:
+        empty = [*row[len(by_side) :], *(() if beside else axes[2 * number + 1])]
+        for axis in empty:
             axis.set_axis_off()
-        method = "\n(separated: Firth's method)" if comparison.columns["separated"] else ""
-        from matplotlib.lines import Line2D  # noqa: PLC0415  (slow to load)
-
-        blank = Line2D([], [], linestyle="none")
-        row[-1].legend(
-            [
-                handle
-                for color, lines in zip(COLORS, texts.values(), strict=False)
-                for handle in (Line2D([], [], color=color), *[blank] * len(lines))
-            ],
-            [text for name, lines in texts.items() for text in (name, *lines)],
-            title=f"{control} against {case}{method}\n{title}",
+        heading, *entries = legends[pair]
+        colors = iter(COLORS)
+        handles = [
+            Line2D([], [], linestyle="none" if entry.startswith(_SIDE_MARK) else "-",
+                   color=next(colors) if not entry.startswith(_SIDE_MARK) else "none")
+            for entry in entries
+        ]  # fmt: skip
+        legend = (row[-1] if beside else empty[-n]).legend(
+            handles, [entry.lstrip(_SIDE_MARK) for entry in entries], title=heading,
             loc="upper left", borderaxespad=0, alignment="left", handlelength=1.2, labelspacing=0.2,
         )  # fmt: skip
-    _name([axis for axis in axes.flat if axis.axison])
+        legend.set_in_layout(False)
+    style.letter_panels([axis for axis in axes.flat if axis.axison])
     return [figure]
 
 
-def draw_registration(cohort: Cohort, analysis: Analysis) -> "list[Figure]":
+def _legend(
+    pair: tuple[str, str], by_side: Mapping[str, Sequence[Curve]], title: str, letters: int
+) -> list[str]:
+    """Write the title and the entries of a legend; those of sides, without a color, are marked."""
+    curves = [curve for side_curves in by_side.values() for curve in side_curves]
+    heading = wrap(" against ".join(pair), letters)
+    if any(curve.separated for curve in curves):
+        heading.append("(separated: Firth's method)")
+    lines = ["\n".join([*heading, title])]
+    for full in (False, True):
+        name = f"with {display_name(curves[0].added)}" if full else "base model"
+        lines.append("\n".join(wrap(name, letters - 4)))
+        lines += [
+            f"{_SIDE_MARK}{_sides_name(curve.hemi).split()[0]}: {curve.text}"
+            for curve in curves
+            if curve.full == full
+        ]
+    return lines
+
+
+def _sides_name(hemi: str) -> str:
+    return {"L": "left", "R": "right"}.get(hemi, "both sides")
+
+
+def draw_registration(results: GroupResults, width: float | None = None) -> "list[Figure]":
     """Draw curvature from medial to lateral before and after registration, and the warps."""
-    sides = analysis.registered
-    figure, axes = _panels(len(sides), 3, (panels.TWO_COLUMNS, 48 * len(sides)))
-    label = with_brackets("curvature", cohort.units.get("curvature", "1"))
-    for (before, after, shifts), (hemi, side) in zip(axes, sides.items(), strict=True):
-        members = members_of(analysis, cohort.table.iloc[side.rows])
-        for axis, source, state in (
-            (before, cohort.sides[hemi], "before"),
-            (after, side, "after"),
-        ):
-            curves = (profiles_of(source.maps, "curvature", member) for member in members.values())
-            _curves(axis, cohort.x, members, curves)
-            axis.set_title(f"{SIDES[hemi]}, {state} registration")
+    from matplotlib.collections import LineCollection  # noqa: PLC0415  (slow to load)
+
+    profiles = results.table("profiles")
+    profiles = profiles[profiles["measure"] == "curvature"]
+    sides = [str(hemi) for hemi in profiles["hemi"].unique()]
+    groups = [str(name) for name in profiles["group"].unique()]
+    wide = (width or style.TWO_COLUMNS) > style.ONE_COLUMN
+    shape = (len(sides), 3) if wide else (3, len(sides))
+    size = (style.TWO_COLUMNS, 48.0 * len(sides)) if wide else (style.ONE_COLUMN, 150.0)
+    figure, axes = style.new_panels(*shape, size)
+    label = with_brackets("curvature", str(profiles["unit"].iloc[0]))
+    for hemi, (before, after, shifts) in zip(sides, axes if wide else axes.T, strict=True):
+        for axis, registered in ((before, False), (after, True)):
+            is_shown = (profiles["hemi"] == hemi) & (profiles["registered"] == registered)
+            for color, group in zip(cycle(COLORS), groups, strict=False):
+                curve = profiles[is_shown & (profiles["group"] == group)]
+                name = f"{group} (n = {curve['n'].max()})"
+                _curve(axis, curve["mean"], curve["mean_se"], color, name)
+            axis.set_title(f"{SIDES[hemi]}, {'after' if registered else 'before'}")
             axis.set_ylabel(label)
-        after.sharey(before)
-        moved = analysis.registrations[hemi].shifts
-        step = -(-len(moved) // _MOST_LINES)
-        for color, member in zip(cycle(COLORS), members.values(), strict=False):
-            shifts.plot(cohort.x, moved[member][::step].T, color=color, alpha=0.25, linewidth=0.4)
-        _curves(shifts, cohort.x, members, (moved[member] for member in members.values()))
+        moved = _shifts_of(results, hemi, groups)
+        step = -(-sum(map(len, moved.values())) // _MOST_LINES)
+        for color, group in zip(cycle(COLORS), groups, strict=False):
+            nodes = np.linspace(0, 1, moved[group].shape[1])
+            lines = [np.column_stack([nodes, line]) for line in moved[group][::step]]
+            shifts.add_collection(LineCollection(lines, colors=color, alpha=0.25, linewidths=0.4))
+        for color, group in zip(cycle(COLORS), groups, strict=False):
+            _, mean, sd = describe_known([moved[group]])
+            _curve(shifts, mean, sd / np.sqrt(max(len(moved[group]), 1)), color, group)
         shifts.axhline(0, color="black", linewidth=0.5)
         shifts.set_title(f"{SIDES[hemi]}, warps" + (f" (1 of {step} drawn)" if step > 1 else ""))
         shifts.set_ylabel("shift to lateral [nodes]")
         for axis in (before, after, shifts):
-            mark_medial(axis, cohort)
-    _explain(figure, axes[0, 0], "mean, 2 standard errors")
-    _name(axes.flat)
+            mark_medial(axis, np.array([0.0, 1.0]))
+    # Sides can be compared, as can both states.
+    grid = axes if wide else axes.T
+    for panels_alike in (grid[:, :2].ravel(), grid[:, 2]):
+        ends = np.array([axis.get_ylim() for axis in panels_alike])
+        for axis in panels_alike:
+            axis.set_ylim(ends[:, 0].min(), ends[:, 1].max())
+    style.explain(figure, grid[0, 0], "mean, 2 standard errors")
+    style.letter_panels(axes.flat)
     return [figure]
 
 
-def _curves(axis: "Axes", x: Float, names: Iterable[str], groups: Iterable[Float]) -> None:
-    """Draw the mean of each group and twice its standard error to both sides."""
-    for color, name, values in zip(cycle(COLORS), names, groups, strict=False):
-        finite, mean, sd = describe_known([values])
-        error = 2 * sd / np.sqrt(np.maximum(finite.sum(axis=0), 1))
-        axis.plot(x, mean, color=color, label=f"{name} (n = {len(values)})", linewidth=1.2)
-        axis.fill_between(x, mean - error, mean + error, color=color, alpha=0.25, linewidth=0)
+def _shifts_of(results: GroupResults, hemi: str, groups: Sequence[str]) -> dict[str, Float]:
+    """Read how far registration moved nodes (sheets, nodes), to lateral, by group."""
+    warps, people = results.table("warps"), results.table("covariates")
+    warps = warps[warps["hemi"] == hemi]
+    nodes = warps.filter(regex=r"^node_\d+$").to_numpy(np.float64)
+    moved = (nodes - np.linspace(0, 1, nodes.shape[1])) * (nodes.shape[1] - 1)
+    column = (results.record.get("groups") or {}).get("column")
+    if column is None:
+        return dict.fromkeys(groups, moved)
+    group_of = people.drop_duplicates(PARTICIPANT).set_index(PARTICIPANT)[column].astype(str)
+    of_sheets = warps[PARTICIPANT].map(group_of).to_numpy()
+    return {group: moved[of_sheets == group] for group in groups}
+
+
+def _curve(axis: "Axes", mean: Any, error: Any, color: str, name: str) -> None:  # noqa: ANN401  (columns)
+    """Draw a mean and twice its standard error to both sides."""
+    mean, error = np.asarray(mean, np.float64), 2 * np.asarray(error, np.float64)
+    x = np.linspace(0, 1, len(mean))
+    axis.plot(x, mean, color=color, label=name, linewidth=1.2)
+    axis.fill_between(x, mean - error, mean + error, color=color, alpha=0.25, linewidth=0)
 
 
 def draw_sections(
@@ -258,7 +278,7 @@ def draw_sections(
     if (parts := parts_of(cohort.y)) is not None:
         named = {name: np.flatnonzero(parts == name) for name in ("tail", "body", "head")}
         places = {name: int(np.median(own)) for name, own in named.items() if len(own)}
-    figure, axes = _panels(len(shapes), len(places), (panels.TWO_COLUMNS, 55 * len(shapes)))
+    figure, axes = style.new_panels(len(shapes), len(places), (style.TWO_COLUMNS, 55 * len(shapes)))
     for i, (hemi, shape) in enumerate(shapes.items()):
         for j, (name, node) in enumerate(places.items()):
             axis = axes[i, j]
@@ -266,8 +286,8 @@ def draw_sections(
             center = np.nanmean(shape.mean[:, :, node], axis=(0, 1))
             for color, (group, layers) in zip(cycle(COLORS), shape.by_group.items(), strict=False):
                 flat = (layers[:, :, node] - center) @ plane.T
-                for line, width, style in zip(flat, _WIDTHS, _STYLES, strict=True):
-                    axis.plot(*line.T, color=color, linewidth=width, linestyle=style)
+                for line, width, dashes in zip(flat, _WIDTHS, _STYLES, strict=True):
+                    axis.plot(*line.T, color=color, linewidth=width, linestyle=dashes)
                 # Another line for the legend alone.
                 axis.plot([], [], color=color, label=f"{group} (n = {shape.counts[group]})")
             if hemi in analysis.fitted:
@@ -277,8 +297,8 @@ def draw_sections(
             axis.set_xlabel("to lateral [mm]")
             axis.set_ylabel("to superior [mm]")
             axis.set_aspect("equal", adjustable="datalim")
-    _explain(figure, axes[0, 0], "walls; dotted: middle")
-    _name(axes.flat)
+    style.explain(figure, axes[0, 0], "walls; dotted: middle")
+    style.letter_panels(axes.flat)
     return [figure]
 
 
@@ -306,7 +326,7 @@ def _mark_subfields(axis: "Axes", layers: Float, fitted: FittedMaps, node: int) 
         if len(nodes):
             x, y = middle[nodes[len(nodes) // 2]]
             box = {"facecolor": "white", "alpha": 0.8, "edgecolor": "none", "pad": 0.3}
-            axis.text(x, y, name, fontsize=panels.SMALL, ha="center", va="center", bbox=box)
+            axis.text(x, y, name, fontsize=style.SMALL, ha="center", va="center", bbox=box)
 
 
 def draw_sites(cohort: Cohort, analysis: Analysis) -> "list[Figure]":
@@ -317,7 +337,7 @@ def draw_sites(cohort: Cohort, analysis: Analysis) -> "list[Figure]":
     shown_sites = [site for site in harmonization.plan.sites if site in harmonization.plan.counts]
     height = 2 * (20 + 5 * len(shown_sites))
     maps = {key: pair for key, pair in harmonization.effects.items() if key[0] == "map"}
-    figure, axes = _panels(2, len(maps), (panels.TWO_COLUMNS, height))
+    figure, axes = style.new_panels(2, len(maps), (style.TWO_COLUMNS, height))
     for j, ((_, hemi, measure), (effects, moments)) in enumerate(maps.items()):
         states = {"before": moments, "after": moments.after(effects)}
         unit = cohort.units.get(measure, "1")
@@ -327,7 +347,7 @@ def draw_sites(cohort: Cohort, analysis: Analysis) -> "list[Figure]":
                     _spread(axis, values[harmonization.plan.sites.index(site)], row, number, name)
         for axis, label, ideal in (
             (axes[0, j], f"mean, {display_name(measure)} [{unit}]", 0.0),
-            (axes[1, j], "SD, over that of all", 1.0),
+            (axes[1, j], "SD, over the SD of all", 1.0),
         ):
             axis.axvline(ideal, color="black", linewidth=0.5)
             axis.set_yticks(
@@ -337,7 +357,7 @@ def draw_sites(cohort: Cohort, analysis: Analysis) -> "list[Figure]":
             axis.locator_params(axis="x", nbins=4)
             axis.set_xlabel(label)
         axes[0, j].set_title(f"{display_name(measure)}, {SIDES[hemi]}")
-    _explain(figure, axes[0, 0])
+    style.explain(figure, axes[0, 0])
     return [figure]
 
 
@@ -354,13 +374,13 @@ def _spread(axis: "Axes", values: Float, row: int, number: int, name: str) -> No
 
 
 def draw_norms(lines: pd.DataFrame, dots: pd.DataFrame) -> "list[Figure]":
-    """Draw centiles over age, a row for each sex and a column for each side; and people on it.
+    """Draw centiles over age, a row for each sex, a column for each side, and participants.
 
     Controls that a site was adapted to are open circles.
     """
     sexes, sides = lines["sex"].unique(), lines["hemi"].unique()
-    width = panels.TWO_COLUMNS if len(sides) > 1 else panels.ONE_COLUMN
-    figure, axes = _panels(len(sexes), len(sides), (width, 60.0 * len(sexes)))
+    width = style.TWO_COLUMNS if len(sides) > 1 else style.ONE_COLUMN
+    figure, axes = style.new_panels(len(sexes), len(sides), (width, 60.0 * len(sexes)))
     measure, unit = lines[["measure", "unit"]].iloc[0]
     names = [name for name in lines.columns if re.fullmatch(r"p\d+", name)]
     limits = np.concatenate([lines[names].to_numpy().ravel(), dots["value"]])
@@ -395,7 +415,7 @@ def draw_norms(lines: pd.DataFrame, dots: pd.DataFrame) -> "list[Figure]":
             axis.set_xlim(age.min(), age.max())
             axis.set_ylim(low - margin, high + margin)
         row[0].set_ylabel(with_brackets(display_name(measure), unit))
-    _name(axes.flat)
+    style.letter_panels(axes.flat)
     return [figure]
 
 
@@ -407,8 +427,9 @@ def norm_rows(
     for i, (quantity, colors) in enumerate({"mean": kind.colors, "SD": "magma"}.items()):
         values = {hemi: pair[i].ravel() for hemi, pair in centers.items()}
         scale = panels.spanned(colors, values)
-        if kind.limits and quantity == "mean":
-            scale = {"cmap": colors, "vmin": kind.limits[0], "vmax": kind.limits[1]}
+        if kind.centered and quantity == "mean":
+            low, high = display.span_of(kind, list(values.values()))
+            scale = {"cmap": colors, "vmin": low, "vmax": high}
         title = f"{quantity[0].upper()}{quantity[1:]} at {age:g} years"
         label = with_brackets(f"{quantity},\n{display_name(measure)}", unit)
         yield panels.Row(
@@ -417,7 +438,7 @@ def norm_rows(
 
 
 def deviation_rows(scored: Mapping[str, ScoredMaps], measure: str) -> Iterator[panels.Row]:
-    """Show mean deviations, and shares of low ones, of those whom no site was adapted to."""
+    """Show mean deviations, and shares of low ones, of participants whom no site was adapted to."""
     z = {
         hemi: side.scores[measure].w[~side.reference]
         for hemi, side in scored.items()
@@ -440,24 +461,29 @@ def deviation_rows(scored: Mapping[str, ScoredMaps], measure: str) -> Iterator[p
 
 
 def draw_figures(
-    cohort: Cohort, analysis: Analysis, shapes: Mapping[str, AverageShape]
-) -> Iterator[tuple[str, Drawing]]:
-    """List all figures of one model by name, for :func:`encode`."""
+    saved: GroupResults,
+    cohorts: Mapping[str, Cohort],
+    analyses: Mapping[str, Analysis],
+    shapes: Mapping[str, AverageShape],
+    all_measures: bool,
+) -> Iterator[tuple[str, style.Drawing]]:
+    """List the figures that a page shows by name, or all, for :func:`encode`."""
     views: panels.Views = {}
-    for measure in dict.fromkeys(m for one in analysis.fitted.values() for m in one.fits):
-        yield (
-            f"{measure}_maps",
-            partial(panels.draw_measure, cohort, analysis, shapes, views, measure),
-        )
-    if analysis.harmonization is not None and analysis.fitted:
-        name = "sites" if analysis.registered else f"{next(iter(analysis.measured.maps))}_sites"
-        yield name, partial(draw_sites, cohort, analysis)
+    dpi = style.DOTS_PER_INCH if all_measures else _SCREEN
+    measures = measures_of(saved)
+    for measure in measures if all_measures else measures[:MOST_FIGURES]:
+        yield f"{measure}_maps", partial(draw_measure, saved, measure, views, dpi)
+    for surface, analysis in analyses.items():
+        if analysis.harmonization is not None and analysis.fitted:
+            name = "sites" if analysis.registered else f"{next(iter(analysis.measured.maps))}_sites"
+            yield name, partial(draw_sites, cohorts[surface], analysis)
+    analysis = analyses[SHEET]
     templates = [one.template for one in analysis.registrations.values()]
     if templates and None not in templates:
-        yield "registration", partial(draw_registration, cohort, analysis)
+        yield "registration", partial(draw_registration, saved)
     if shapes:
-        yield "sections", partial(draw_sections, cohort, analysis, shapes)
+        yield "sections", partial(draw_sections, cohorts[SHEET], analysis, shapes)
     if analysis.pairs:
-        yield "roc", partial(draw_roc, analysis)
+        yield "roc", partial(draw_roc, saved)
         if any(one.full.calibration.judged for *_, one in analysis.pairs):
             yield "calibration", partial(draw_calibration, analysis)

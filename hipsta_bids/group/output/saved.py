@@ -47,6 +47,8 @@ class SavedEffects(TomlTable):
     """Whether participants had several visits."""
     icv: str | None
     """Column that volumes kept besides."""
+    labels: dict[str, list[str]] = Field(default_factory=dict)
+    """Values of each field of provenance of the labels."""
     templates: dict[str, str]
     """Digest of the template of registration by hemisphere."""
     maps: files.Nested
@@ -146,6 +148,8 @@ class NormsFile(TomlTable):
     """Of hipsta_bids, at the participant level."""
     seg: files.Text
     region: files.Text
+    labels: dict[files.Text, list[files.Text]] = Field(default_factory=dict)
+    """Values of each field of provenance of the labels."""
     settings_hash: files.Text
     """Of the settings of the participant level."""
     registration: dict[str, Any]

@@ -1,10 +1,10 @@
-"""Results as tables, and figures of tests of several measures at once."""
+"""Results as tables."""
 
 import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -14,20 +14,14 @@ from hipsta_bids.group.design.formula import file_label
 from hipsta_bids.group.design.settings import GroupSettings
 from hipsta_bids.group.output import columns, results
 from hipsta_bids.group.output.columns import find_clusters, frame_of
-from hipsta_bids.group.output.panels import Row, draw_pages
-from hipsta_bids.group.output.shapes import AverageShape
 from hipsta_bids.group.stats.arrays import Float, describe_known, mean_of_known
 from hipsta_bids.group.stats.classify import ClassifierResult
 from hipsta_bids.group.stats.clusters import edges_of
 from hipsta_bids.group.stats.glm import FittedMaps, PointTest
 from hipsta_bids.group.stats.inference import Discoveries, MapKey, PermutationTest, control_fdr
 from hipsta_bids.group.stats.registration import Registration
-from hipsta_bids.reports import cells, display
-from hipsta_bids.reports.group_maps import EFFECT_NAMES, signed_logarithm
+from hipsta_bids.reports import cells
 from hipsta_bids.types import PARTICIPANT, SESSION
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 Named = tuple[str, pd.DataFrame]
 """File name without extension, and table."""
@@ -55,7 +49,7 @@ def result_tables(
         yield from _registration_tables(cohort, analysis)
     yield from _sites(f"{prefix}sites", cohort, analysis)
     if analysis.measures:
-        yield "measures", with_fdr(_stacked(_measures(cohort, analysis)), settings)
+        yield "measures", summary_tests(cohort, analysis, settings)
         if analysis.groups is not None:
             yield "descriptives", _stacked(_descriptives(analysis))
     if len(analysis.scores):
@@ -157,6 +151,14 @@ def _profiles(cohort: Cohort, analysis: results.Analysis) -> Iterator[Columns]:
                         "mean": mean,
                         "mean_se": sd / np.sqrt(np.maximum(count, 1)),
                     }
+
+
+def summary_tests(
+    cohort: Cohort, analysis: results.Analysis, settings: GroupSettings
+) -> pd.DataFrame:
+    """Return one row per test of a summary measure; empty without any."""
+    blocks = list(_measures(cohort, analysis))
+    return with_fdr(_stacked(blocks), settings) if blocks else pd.DataFrame()
 
 
 def overview_table(discoveries: Mapping[MapKey, Discoveries]) -> pd.DataFrame:
@@ -359,7 +361,6 @@ def _classification(analysis: results.Analysis, settings: GroupSettings) -> pd.D
 
 
 _EFFECTS = {"t": "cohen_d", "F": "partial_eta_squared"}
-_LEAST_Z = 4.0  # at the end of the colors
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -437,47 +438,3 @@ def joint_peaks(joint: Sequence[JointMap], neighbors: int) -> pd.DataFrame:
                 }
             )
     return pd.DataFrame(rows)
-
-
-def draw_joint(joint: Sequence[JointMap], shapes: Mapping[str, AverageShape]) -> "list[Figure]":
-    """Draw combined evidence and corrected p of each contrast."""
-    by_contrast: dict[str, dict[str, JointMap]] = {}
-    for joint_map in joint:
-        by_contrast.setdefault(joint_map.key.contrast, {})[joint_map.key.hemi] = joint_map
-    places = {joint_map.key.hemi: joint_map.fitted for joint_map in joint}
-    blocks = [list(_rows(i, name, own)) for i, (name, own) in enumerate(by_contrast.items())]
-    return draw_pages(joint[0].cohort, places, blocks, shapes)
-
-
-def _rows(number: int, contrast: str, maps: Mapping[str, JointMap]) -> Iterator[Row]:
-    _, colors, p_colors = display.effect_colors("F")
-    z = {hemi: one.test.statistic for hemi, one in maps.items()}
-    survive = {hemi: one.found.rejected for hemi, one in maps.items()}
-    logs = {hemi: signed_logarithm(one.found.adjusted, z[hemi]) for hemi, one in maps.items()}
-    sides = {hemi: "" if hemi == cells.BOTH_SIDES else f" {cells.SIDES[hemi]}" for hemi in maps}
-    counts = ", ".join(f"{int(found.sum())}{sides[hemi]}" for hemi, found in survive.items())
-    tested = "/".join(dict.fromkeys(str(int(np.isfinite(one).sum())) for one in z.values()))
-    first = next(iter(maps.values()))
-    yield Row(
-        kind="effect",
-        index=number,
-        title=f"Joint evidence, {contrast}",
-        label=EFFECT_NAMES["z"],
-        scale={"cmap": colors, "vmin": 0.0, "vmax": max(_LEAST_Z, *map(np.nanmax, z.values()))},
-        values=z,
-        survive=survive,
-    )
-    yield Row(
-        kind="significance",
-        index=number,
-        title=f"Significant: {counts} of {tested} points",
-        label="corrected p",
-        scale={
-            "cmap": p_colors,
-            "vmin": 0.0,
-            "vmax": display.significance_reach(list(logs.values())),
-        },
-        values=logs,
-        survive=survive,
-        level=first.found.alpha,
-    )

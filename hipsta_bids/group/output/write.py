@@ -8,7 +8,7 @@ import re
 import shutil
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from functools import cache, partial
+from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -20,16 +20,18 @@ from hipsta_bids.group.cohort.collect import Exclusion
 from hipsta_bids.group.cohort.data import SHEET, Cohort
 from hipsta_bids.group.design.settings import GroupSettings
 from hipsta_bids.group.output import results, tables
-from hipsta_bids.group.output.figures import Drawing, draw_figures, encode
+from hipsta_bids.group.output.figures import draw_figures
 from hipsta_bids.group.output.methods import methods_text
 from hipsta_bids.group.output.shapes import AverageShape
-from hipsta_bids.group.output.tables import JointMap, draw_joint, joint_peaks, joint_points
+from hipsta_bids.group.output.style import KINDS, Drawing, encode
+from hipsta_bids.group.output.tables import JointMap, joint_peaks, joint_points
 from hipsta_bids.group.stats.arrays import Float, blocks, return_memory
 from hipsta_bids.group.stats.glm import FittedMaps, PointTest
 from hipsta_bids.group.stats.inference import Discoveries, MapKey
 from hipsta_bids.io import files, gifti
 from hipsta_bids.progress import tell
 from hipsta_bids.reports.cells import JOINT
+from hipsta_bids.reports.group_tables import GroupResults
 from hipsta_bids.types import PARTICIPANT, SESSION
 
 _LOGGER = logging.getLogger(__name__)
@@ -41,7 +43,7 @@ _ROWS = 10_000  # of tables that are spelled at once
 
 @contextlib.contextmanager
 def whole_folder(path: Path) -> Iterator[Path]:
-    """Make a folder to write into, which is renamed to its final name if all went well."""
+    """Make a folder to write into, which is renamed to its final name if all succeeds."""
     parent, name = path.parent, path.name
     scratch = parent / f".{name}.{os.getpid()}.tmp"
     files.make_folder(parent)
@@ -79,6 +81,7 @@ def write_results(
     joint: Sequence[JointMap] = (),
     region: str = "body",
     ratings: Mapping[str, int] | None = None,
+    labels: Mapping[str, list[str]],
 ) -> None:
     """Write tables, maps and text; cohorts and analyses are by surface."""
     cohort, analysis = cohorts[SHEET], analyses[SHEET]
@@ -106,6 +109,7 @@ def write_results(
     if analysis.harmonization is not None:
         parts = [one.harmonization for one in analyses.values() if one.harmonization is not None]
         if effects := results.effects_of(parts, results.digests(analysis.registrations)):
+            effects = effects.model_copy(update={"labels": dict(labels)})
             files.write_json(folder / "harmonization.json", effects.model_dump(by_alias=True))
     for surface, one in analyses.items():
         _write_surfaces(folder, cohorts[surface], one)
@@ -133,26 +137,25 @@ def write_exclusions(folder: Path, exclusions: Sequence[Exclusion]) -> None:
 
 
 def draw(
-    folder: Path,
+    saved: GroupResults,
     cohorts: Mapping[str, Cohort],
     analyses: Mapping[str, results.Analysis],
     shapes: Mapping[str, AverageShape],
     *,
-    joint: Sequence[JointMap] = (),
+    prints: bool,
 ) -> list[str]:
-    """Draw the figures of all models, and say what is wrong with them."""
-    drawings = [
-        drawing
-        for surface, cohort in cohorts.items()
-        for drawing in draw_figures(cohort, analyses[surface], shapes if surface == SHEET else {})
-    ]
-    if joint:
-        drawings.append((f"{JOINT}_maps", partial(draw_joint, joint, shapes)))
-    return write_figures(folder, drawings)
+    """Draw the figures of an analysis that was written, and return their problems."""
+    drawings = draw_figures(saved, cohorts, analyses, shapes, prints)
+    return write_figures(saved.folder, drawings, prints=prints)
 
 
-def write_figures(folder: Path, drawings: Iterable[tuple[str, Drawing]]) -> list[str]:
-    """Draw figures by name, and say which are missing or lack letters; one line each."""
+def write_figures(
+    folder: Path, drawings: Iterable[tuple[str, Drawing]], *, prints: bool = False
+) -> list[str]:
+    """Draw figures by name; return missing figures and missing letters, one line each.
+
+    The page shows SVG; ``prints`` asks for PDF and PNG, too.
+    """
     tell("figures")
     return_memory()
     problems, missing = [], set()
@@ -162,7 +165,7 @@ def write_figures(folder: Path, drawings: Iterable[tuple[str, Drawing]]) -> list
         try:
             with warnings.catch_warnings(record=True) as warned:
                 warnings.simplefilter("always")
-                encoded = encode(name, drawing)
+                encoded = encode(name, drawing, KINDS if prints else ("svg",))
         except Exception as error:  # results are worth more than figures
             _LOGGER.exception("figure %s", name)
             problems.append(f"figure {name}: not drawn ({type(error).__name__}: {error})")
@@ -249,7 +252,7 @@ def stats_of(
 
 
 def write_stats(folder: Path, maps: Mapping[MapKey, _Stats]) -> None:
-    """Write maps of statistics as GIFTI, and those of both sides as one CIFTI file."""
+    """Write maps of statistics as GIFTI, and maps of both sides as one CIFTI file."""
     grouped: dict[str, dict[str, _Stats]] = {}
     for key, stats in maps.items():
         for stat, values in stats.items():
@@ -321,7 +324,7 @@ def write_scores(
     letter: str,
     sheets: bool,
 ) -> None:
-    """Write each participant's scores as maps; those of the sheet also as one Parquet file."""
+    """Write each participant's scores as maps; maps of the sheet also as one Parquet file."""
     for hemi, side in sides.items():
         names = [str(name) for name in table.index[side.rows]]
         for measure, scored in side.scores.items():

@@ -12,7 +12,7 @@ from hipsta_bids.errors import ModelError
 from hipsta_bids.group.cohort import data
 from hipsta_bids.group.cohort.read import leave_rare
 from hipsta_bids.group.design import model as designs
-from hipsta_bids.group.design.formula import ModelSpec
+from hipsta_bids.group.design.formula import ModelSpec, listed
 from hipsta_bids.group.design.grammar import closed_formula
 from hipsta_bids.group.design.settings import GlmSettings, GroupSettings
 from hipsta_bids.group.output import results
@@ -82,6 +82,7 @@ def analyze_cohort(
         If the model cannot be fitted to these data.
     """
     comparison = comparison or designs.Comparison()
+    _check_covariates(model, comparison, settings, measures, is_harmonized=site_effects is not None)
     table = data.modeled_table(cohort.table, comparison)
     plan = harmonize.plan_sites(
         cohort,
@@ -123,6 +124,7 @@ def analyze_cohort(
         measures=measures,
         rows=rows,
         comparison=comparison,
+        covariates=model.maps,
         settings=settings,
     )
     harmonization, compared, fitted, discoveries = fit(measured, registrations=registrations)
@@ -140,16 +142,20 @@ def analyze_cohort(
         references=references,
     )
     tell("summary measures")
+    # A covariate that is a map has no value for a whole hemisphere.
     summaries, notes = fit_summaries(
         compared,
         model,
         design,
         settings.design,
-        names=measures.summaries,
+        names=() if model.maps else measures.summaries,
         references=references,
         icv=icv,
         rows_of=make_rows,
     )
+    if model.maps:
+        terms = listed(f"map({name})" for name in model.maps)
+        notes.append(f"summary measures are not tested: {terms} has values at points only")
     classified = compared
     if harmonization is not None and groups is not None and harmonization.leaks(groups.column):
         classified = data.compare_sessions(measured, comparison)
@@ -177,6 +183,34 @@ def analyze_cohort(
         pairs=pairs,
         skipped=[*(harmonization.notes if harmonization else ()), *notes, *more],
     )
+
+
+def _check_covariates(
+    model: ModelSpec,
+    comparison: designs.Comparison,
+    settings: GroupSettings,
+    measures: data.Measures,
+    *,
+    is_harmonized: bool,
+) -> None:
+    """Refuse what a model with maps as covariates cannot do."""
+    if not model.maps:
+        return
+    excluded = {
+        "--longitudinal": comparison.longitudinal,
+        "--asymmetry": comparison.asymmetry,
+        "--normative": comparison.normative is not None,
+        "--harmonize": is_harmonized or bool(settings.harmonization.column),
+        "--joint": bool(settings.joint.measures),
+        "--fdr with permutations": settings.multiplicity.method in inference.PERMUTATIONS,
+        "summary measures alone": not measures.maps,
+    }
+    if problems := [name for name, is_asked in excluded.items() if is_asked]:
+        raise ModelError(f"map() in a formula: not with {listed(problems)}; remove one of them")
+    if comparison.pair is None and (outcomes := [m for m in model.maps if m in measures.maps]):
+        raise ModelError(
+            f"map({outcomes[0]}) in the formula explains itself; choose other maps by --measures"
+        )
 
 
 def analyze_points(
@@ -228,6 +262,7 @@ def _fit_cohort(
     rows: RowModel,
     comparison: designs.Comparison,
     settings: GroupSettings,
+    covariates: Sequence[str] = (),
     registrations: Mapping[str, registration.Registration] | None = None,
 ) -> tuple[
     results.Harmonization | None,
@@ -242,7 +277,7 @@ def _fit_cohort(
             cohort, plan, settings, measures, registrations or {}
         )
     compared = data.compare_sessions(
-        cohort if harmonization is None else harmonization.cohort, comparison
+        cohort if harmonization is None else harmonization.cohort, comparison, covariates
     )
     fitted = {
         hemi: fit_maps(hemi, side.only(maps), rows)
@@ -272,7 +307,7 @@ def register_side(
 ) -> tuple[registration.Registration, arrays.SideMaps]:
     """Register the sheets of one hemisphere, to a template or to each other; also the maps."""
     side = cohort.sides[hemi]
-    profiles = registration.mean_profiles(side.maps["curvature"], settings.registration)
+    profiles = registration.mean_profiles(side.curvature, settings.registration)
     if templates is None:
         result = registration.register(profiles, settings.registration)
     else:

@@ -5,22 +5,29 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
+
 from hipsta_bids.derivatives import dataset
 from hipsta_bids.group.cohort import collect
 from hipsta_bids.group.cohort.data import SHEET, modeled_table
+from hipsta_bids.group.cohort.masks import mask_note
+from hipsta_bids.group.cohort.quality import quality_notes, quality_table
 from hipsta_bids.group.design import model as designs
 from hipsta_bids.group.design.grammar import closed_formula
 from hipsta_bids.group.design.settings import GroupSettings
 from hipsta_bids.group.output.results import Analysis, harmonization_record
 from hipsta_bids.group.output.saved import load_effects
 from hipsta_bids.group.output.shapes import average_shapes, write_shapes
-from hipsta_bids.group.output.write import draw, write_results
+from hipsta_bids.group.output.tables import summary_tests
+from hipsta_bids.group.output.write import draw, write_results, write_table
 from hipsta_bids.group.questions import analysis as fitting
 from hipsta_bids.group.questions import study as studies
 from hipsta_bids.group.questions.exchange import SUMMARY, summarize, write_summary
 from hipsta_bids.group.questions.mixing import with_mixes
 from hipsta_bids.io import files
 from hipsta_bids.progress import tell
+from hipsta_bids.protocols.toml import resolve
+from hipsta_bids.reports.group_tables import GroupResults, opposite_changes
 from hipsta_bids.types import PARTICIPANT
 
 
@@ -60,7 +67,9 @@ def _analyze(options: studies.GroupOptions, settings: GroupSettings) -> studies.
         visits=study.time,
     )
     table = modeled_table(cohort.table, options.comparison)
-    study = with_mixes(study, table, closed_formula(model.formula).names)
+    effects = load_effects(options.harmonize_model) if options.harmonize_model else None
+    source = (effects.file, effects.labels) if effects else ("", {})
+    study = with_mixes(study, table, closed_formula(model.formula).names, source=source)
     templates = studies.read_templates(options.template, cohort)
     analysis = fitting.analyze_cohort(
         cohort,
@@ -73,7 +82,7 @@ def _analyze(options: studies.GroupOptions, settings: GroupSettings) -> studies.
         time=study.time.column if study.time else None,
         icv=study.icv,
         templates=templates,
-        site_effects=load_effects(options.harmonize_model) if options.harmonize_model else None,
+        site_effects=effects,
     )
     analyses = {
         surface: analysis
@@ -91,6 +100,11 @@ def _analyze(options: studies.GroupOptions, settings: GroupSettings) -> studies.
     exclusions = [*study.exclusions, *collect.exclude_visits(table, incomplete)]
     measures = designs.wanted_measures(options.model, options.measures)
     notes = [*study.notes, *_notes(study, analysis)]
+    quality = quality_table(study.quality, groups.column) if groups else pd.DataFrame()
+    notes += quality_notes(quality)
+    if study.masked is not None:
+        shares = study.masked[study.masked["visit"].isin(cohort.table.index)]
+        notes.append(mask_note(shares, cohort.table[groups.column] if groups else None))
     summary = _summary(study, analysis, notes)
     tell("average surfaces")
     shapes = average_shapes(study.collection.records, cohort, analysis, settings.shapes)
@@ -109,15 +123,27 @@ def _analyze(options: studies.GroupOptions, settings: GroupSettings) -> studies.
             joint=tested,
             region=options.sheets.region,
             ratings=study.collection.ratings,
+            labels=study.labels,
         )
         files.write_json(folder / "model.json", document)
+        if len(quality):
+            write_table(folder, "quality", quality)
         if summary is not None:
             write_summary(folder / SUMMARY, summary)
         write_shapes(folder, shapes)
         if analysis.registered and study.collection.records and not shapes:
             notes.append("no average surfaces: the surfaces of the participant level are missing")
-        notes.extend(draw(folder, study.cohorts, analyses, shapes, joint=tested))
-        return _record(analysis, study.collection.ratings)
+        record = _record(analysis, study.collection.ratings)
+        saved = GroupResults(
+            folder=folder,
+            record={
+                **record,
+                "inputs": {"maps": dict(options.maps)},
+                "settings": resolve(settings),
+            },
+        )
+        notes.extend(draw(saved, study.cohorts, analyses, shapes, prints=options.figures))
+        return record
 
     return study.write_folder(
         designs.folder_name(model.formula, measures) + options.comparison.suffix,
@@ -141,6 +167,7 @@ def _summary(study: studies.Study, analysis: Analysis, notes: list[str]) -> dict
             "versions": list(collection.versions),
             "seg": collection.records[0].result.name.seg if collection.records else "none",
             "region": options.sheets.region,
+            "labels": study.labels,
             "settings_hash": collection.settings_hash,
         },
     )
@@ -180,6 +207,7 @@ def _notes(study: studies.Study, analysis: Analysis) -> list[str]:
                 " survives, above the level; effects are widespread"
             )
     notes += fitting.unequal_spread(analysis, settings.glm)
+    notes += opposite_changes(summary_tests(study.cohort, analysis, settings))
     for hemi, registration in analysis.registrations.items():
         if not registration.converged:
             notes.append(f"hemisphere {hemi}: registration had not settled when it ended")
@@ -195,7 +223,7 @@ def _record(analysis: Analysis, ratings: Mapping[str, int] | None) -> dict[str, 
         if analysis.harmonization is None
         else harmonization_record(analysis.harmonization, analysis.groups),
         "measures": {"maps": analysis.measured.maps, "summaries": analysis.measured.summaries},
-        "formula": analysis.model.formula,
+        "formula": analysis.model.text,
         "columns": analysis.design.columns,
         "references": analysis.design.references,
         "contrasts": {c.name: c.weights.tolist() for c in analysis.design.contrasts},

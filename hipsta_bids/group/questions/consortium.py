@@ -15,14 +15,16 @@ from hipsta_bids.errors import OutputError, UsageError
 from hipsta_bids.group.cohort.data import Cohort
 from hipsta_bids.group.design.settings import GroupSettings
 from hipsta_bids.group.output import write
-from hipsta_bids.group.output.figures import Drawing
+from hipsta_bids.group.output.ground import grounds_of
+from hipsta_bids.group.output.maps import ContrastMap, contrasts
 from hipsta_bids.group.output.methods import Citations, code, discovery_text, escaped
-from hipsta_bids.group.output.panels import Row, contrasts, draw_pages
+from hipsta_bids.group.output.panels import Row, draw_pages
+from hipsta_bids.group.output.style import Drawing
 from hipsta_bids.group.output.tables import META_COLUMNS
 from hipsta_bids.group.questions.exchange import SiteSummary, read_summary, shown_counts
 from hipsta_bids.group.questions.sites import Meta, analyze_sites, check_agreement, meta_tables
 from hipsta_bids.group.stats.arrays import SideMaps
-from hipsta_bids.group.stats.glm import FittedMaps, PointTest
+from hipsta_bids.group.stats.glm import MEAN, FittedMaps
 from hipsta_bids.group.stats.inference import PERMUTATIONS
 from hipsta_bids.group.stats.meta import FIXED, RANDOM
 from hipsta_bids.io import files
@@ -35,8 +37,13 @@ def run_meta(
     out_dir: Path,
     settings: GroupSettings,
     command: Sequence[str] = (),
+    *,
+    figures: bool = False,
 ) -> tuple[Path, list[str]]:
-    """Combine the summaries of sites, perhaps renamed; returns the page and notes."""
+    """Combine the summaries of sites, perhaps renamed; returns the page and notes.
+
+    ``figures`` asks for figures for print, too.
+    """
     if settings.multiplicity.method in PERMUTATIONS:
         raise UsageError(
             "meta: summaries have no participants to permute; use --correction fdr2 or bh"
@@ -54,7 +61,7 @@ def run_meta(
         for name, table in meta_tables(meta):
             write.write_table(scratch, name, table, described=name != "sites", meaning=META_COLUMNS)
         _write_maps(scratch, meta)
-        notes += write.write_figures(scratch, _figures(meta))
+        notes += write.write_figures(scratch, _figures(meta), prints=figures)
         files.write_text(scratch / "methods.md", _methods(meta))
         files.write_json(scratch / "meta.json", _record(meta, paths, command, notes))
     write_meta_report(out_dir)
@@ -107,17 +114,25 @@ def _cohort(meta: Meta) -> Cohort:
 def _figures(meta: Meta) -> Iterator[tuple[str, Drawing]]:
     """List figures of maps, one per measure, for :func:`write_figures`."""
     maps, cohort = list(meta.of("map")), _cohort(meta)
-    tests: dict[str, dict[str, list[PointTest]]] = {}
+    tests: dict[str, dict[str, dict[str, ContrastMap]]] = {}
     for item in maps:
         measures = tests.setdefault(item.model.hemi, {})
-        measures.setdefault(item.model.measures[0], []).extend(
-            test for _, test, _ in meta.tests(item)
-        )
-    places = {hemi: _place(meta, hemi, cohort) for hemi in tests}
+        for key, test, _ in meta.tests(item):
+            result = meta.found[key]
+            measures.setdefault(item.model.measures[0], {})[key.contrast] = ContrastMap(
+                kind=test.kind,
+                effect=test.effect,
+                statistic=test.statistic,
+                df=np.asarray(test.df, dtype=np.float64),
+                adjusted=result.adjusted,
+                rejected=result.rejected,
+                alpha=result.alpha,
+            )
+    places = grounds_of(cohort, {hemi: _place(meta, hemi, cohort) for hemi in tests})
     like = {item.label(RANDOM): item.label(FIXED) for item in maps}
     for measure in dict.fromkeys(item.model.measures[0] for item in maps):
         sides = {hemi: one for hemi, one in places.items() if measure in tests[hemi]}
-        blocks = list(contrasts(tests, meta.found, measure, like))
+        blocks = list(contrasts(tests, measure, like))
         items = [item for item in maps if item.model.measures[0] == measure]
         for number, contrast in enumerate(dict.fromkeys(item.contrast for item in items)):
             row = Row(
@@ -133,7 +148,7 @@ def _figures(meta: Meta) -> Iterator[tuple[str, Drawing]]:
                 },
             )
             blocks[2 * number + 1].append(row)
-        yield f"{measure}_maps", partial(draw_pages, cohort, sides, blocks)
+        yield f"{measure}_maps", partial(draw_pages, sides, blocks)
 
 
 def _place(meta: Meta, hemi: str, cohort: Cohort) -> FittedMaps:
@@ -190,7 +205,7 @@ def _record(
 
 
 def _methods(meta: Meta) -> str:
-    """Word what was done and what came out."""
+    """Return what was done and what was found."""
     rules, sites = meta.settings.meta, meta.sites
     cite = Citations()
     counts = Counter[str]()
@@ -204,52 +219,60 @@ def _methods(meta: Meta) -> str:
         else "All sites registered their maps to one template of curvature profiles (hash"
         f" {sites[0].template_hash})."
     )
+    method_text = cite("method")
+    if sites[0].template is not None:
+        aligned += f" Registration used monotone B-spline warps {cite('registr')}."
     joint = rules.model == "joint"
-    fixed = "The fixed effect is the mean of the sites' estimates, weighted by inverse variances."
+    fixed = "The fixed effect was the mean of the sites' estimates, weighted by inverse variances."
     if joint:
         fixed = (
-            "The fixed effect is of the model of all participants with a constant per site"
-            f" {cite('join')}. It needs the sites' coefficients and their covariances only."
-            " Contrasts that include the constant are combined by inverse variances."
+            "The fixed effect was estimated in the model of all participants with a constant per"
+            f" site {cite('join')}. This needs only the sites' coefficients and their covariances."
         )
+        if any(item.contrast == MEAN for item in meta.items):
+            fixed += " Means, which include the constant, were combined by inverse variances."
     if rules.random == "dl":
-        random = f"the moments of DerSimonian and Laird {cite('dl')}, tests are normal"
+        random = (
+            f"estimated by the moments of DerSimonian and Laird {cite('dl')}. Tests used the normal"
+            " distribution"
+        )
     elif joint:
         random = (
-            f"restricted maximum likelihood {cite('reml')} in the same model with a random slope of"
-            " the site. Tests and limits follow t with one degree of freedom less than sites"
+            f"estimated by restricted maximum likelihood {cite('reml')} in the same model with a"
+            " random slope of the site. Tests and limits used t, with one degree of freedom less"
+            " than the number of sites"
         )
     else:
         random = (
-            f"restricted maximum likelihood {cite('reml')}, tests and limits of Knapp and"
-            f" Hartung {cite('knapp-hartung')}. Standard errors are not smaller than without their"
-            f" correction {cite('modified')}"
+            f"estimated by restricted maximum likelihood {cite('reml')}. Tests and limits followed"
+            f" Knapp and Hartung {cite('knapp-hartung')}, with standard errors not smaller"
+            f" than without their correction {cite('modified')}"
         )
     measure_text = (
-        f"Measures of the hippocampus {cite('method')} of {meta.people} participants{groups} at"
-        f" {len(sites)} sites were combined with hipsta_bids {__version__}. No values of"
-        f" participants left a site. Each site fitted the linear model"
-        f" {code(sites[0].models[0].formula)} at each point of the sheet, and to summary measures."
+        f"Measures of the hippocampal body {method_text} of {meta.people} participants{groups} at"
+        f" {len(sites)} sites were combined with hipsta_bids {__version__}. No value of a"
+        f" participant left its site. Each site fitted the linear model"
+        f" {code(sites[0].models[0].formula)} at each point of the sheet and to each summary"
+        " measure."
     )
     effects = (
-        f"{fixed} In the random-effects model, true effects differ between sites; their variance"
-        f" (tau²) was estimated by {random}. Heterogeneity is described by Cochran's Q and I²"
-        f" {cite('i2')}, and by limits of the effect at a further site {cite('prediction')}."
+        f"{fixed} In the random-effects model, true effects differ between sites. Their variance"
+        f" (tau²) was {random}. Heterogeneity was described by Cochran's Q, by I² {cite('i2')}, and"
+        f" by limits of the effect at a further site {cite('prediction')}."
     )
     if meta.items[0].result.without:
-        effects += " All was repeated without each of the sites."
+        effects += " All analyses were repeated without each site."
     errors = (
-        f"{discovery_text(meta.settings.multiplicity, cite)}, and for all summary measures of a"
-        " contrast together. Effect sizes are Cohen's d: the estimate over"
-        f" the residual standard deviation within sites, with {rules.confidence:.0%} confidence"
-        " limits."
+        f"{discovery_text(meta.settings.multiplicity, cite)}, and over all summary measures of a"
+        " contrast. Effect sizes are Cohen's d: the estimate divided by the residual standard"
+        f" deviation within sites, with {rules.confidence:.0%} confidence limits."
     )
     paragraphs = [f"{measure_text} {aligned}", effects, errors]
     survivors = [
-        f"{key.measure}, {key.contrast}, {key.hemi}: {int(found.rejected.sum())} of"
+        f"- {escaped(f'{key.measure}, {key.contrast}, {key.hemi}')}: {int(found.rejected.sum())} of"
         f" {found.n_tests} points"
         for key, found in meta.found.items()
     ]
     if survivors:
-        paragraphs.append(f"Points that survive: {escaped('; '.join(survivors))}.")
+        paragraphs.append("\n".join(["Significant points after correction:", "", *survivors]))
     return cite.page(paragraphs, sites[0].region)

@@ -150,6 +150,8 @@ class SiteSummary(TomlTable):
     """Of hipsta_bids, at the participant level."""
     seg: Text
     region: Text
+    labels: dict[Text, list[Text]] = Field(default_factory=dict)
+    """Values of each field of provenance of the labels."""
     settings_hash: Text
     """Of the settings of the participant level."""
     axes: Text
@@ -223,9 +225,9 @@ def summarize(
 ) -> tuple[dict[str, Any], list[str]]:
     """Make the summary of an analysis of linear models, and note its omissions.
 
-    The cohort has coordinates and units; ``inputs`` are ``seg``, ``region``, ``settings_hash`` and
-    ``versions`` of the sheets. ModelError if so few participants are behind a number that it could
-    be traced to one of them.
+    The cohort has coordinates and units; ``inputs`` are ``seg``, ``region``, ``labels``,
+    ``settings_hash`` and ``versions`` of the sheets. ModelError if so few participants are behind a
+    number that it could be traced to one of them.
     """
     _check_model(analysis, settings)
     compared = analysis.compared
@@ -316,6 +318,8 @@ def _check_model(analysis: Analysis, settings: GroupSettings) -> None:
     problem = None
     if analysis.comparison.longitudinal:
         problem = "of --longitudinal cannot be combined; use --paired"
+    elif analysis.model.maps:
+        problem = "with map() cannot be combined; remove the term"
     elif analysis.harmonization is not None:
         problem = "of harmonized values cannot be combined; leave --harmonize out"
     elif settings.glm.covariance != "ordinary":

@@ -2,16 +2,16 @@
 
 import warnings
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 import pandas as pd
 from scipy import stats
 
-from hipsta_bids.derivatives.dataset import PROVENANCE
+from hipsta_bids.derivatives.dataset import PROVENANCE, counts_text
 from hipsta_bids.errors import InputError
-from hipsta_bids.group.cohort.collect import counts_text
+from hipsta_bids.group.cohort.quality import exact_p
 from hipsta_bids.group.cohort.read import visit_name
 from hipsta_bids.group.design.formula import typed
 from hipsta_bids.group.questions.study import Study
@@ -23,10 +23,17 @@ from hipsta_bids.types import PARTICIPANT, SESSION
 _SAME_EDGE, _LEVEL = 0.05, 0.05
 
 
-def with_mixes(study: Study, rows: pd.DataFrame, terms: Iterable[str]) -> Study:
+def with_mixes(
+    study: Study,
+    rows: pd.DataFrame,
+    terms: Iterable[str],
+    *,
+    source: tuple[object, Mapping[str, Sequence[str]]] = ("", {}),
+) -> Study:
     """Find in what the hemispheres of a model differ; InputError unless the settings allow it.
 
     ``rows`` are visits or, of pairs of sessions, participants; without ``terms`` they do not count.
+    ``source`` names a file of norms or effects of sites, and the segmentations that it rests on.
     """
     table, sides, pair = study.cohort.table, study.cohort.sides, study.options.comparison.pair
     records = ((record.result.name, record.provenance) for record in study.collection.records)
@@ -41,6 +48,14 @@ def with_mixes(study: Study, rows: pd.DataFrame, terms: Iterable[str]) -> Study:
     frame = frame[is_used & frame[key].isin(complete.index)]
     frame = frame.assign(voxel_size=frame["voxel_size"].map(_sizes(Counter(frame["voxel_size"]))))
     mixed = {f: f"{f}: {counts_text(n)}" for f in PROVENANCE if len(n := Counter(frame[f])) > 1}
+    labels = {field: sorted(set(frame[field])) for field in PROVENANCE}
+    for field, expected in source[1].items():
+        present = labels.get(field, [])
+        sizes = _sizes(Counter({**dict.fromkeys(present, 1), **dict.fromkeys(expected, 2)}))
+        if set(map(sizes.get, present) if field == "voxel_size" else present) - set(expected):
+            text = mixed.get(field, f"{field}: {', '.join(present)}")
+            mixed[field] = f"{text}, but {', '.join(expected)} in {source[0]}"
+        labels[field] = sorted({*present, *expected})
     if refused := [field for field in mixed if field not in study.settings.design.mixed]:
         raise InputError(
             f"hemispheres of one analysis differ in {'; '.join(mixed[one] for one in refused)};"
@@ -56,7 +71,7 @@ def with_mixes(study: Study, rows: pd.DataFrame, terms: Iterable[str]) -> Study:
         ending = f"; association {parts}" if parts else ""
         ending += f"; effects of {names} may be effects of {field}" if names else ""
         lines.append(f"hemispheres differ in {text}{ending}")
-    return replace(study, mixes=tuple(lines))
+    return replace(study, mixes=tuple(lines), labels=labels)
 
 
 def _sizes(counts: Counter[str]) -> dict[str, str]:
@@ -84,5 +99,4 @@ def _association(frame: pd.DataFrame, field: str, values: pd.Series) -> tuple[st
         with warnings.catch_warnings(action="ignore"):  # of kinds without spread
             samples = (value[kind == name] for name in kind.unique())
             return "F test", float(stats.f_oneway(*samples).pvalue)
-    method = None if table.shape == (2, 2) else stats.MonteCarloMethod(rng=np.random.default_rng(0))
-    return "Fisher's exact test", float(stats.fisher_exact(table, method=method).pvalue)
+    return "Fisher's exact test", exact_p(table)

@@ -18,11 +18,14 @@ from hipsta_bids.group.design.formula import check_names, level_labels, listed, 
 from hipsta_bids.group.design.model import BOTH, FIRST_AGE, Comparison
 from hipsta_bids.group.design.settings import GroupSettings, NormSettings
 from hipsta_bids.group.output import write
-from hipsta_bids.group.output.figures import Drawing, deviation_rows, draw_norms, norm_rows
-from hipsta_bids.group.output.methods import escaped, norms_text
+from hipsta_bids.group.output.figures import deviation_rows, draw_norms, norm_rows
+from hipsta_bids.group.output.ground import grounds_of
+from hipsta_bids.group.output.methods import escaped
 from hipsta_bids.group.output.panels import draw_pages
+from hipsta_bids.group.output.question_methods import norms_text
 from hipsta_bids.group.output.results import ScoredMaps
 from hipsta_bids.group.output.saved import NormsFile, load_norms, save_norms, templates_from_json
+from hipsta_bids.group.output.style import Drawing
 from hipsta_bids.group.questions import study as studies
 from hipsta_bids.group.questions.mixing import with_mixes
 from hipsta_bids.group.questions.scores import map_rows, score_rows
@@ -90,7 +93,7 @@ def run_norms(
         study, studies.read_templates(options.template, study.cohort)
     )
     tell("norms")
-    file = file.model_copy(update={"template": template})
+    file = file.model_copy(update={"template": template, "labels": dict(study.labels)})
     norms, tables["coverage"] = _fit(values, people, file, settings.norms)
     n_sites = len(file.sites)
     scoring = _Made(None, None, file, norms, people, cohorts, values, tables, n_sites)
@@ -123,7 +126,7 @@ def _score_people(
     if not people.known.any():
         reasons = "; ".join(dict.fromkeys(message for _, message in study.left_out.values()))
         raise ModelError(f"{path}: no participant can be scored: {reasons}")
-    study = with_mixes(study, table[people.known], (file.age,))
+    study = with_mixes(study, table[people.known], (file.age,), source=(path, file.labels))
     controls_kept = studies.members(table, controls, "--controls")
     references = controls_kept & (controls is not None) & ~repeated.to_numpy()
     file = _with_new_sites(study, path, file, people, references, controls=controls)
@@ -206,7 +209,7 @@ def _write(study: studies.Study, scoring: _Made, notes: Iterable[str]) -> studie
                     folder, cohort, cohort.table, scored, letter="z", sheets=surface == SHEET
                 )
         files.write_text(folder / "methods.md", text)
-        return write.write_figures(folder, _figures(scoring))
+        return write.write_figures(folder, _figures(scoring), prints=study.options.figures)
 
     counts = np.bincount(people.site[people.known][is_first], minlength=len(file.sites)).tolist()
     record = {
@@ -493,14 +496,14 @@ def _figures(scoring: _Made) -> Iterator[tuple[str, Drawing]]:
     for surface, cohort in scoring.cohorts.items():
         for measure in dict.fromkeys(n for side in cohort.sides.values() for n in side.maps):
             sides = {h: one for h, one in cohort.sides.items() if (h, measure) in scoring.norms}
-            places = {hemi: points_of(one) for hemi, one in sides.items()}
+            grounds = grounds_of(cohort, {hemi: points_of(one) for hemi, one in sides.items()})
             unit = cohort.units.get(measure, "1")
             middle = scoring.file.middle
             means = {hemi: scoring.norms[hemi, measure].expected(middle) for hemi in sides}
             rows = norm_rows(means, float(middle.age[0]), measure, unit)
             if scoring.adapted is not None:
                 rows = deviation_rows(scoring.scored[surface], measure)
-            yield f"{measure}_normmaps", partial(draw_pages, cohort, places, [list(rows)])
+            yield f"{measure}_normmaps", partial(draw_pages, grounds, [list(rows)])
 
 
 def _dots(scoring: _Made, lines: pd.DataFrame) -> pd.DataFrame:

@@ -9,7 +9,8 @@ from formulaic import Formula
 
 from hipsta_bids.errors import ModelError, UsageError
 from hipsta_bids.group.cohort import data
-from hipsta_bids.group.design.formula import Contrast, ModelSpec, check_names, listed, typed
+from hipsta_bids.group.design.contrasts import Contrast
+from hipsta_bids.group.design.formula import ModelSpec, check_names, listed, typed
 from hipsta_bids.group.design.grammar import closed_formula, term_text
 from hipsta_bids.group.design.model import Design, Groups, build_design
 from hipsta_bids.group.design.settings import ClassificationSettings, DesignSettings, GroupSettings

@@ -10,7 +10,8 @@ import numpy as np
 import pandas as pd
 
 from hipsta_bids.errors import ModelError
-from hipsta_bids.group.design.formula import Contrast, listed
+from hipsta_bids.group.design.contrasts import Contrast
+from hipsta_bids.group.design.formula import listed
 from hipsta_bids.group.design.settings import GroupSettings
 from hipsta_bids.group.output import columns, tables
 from hipsta_bids.group.questions.exchange import ModelSummary, SiteSummary, shown_counts
@@ -128,8 +129,15 @@ def check_agreement(sites: Sequence[SiteSummary]) -> list[str]:
                 words = [", ".join(f"{weight:.6g}" for weight in row) for row in rows]
                 item = f"{title}: weights of {name} on {', '.join(model.columns)}"
                 _agree(sites, item, words, _BY_COLUMNS)
-    is_mixed = len({site.version for site in sites}) > 1
-    return ["sites used several versions of hipsta_bids, see sites.tsv"] if is_mixed else []
+    notes = []
+    if len({site.version for site in sites}) > 1:
+        notes.append("sites used several versions of hipsta_bids, see sites.tsv")
+    for name in dict.fromkeys(name for site in sites for name in site.labels):
+        kinds = {site.site: ", ".join(site.labels.get(name, ["unknown"])) for site in sites}
+        if len(set(kinds.values())) > 1:
+            texts = "; ".join(f"{kind} at {site}" for site, kind in kinds.items())
+            notes.append(f"labels of sites differ in {name}: {texts}")
+    return notes
 
 
 def _agree(

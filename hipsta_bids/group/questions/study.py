@@ -15,6 +15,7 @@ from hipsta_bids.errors import ModelError
 from hipsta_bids.group.cohort import collect, external, read
 from hipsta_bids.group.cohort.covariates import add_icv, add_time, read_covariates, spelled_note
 from hipsta_bids.group.cohort.data import SHEET, Cohort, Measures, choose_visits
+from hipsta_bids.group.cohort.masks import mask_sheets
 from hipsta_bids.group.design import model as designs
 from hipsta_bids.group.design.formula import ascii_letters, check_names, listed, with_factors
 from hipsta_bids.group.design.settings import GroupSettings
@@ -30,7 +31,7 @@ from hipsta_bids.io import files
 from hipsta_bids.progress import each, tell
 from hipsta_bids.protocols.toml import resolve
 from hipsta_bids.reports.group import write_group_report
-from hipsta_bids.types import PARTICIPANT
+from hipsta_bids.types import PARTICIPANT, SESSION
 
 #: Hemispheres that notes name.
 _MOST_NOTES = 4
@@ -62,6 +63,8 @@ class GroupOptions:
     summary."""
     reports: bool = True
     """Whether a page is made."""
+    figures: bool = False
+    """Whether figures are written for print, too, as PDF and PNG."""
     command: tuple[str, ...] = ()
     """The command line, for the record."""
 
@@ -112,8 +115,14 @@ class Study:
     """Column and level of the participants; all without."""
     left_out: dict[str, tuple[str, str]] = field(default_factory=dict)
     """Reason and message by further visits that are left out."""
+    quality: pd.DataFrame = field(default_factory=pd.DataFrame)
+    """Decision and rating of each hemisphere, also of failed ones, with covariates."""
+    masked: pd.DataFrame | None = None
+    """Visit, side and share of masked points of each sheet, if a mask is asked for."""
     mixes: tuple[str, ...] = ()
     """In what hemispheres differ, as far as the settings allow it, one line each."""
+    labels: Mapping[str, list[str]] = field(default_factory=dict)
+    """Values of each field of provenance of their labels."""
 
     @property
     def cohort(self) -> Cohort:
@@ -258,8 +267,14 @@ def read_study(
     requests = external.map_patterns(options.maps, options.surfaces, reserved)
     requested = designs.wanted_measures(options.model, options.measures)
     measures = read.choose_measures(requested, collection.records, [one.name for one in requests])
+    covariate_maps = designs.covariate_maps(options.model)
+    if covariate_maps:
+        known_maps = [one.name for one in requests]
+        found_maps = read.choose_measures(covariate_maps, collection.records, known_maps)
+        if found_maps.summaries:
+            raise ModelError(f"map({found_maps.summaries[0]}) in the formula: it is no map")
     files_of, visits = external.find_all(
-        [one for one in requests if one.name in measures.maps],
+        [one for one in requests if one.name in {*measures.maps, *covariate_maps}],
         options.bids_dir,
         read.visits_of(collection.records),
         collect.wanted_by(options.sheets),
@@ -268,14 +283,24 @@ def read_study(
     sheets = read.read_sheets(
         collection.records,
         collection.grid,
-        [name for name in measures.maps if name not in names],
+        [name for name in dict.fromkeys((*measures.maps, *covariate_maps)) if name not in names],
         visits,
         max_gap=settings.registration.max_gap,
     )
     sheets, surfaces, map_notes = external.add_external(sheets, files_of, visits)
+    if covariate_maps and surfaces:
+        raise ModelError(
+            f"maps {listed(surfaces)} are not on the grid of the sheet, but map() in the formula"
+            " is; remove one"
+        )
     measured, volume_notes = external.add_volumes(
         sheets, collection.records, options.volumes, options.bids_dir
     )
+    mask_notes: list[str] = []
+    masked = None
+    if options.sheets.masks:
+        records = collection.records
+        measured, masked, mask_notes = mask_sheets(measured, records, options.sheets.masks)
     read.check_summaries(measures, measured.sides)
     covariates, absent, spelled = read_covariates(
         measured.table, options.bids_dir, options.covariates, settings
@@ -283,6 +308,7 @@ def read_study(
     lacking = (
         f"participants.tsv: has no row of {listed(sorted(absent))}; add it, or check its label"
     )
+    quality = _with_covariates(collection.quality, covariates, options, settings)
     table_notes = [lacking] * bool(absent)
     if spelled:
         file = options.model.file and files.read_json(options.model.file)
@@ -320,12 +346,36 @@ def read_study(
             *measured.damaged,
             *collect.exclude_visits(measured.table, reasons_of),
         ),
-        notes=(*collection.notes, *map_notes, *volume_notes, *_damaged(measured), *table_notes),
+        notes=(
+            *(*collection.notes, *map_notes, *mask_notes, *volume_notes),
+            *(*_damaged(measured), *table_notes),
+        ),
+        masked=masked,
+        quality=quality,
         absent=absent,
         among=among,
     )
     keep = members(cohort.table, among)
     return study.take(keep, ("not-asked", "another level than --among"))
+
+
+def _with_covariates(
+    quality: pd.DataFrame,
+    covariates: pd.DataFrame,
+    options: GroupOptions,
+    settings: GroupSettings,
+) -> pd.DataFrame:
+    """Add covariates to decisions; those of participants without any sheet are read."""
+    if not len(quality):
+        return quality
+    keys = [PARTICIPANT, SESSION]
+    visits = quality[keys].drop_duplicates()
+    if not visits[PARTICIPANT].isin(covariates[PARTICIPANT]).all():
+        visits = visits.set_axis(
+            visits[PARTICIPANT].str.cat(visits[SESSION], "_", na_rep="").tolist()
+        )
+        covariates = read_covariates(visits, options.bids_dir, options.covariates, settings)[0]
+    return quality.merge(covariates.drop_duplicates(keys), on=keys, how="left")
 
 
 def _damaged(measured: read.Measured) -> tuple[str, ...]:

@@ -20,9 +20,11 @@ from hipsta_bids.group.design.formula import listed, model_from_shortcut, parse_
 from hipsta_bids.group.design.settings import GroupSettings
 from hipsta_bids.group.output import write
 from hipsta_bids.group.output.columns import frame_of
-from hipsta_bids.group.output.figures import Drawing
-from hipsta_bids.group.output.methods import Citations, code, escaped, power_text, retest_text
+from hipsta_bids.group.output.ground import grounds_of
+from hipsta_bids.group.output.methods import Citations, code, escaped
 from hipsta_bids.group.output.panels import Row, draw_pages, spanned
+from hipsta_bids.group.output.question_methods import power_text, retest_text
+from hipsta_bids.group.output.style import Drawing
 from hipsta_bids.group.output.tables import entity_label
 from hipsta_bids.group.questions import study as studies
 from hipsta_bids.group.questions.mixing import with_mixes
@@ -145,8 +147,8 @@ class Retested:
         text = f"these repeated sessions {cite('bland')}"
         if self._has_visits:
             text += (
-                "; true changes were taken to be the same in all participants, so that the numbers"
-                " are lower limits"
+                ". True changes were assumed equal in all participants, so that sample sizes are"
+                " lower limits"
             )
         return text
 
@@ -243,11 +245,11 @@ class Modeled:
         """Name what means, changes and variances rest on."""
         model = code(self.spec.formula)
         if self.time is None:
-            return f"these participants, after a linear model {model}"
+            return f"these participants, with a linear model {model}"
         unit = "a month" if self.months == 1 else f"{self.months:.3g} months"
         return (
-            f"these participants, by a linear mixed model {model} with random intercepts and "
-            f"slopes {cite('mixed')}; a unit of {escaped(self.time)} is {unit}"
+            f"these participants, with a linear mixed model {model} with random intercepts and"
+            f" slopes of participants {cite('mixed')}. One unit of {escaped(self.time)} was {unit}"
         )
 
 
@@ -318,7 +320,7 @@ def run_trial(
         if templates:
             files.write_json(folder / "template.json", templates)
         files.write_text(folder / "methods.md", _methods(study, source, modeled, results, effect))
-        return write.write_figures(folder, _figures(cohorts, results))
+        return write.write_figures(folder, _figures(cohorts, results), prints=options.figures)
 
     record = {
         "formula": source.spec.formula if isinstance(source, Modeled) else None,
@@ -404,23 +406,25 @@ def _methods(
     """Describe what was done, with the works it rests on."""
     settings, cite = study.settings, Citations()
     among = f" ({escaped(' '.join(study.among))})" if study.among else ""
-    first = (
-        f"Measures of the hippocampus {cite('method')} of {visits[PARTICIPANT].nunique()}"
-        f" participants{among} with {len(visits)} visits were analyzed with hipsta_bids"
-        f" {__version__}."
-    )
     surfaces = dict.fromkeys(result.layer.surface for result in results)
+    external = [name for name in surfaces if name not in {SHEET, SUMMARY}]
+    subject = f"Maps of {', '.join(external)}"
+    if len(external) < len(surfaces):
+        subject = f"Measures of the hippocampal body {cite('method')}"
+    first = (
+        f"{subject} of {visits[PARTICIPANT].nunique()} participants{among} with"
+        f" {len(visits)} visits were analyzed with hipsta_bids {__version__}."
+    )
     if SHEET in surfaces and settings.registration.align != "none":
         first += (
-            f" Sheets were registered by their curvature profiles {cite('registr')}, each session"
-            " by itself, as for comparisons of groups."
+            f" Sheets of each session were registered by their curvature profiles"
+            f" {cite('registr')}."
         )
     elif SHEET in surfaces:
         first += " Sheets were not registered to each other."
-    if external := [name for name in surfaces if name not in {SHEET, SUMMARY}]:
+    if external:
         first += (
-            f" Maps of other programs ({', '.join(external)}) were taken as they are, without"
-            " registration."
+            f" Maps of other programs ({', '.join(external)}) were analyzed without registration."
         )
     paragraphs = [first]
     if isinstance(source, Retested):
@@ -493,7 +497,8 @@ def _figures(
             unit = cohorts[surface].units.get(measure, "1")
             if rows := list(make(sides, display_name(measure), unit)):
                 points = {hemi: r.points for hemi, r in sides.items() if r.points is not None}
-                yield f"{measure}_{question}", partial(draw_pages, cohorts[surface], points, [rows])
+                grounds = grounds_of(cohorts[surface], points)
+                yield f"{measure}_{question}", partial(draw_pages, grounds, [rows])
 
 
 def _agreement(sides: Mapping[str, Described], measure: str, unit: str) -> Iterator[Row]:

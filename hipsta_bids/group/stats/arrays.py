@@ -3,7 +3,7 @@
 import contextlib
 import ctypes
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pandas as pd
@@ -99,6 +99,16 @@ class SideMaps:
     """One row per sheet: the columns of the participant level's summaries, as numbers."""
     mesh: Mesh | None = None
     """Surface of the points if they are not on the grid: x are its vertices then, and y is 1."""
+    covariates: Mapping[str, Float] = field(default_factory=dict)
+    """(sheets, x, y) maps that are covariates of the model at each point, by name."""
+
+    unmasked: Float | None = None
+    """(sheets, x, y) curvature that registration uses, where a mask has points of that map."""
+
+    @property
+    def curvature(self) -> Float:
+        """(sheets, x, y) map that registration uses."""
+        return self.maps["curvature"] if self.unmasked is None else self.unmasked
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -129,6 +139,8 @@ class SideMaps:
             self,
             rows=self.rows[keep],
             maps=some_sheets(self.maps, keep),
+            covariates=some_sheets(self.covariates, keep),
+            unmasked=None if self.unmasked is None else self.unmasked[keep],
             subfield=self.subfield[keep],
             summary=self.summary[keep].reset_index(drop=True),
         )

@@ -8,16 +8,16 @@ import numpy as np
 from scipy.linalg import null_space, orth
 
 from hipsta_bids.errors import ModelError
-from hipsta_bids.group.design.formula import Contrast
+from hipsta_bids.group.design.contrasts import Contrast
 from hipsta_bids.group.stats.arrays import Bool, Float, Int
 
 #: ``whole`` exchanges participants with all their visits, ``within`` the visits of each, ``flip``
 #: changes the signs of all visits of a participant.
 Exchange = Literal["whole", "within", "flip"]
 _TEXT: Mapping[Exchange, str] = {
-    "whole": "participants with as many visits changed places, with all of them",
-    "within": "visits changed places within participants",
-    "flip": "the signs of all visits of a participant were flipped together",
+    "whole": "participants with the same number of visits were exchanged",
+    "within": "visits were exchanged within participants",
+    "flip": "the signs of all visits of a participant were flipped",
 }
 #: Length left of a vector of length 1 that is not in the span of some columns.
 _OUTSIDE = 1e-6
@@ -115,6 +115,11 @@ def split(matrix: Float, contrast: Contrast) -> tuple[Float, Float]:
     return tested, np.linalg.qr(matrix @ null_space(contrast.weights))[0]
 
 
+def spans_constant(matrix: Float, contrast: Contrast) -> bool:
+    """Check whether the columns that are not tested can make a constant; else a mean is tested."""
+    return spans(split(matrix, contrast)[1], np.ones(len(matrix)))
+
+
 def spans(columns: Float, vector: Float) -> bool:
     """Whether orthonormal columns can make a vector."""
     unit = vector / np.linalg.norm(vector)
@@ -187,14 +192,15 @@ def exchange_text(
     visits: Visits,
     choice: Literal["auto"] | Exchange,
 ) -> str:
-    """Word the exchange of each contrast."""
+    """Word the exchange of each contrast, without a final period."""
     kinds: dict[Exchange, list[str]] = {}
     for contrast in contrasts:
         kinds.setdefault(choose_exchange(matrix, contrast, visits, choice), []).append(
             contrast.name
         )
     texts = (f"for {', '.join(names)}, {_TEXT[kind]}" for kind, names in kinds.items())
-    return f" In permutations {'; '.join(texts)}."
+    text = "; ".join(texts)
+    return text[:1].upper() + text[1:]
 
 
 def _between(tested: Float, nuisance: Float, visits: Visits, *, changes: bool) -> bool:

@@ -2,15 +2,17 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import special
+from scipy.linalg import block_diag
 from scipy.optimize import elementwise
 from statsmodels.regression.linear_model import OLS
 
 from hipsta_bids.errors import ModelError
-from hipsta_bids.group.design.formula import Contrast
+from hipsta_bids.group.design.contrasts import Contrast
 from hipsta_bids.group.design.model import Design
 from hipsta_bids.group.design.settings import GlmSettings
 from hipsta_bids.group.stats.arrays import Bool, Float, Int, SideMaps, parts_of_sheets, sheets_of
@@ -148,19 +150,40 @@ class PointBlock:
 
 
 def fit_points(
-    maps: Float, matrix: Float, contrasts: Sequence[Contrast], settings: GlmSettings
+    maps: Float,
+    matrix: Float,
+    contrasts: Sequence[Contrast],
+    settings: GlmSettings,
+    covariates: Float | None = None,
 ) -> PointwiseFit:
-    """Fit the same linear model to each column of a table, with values missing anywhere."""
-    check_design(maps, matrix, contrasts)
+    """Fit the same linear model to each column of a table, with values missing anywhere.
+
+    ``covariates`` (maps, rows, points) have a value at each point, and are further columns of the
+    design there, as differences from their mean at the point (Casanova et al. 2007,
+    doi:10.1016/j.neuroimage.2006.09.011). Contrasts have weights of ``covariates`` after the
+    weights of the matrix, or none.
+    """
+    n_maps = 0 if covariates is None else len(covariates)
+    columns = matrix.shape[1] + n_maps
+    contrasts = [_padded(contrast, columns) for contrast in contrasts] if n_maps else contrasts
+    check_design(maps, matrix, contrasts, columns)
     basis, triangle = np.linalg.qr(matrix)
     inverse = np.linalg.inv(triangle)
-    blocks = [
-        fit_block(np.asarray(maps[:, part], dtype=np.float64), basis, settings)
-        for part in chunks(maps.shape, matrix.shape[1])
-    ]
+    if covariates is not None:
+        scales = np.nanstd(covariates, axis=1).mean(axis=1, where=np.isfinite(maps).any(axis=0))
+        scales = np.maximum(scales, np.finfo(np.float64).tiny) * np.sqrt(len(maps))
+        covariates = covariates / scales[:, None, None]
+        inverse = block_diag(inverse, np.diag(1 / scales))
+    blocks = []
+    for part in chunks(maps.shape, columns):
+        values = np.asarray(maps[:, part], dtype=np.float64)
+        if covariates is None:
+            blocks.append(fit_block(values, basis, settings))
+        else:
+            blocks.append(_fit_covariates(values, basis, covariates[:, :, part], settings))
     names = ("scores", "covariance", "sigma", "n")
     fit = PointBlock(*(np.concatenate([getattr(one, name) for one in blocks]) for name in names))
-    df = np.where(np.isfinite(fit.sigma), fit.n - matrix.shape[1], np.nan)
+    df = np.where(np.isfinite(fit.sigma), fit.n - columns, np.nan)
     tests = tuple(
         _test(contrast, contrast.weights @ inverse, fit, df, settings.confidence)
         for contrast in contrasts
@@ -168,8 +191,18 @@ def fit_points(
     return PointwiseFit(inverse @ fit.scores.T, fit.sigma, fit.n, tests)
 
 
-def check_design(maps: Float, matrix: Float, contrasts: Sequence[Contrast]) -> None:
+def _padded(contrast: Contrast, columns: int) -> Contrast:
+    """Return a contrast with weights of further columns, which are zero."""
+    rows, size = contrast.weights.shape
+    weights = np.hstack([contrast.weights, np.zeros((rows, max(columns - size, 0)))])
+    return Contrast(contrast.name, weights)
+
+
+def check_design(
+    maps: Float, matrix: Float, contrasts: Sequence[Contrast], columns: int | None = None
+) -> None:
     """Refuse a design that cannot be fitted, as where some rows have no maps."""
+    columns = matrix.shape[1] if columns is None else columns
     if maps.ndim != 2 or matrix.ndim != 2 or maps.shape[0] != matrix.shape[0]:  # noqa: PLR2004 -- tables
         raise ModelError(
             f"model: maps of shape {maps.shape} do not fit a design of shape {matrix.shape};"
@@ -183,10 +216,10 @@ def check_design(maps: Float, matrix: Float, contrasts: Sequence[Contrast]) -> N
             f"{matrix.shape[0]} rows; remove one"
         )
     for contrast in contrasts:
-        if contrast.weights.shape[1] != matrix.shape[1]:
+        if contrast.weights.shape[1] != columns:
             raise ModelError(
                 f"contrast {contrast.name!r} has {contrast.weights.shape[1]} weights, the design"
-                f" {matrix.shape[1]} columns"
+                f" {columns} columns"
             )
 
 
@@ -241,6 +274,44 @@ def fit_block(maps: Float, basis: Float, settings: GlmSettings) -> PointBlock:
         covariance = inverse * (sigma**2)[:, None, None]
     return PointBlock(
         scores=np.where(usable[:, None], scores, np.nan),
+        covariance=np.where(usable[:, None, None], covariance, np.nan),
+        sigma=sigma,
+        n=n,
+    )
+
+
+def _fit_covariates(
+    maps: Float, basis: Float, covariates: Float, settings: GlmSettings
+) -> PointBlock:
+    """Solve least squares at some points whose designs differ; as :func:`fit_block`."""
+    present = np.isfinite(maps) & np.isfinite(covariates).all(axis=0)
+    n = present.sum(axis=0)
+    centered = np.where(present, covariates, 0.0)
+    means = centered.sum(axis=1, keepdims=True) / np.maximum(n, 1)
+    centered = np.where(present, centered - means, 0.0)
+    fixed = np.where(present.T[:, :, None], basis, 0.0)
+    designs = np.concatenate([fixed, centered.transpose(2, 1, 0)], axis=2)
+    values = np.where(present, maps, 0.0).T[:, :, None]
+    columns = designs.shape[2]
+    information = designs.transpose(0, 2, 1) @ designs
+    usable = np.linalg.eigvalsh(information)[:, 0] > MIN_INFORMATION
+    usable &= n - columns >= settings.min_residual_df
+    information[~usable] = np.eye(columns)
+    inverse = np.linalg.inv(information)
+    scores = inverse @ (designs.transpose(0, 2, 1) @ values)
+    residuals = (values - designs @ scores)[:, :, 0]
+    squares = np.einsum("ps,ps->p", residuals, residuals)
+    usable &= squares > np.sum(values**2, axis=(1, 2)) * np.finfo(np.float64).eps
+    sigma = np.where(usable, np.sqrt(squares / np.where(usable, n - columns, 1)), np.nan)
+    covariance = inverse * (sigma**2)[:, None, None]
+    if settings.covariance == "hc3":
+        leverage = np.einsum("psi,pij,psj->ps", designs, inverse, designs)
+        is_saturated = (1 - leverage < np.sqrt(np.finfo(np.float64).eps)) & present.T
+        weights = residuals / np.where(is_saturated, np.nan, 1 - leverage)
+        weighted = designs * weights[:, :, None]
+        covariance = inverse @ (weighted.transpose(0, 2, 1) @ weighted) @ inverse
+    return PointBlock(
+        scores=np.where(usable[:, None], scores[:, :, 0], np.nan),
         covariance=np.where(usable[:, None, None], covariance, np.nan),
         sigma=sigma,
         n=n,
@@ -380,6 +451,12 @@ class RowModel:
         """Fit some rows of the design at each point."""
         return fit_points(values, self.design.matrix[rows], contrasts, self.settings)
 
+    def fit_on_maps(
+        self, values: Float, rows: Int, contrasts: tuple[Contrast, ...], covariates: Float
+    ) -> PointwiseFit:
+        """Fit some rows of the design at each point, with maps as covariates."""
+        return fit_points(values, self.design.matrix[rows], contrasts, self.settings, covariates)
+
     def fit_measures(
         self, values: Float, rows: Int, contrasts: tuple[Contrast, ...]
     ) -> PointwiseFit:
@@ -393,7 +470,8 @@ def with_mean(design: Design) -> tuple[Contrast, ...]:
     matching = [
         one
         for one in design.contrasts
-        if one.name == MEAN or (one.n_rows == 1 and np.allclose(one.weights, mean.weights))
+        if one.name == MEAN
+        or (one.weights.shape == mean.weights.shape and np.allclose(one.weights, mean.weights))
     ]
     return design.contrasts if matching else (mean, *design.contrasts)
 
@@ -437,11 +515,17 @@ def fit_maps(
         side.rows, model.design.rows, assume_unique=True, return_indices=True
     )
     tested = model.design.contrasts if contrasts is None else contrasts
+    maps = [_values(values, positions) for values in side.covariates.values()]
+    fit_rows: Callable[[Float, Int, tuple[Contrast, ...]], PointwiseFit] = model.fit
+    if maps:
+        fit_rows = partial(model.fit_on_maps, covariates=np.stack(maps).astype(np.float64))
     fits = {}
     try:
         for name in side.maps:
             # Maps of a large cohort are made here: without a name, one is gone before the next.
-            fits[name] = model.fit(_values(side.maps[name], positions), rows, tested)
+            values = _values(side.maps[name], positions)
+            fits[name] = fit_rows(values, rows, tested)
+            del values
     except ModelError as error:
         raise ModelError(f"hemisphere {hemi}: {error}") from error
     for name, fit in fits.items():

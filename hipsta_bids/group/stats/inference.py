@@ -11,13 +11,15 @@ from scipy import special
 from statsmodels.stats.multitest import multipletests
 
 from hipsta_bids.errors import ModelError
-from hipsta_bids.group.design.formula import Contrast, check_names, listed
+from hipsta_bids.group.design.contrasts import Contrast
+from hipsta_bids.group.design.formula import check_names, listed
 from hipsta_bids.group.design.settings import GlmSettings, MultiplicitySettings
 from hipsta_bids.group.stats import exchangeability
 from hipsta_bids.group.stats.arrays import Bool, Float, Int
 from hipsta_bids.group.stats.clusters import edges_of, enhance
 from hipsta_bids.group.stats.glm import FittedMaps, RowModel, fit_points
 from hipsta_bids.progress import tell
+from hipsta_bids.types import FAMILY
 
 #: Share of the smallest p that serves as cut-off when nothing is rejected.
 BELOW_ALL = 0.1
@@ -322,7 +324,7 @@ def families(maps: Iterable[MapKey], scope: str) -> list[list[MapKey]]:
     """Group maps whose points are tested together."""
     groups: dict[tuple[str, ...], list[MapKey]] = {}
     for key in maps:
-        family = (key.measure, key.contrast, *(() if scope == "hemispheres" else (key.hemi,)))
+        family = tuple(getattr(key, name) for name in FAMILY[scope])
         groups.setdefault(family, []).append(key)
     return list(groups.values())
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from hipsta_bids.errors import ModelError
-from hipsta_bids.group.design.formula import Contrast
+from hipsta_bids.group.design.contrasts import Contrast
 from hipsta_bids.group.design.model import Design
 from hipsta_bids.group.design.settings import GlmSettings, LongitudinalSettings
 from hipsta_bids.group.stats import glm, random_slope

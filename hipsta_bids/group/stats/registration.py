@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from hipsta_bids.errors import ModelError
-from hipsta_bids.group.design.formula import Contrast
+from hipsta_bids.group.design.contrasts import Contrast
 from hipsta_bids.group.design.settings import MultiplicitySettings, RegistrationSettings
 from hipsta_bids.group.stats import warps as warping
 from hipsta_bids.group.stats.arrays import SHEETS, Bool, Float, blocks

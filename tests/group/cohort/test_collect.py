@@ -32,7 +32,7 @@ def test_extended_results_are_analyzed_when_asked_for(study, capsys):
     assert record["inputs"]["region"] == "extended"
     assert record["hemispheres"] == {"L": sum(PLAN.sizes), "R": sum(PLAN.sizes)}
     text = (folder / "methods.md").read_text()
-    assert "Measures of the hippocampus and the neighboring cortex [1]" in text
+    assert "Measures of the hippocampal body and the neighboring cortex [1]" in text
 
 
 def test_body_is_the_default_and_others_are_counted(study, capsys):

@@ -145,7 +145,7 @@ def test_left_side_of_formulas():
 def test_figures_are_those_of_the_measures(dataset, quick):
     code, group = run(dataset, quick, "--measures", "T2", "--name", "drawn")
     assert code == 0
-    names = {path.stem for path in (group / "drawn" / "figures").glob("*.png")}
+    names = {path.stem for path in (group / "drawn" / "figures").glob("*.svg")}
     assert names == {"T2_maps", "registration", "roc"}
     drawing = (group / "drawn" / "figures" / "T2_maps.svg").read_text()
     assert ">T2 [arbitrary]<" in drawing

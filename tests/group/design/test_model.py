@@ -8,10 +8,10 @@ import pytest
 from scipy import stats
 
 from hipsta_bids.errors import ModelError
+from hipsta_bids.group.design.contrasts import parse_expression
 from hipsta_bids.group.design.formula import (
     listed,
     model_from_shortcut,
-    parse_expression,
     parse_model,
 )
 from hipsta_bids.group.design.model import (

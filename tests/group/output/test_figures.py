@@ -4,25 +4,31 @@ import contextlib
 import io
 import re
 import zlib
+from functools import partial
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
 import pytest
+from matplotlib.collections import LineCollection
 from matplotlib.contour import ContourSet
+from matplotlib.image import BboxImage
 from matplotlib.text import Text
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from hipsta_bids.group.design.settings import ClassificationSettings
-from hipsta_bids.group.output.figures import draw_calibration, draw_roc, draw_sections, encode
-from hipsta_bids.group.output.panels import draw_measure, draw_view
+from hipsta_bids.group.output.figures import draw_calibration, draw_roc, draw_sections
+from hipsta_bids.group.output.maps import draw_measure
+from hipsta_bids.group.output.panels import draw_view
 from hipsta_bids.group.output.results import Analysis
 from hipsta_bids.group.output.shapes import AverageShape
+from hipsta_bids.group.output.style import encode, style
 from hipsta_bids.group.output.views import across, draw_mesh, laid_out, look
 from hipsta_bids.group.stats.classify import Area, calibrate, roc_curve
-from hipsta_bids.group.stats.inference import Discoveries, MapKey
-from hipsta_bids.io.gifti import sheet_triangles
+from hipsta_bids.io.gifti import sheet_triangles, surface_bytes
+from hipsta_bids.reports.group_tables import GroupResults
 from hipsta_bids.reports.maps import new_figure
 from hipsta_bids.types import Mesh
 
@@ -129,76 +135,84 @@ def test_triangles_without_a_value_are_left_out():
     assert len(colors.get_array()) == len(mesh.triangles) - (mesh.triangles == 0).any(axis=1).sum()
 
 
-def measured(survive, sides="LR", *, kind="t", mesh=None, groups=("CN", "AD"), contrasts=1):
-    """An analysis of thickness in which some points survive on the left side."""
-    shape = GRID if mesh is None else (len(mesh.points), 1)
-    points = shape[0] * shape[1]
+def measured(folder, survive, sides="LR", *, kind="t", mesh=None, groups=("CN", "AD"),
+             contrasts=1, surface=True):  # fmt: skip
+    """The files of an analysis of thickness in which some points survive on the left side."""
+    nx, ny = GRID
     random = np.random.default_rng(0)
-    tests = [
-        SimpleNamespace(
-            contrast=SimpleNamespace(name=f"{groups[0]}-{groups[-1]} {n}" if n else "CN-AD"),
-            kind=kind,
-            statistic=np.abs(random.normal(0, 1, points)),
-            effect=random.uniform(0, 0.5, points),
-            df=np.full(points, 20.0),
-        )
-        for n in range(contrasts)
-    ]
-    fields = (
-        np.repeat([0] * 7 + [1] * 14, GRID[1]).reshape(GRID) if mesh is None else -np.ones(shape)
+    if mesh is None:
+        points = nx * ny
+        i, j = np.indices(GRID).reshape(2, -1)
+        x, y = np.linspace(-0.9, 0.9, nx), np.linspace(-0.9, 0.9, ny)
+        place = {"node_x": i + 1, "node_y": j + 1, "x": x[i], "y": y[j]}
+        names = np.where(i < 7, "Sub", "CA1")
+    else:
+        points = len(mesh.points)
+        place = {"vertex": np.arange(points)}
+        place |= {f"surface_{axis}": mesh.points[:, n] for n, axis in enumerate("xyz")}
+        names = np.full(points, np.nan)
+    tables, maps = {}, []
+    for hemi in sides:
+        for n in range(contrasts):
+            flags = np.asarray(survive) if hemi == "L" else np.zeros(points, dtype=bool)
+            name = f"hemi-{hemi}_{n}"
+            effect = random.uniform(0, 0.5, points)
+            tables[name] = pd.DataFrame(
+                {
+                    **place,
+                    "subfield": names,
+                    "n": 4,
+                    "statistic": np.abs(random.normal(0, 1, points)),
+                    "df": 20.0,
+                    "p_corrected": np.where(flags, 0.001, 0.5),
+                    "significant": flags,
+                    "cohen_d": effect if kind == "t" else np.nan,
+                    "eta_squared": effect,
+                }
+            )
+            contrast = f"{groups[0]}-{groups[-1]} {n}" if n else "CN-AD"
+            maps.append({"measure": "thickness", "contrast": contrast, "hemi": hemi, "file": name})
+    tables["maps"] = pd.DataFrame(maps)
+    tables["means"] = pd.concat(
+        pd.DataFrame({"measure": "thickness", "unit": "mm", "hemi": hemi, "group": group,
+                      **place, "n": 2, "mean": random.normal(2, 0.1, points)})
+        for hemi in sides for group in groups
+    )  # fmt: skip
+    for hemi, own in shapes_of(sides).items() if surface and mesh is None else ():
+        write_mesh(folder / f"hemi-{hemi}_desc-average_midthickness.surf.gii", own)
+    if mesh is not None:
+        for hemi in sides:
+            write_mesh(folder / f"hemi-{hemi}_space-thickness_midthickness.surf.gii", mesh)
+    return GroupResults(folder=folder, record={"comparison": {"pair": None}}, _tables=tables)
+
+
+def write_mesh(path, mesh):
+    triangles = mesh.triangles.astype(np.int32)
+    path.write_bytes(
+        surface_bytes(mesh.points, triangles, hemi=path.name[5], secondary=None, unfolded=False)
     )
-    names = ("Sub", "CA1") if mesh is None else ()
-    one = SimpleNamespace(
-        fits={"thickness": SimpleNamespace(tests=tests)},
-        maps=SimpleNamespace(shape=shape, mesh=mesh, names=names, rows=np.arange(4)),
-        used=np.arange(4),
-        subfield=fields.astype(np.int64),
-        parts=lambda _, own: [random.normal(2, 0.1, (int(own.sum()), points))],
-    )
-    found = {
-        MapKey("thickness", test.contrast.name, hemi): Discoveries(
-            adjusted=np.where(flags, 0.001, 0.5),
-            rejected=flags,
-            cutoff=0.01,
-            n_tests=points,
-            alpha=0.05,
-        )
-        for test in tests
-        for hemi in sides
-        for flags in [np.asarray(survive) if hemi == "L" else np.zeros(points, dtype=bool)]
-    }
-    table = pd.DataFrame({"group": [groups[n % len(groups)] for n in range(4)]})
-    analysis = SimpleNamespace(
-        fitted=dict.fromkeys(sides, one),
-        found=found,
-        compared=SimpleNamespace(table=table),
-        groups=SimpleNamespace(column="group", levels=groups),
-        comparison=SimpleNamespace(pair=None, longitudinal=False),
-    )
-    cohort = SimpleNamespace(
-        x=np.linspace(-0.9, 0.9, GRID[0]),
-        y=np.linspace(-0.9, 0.9, GRID[1]),
-        units={"thickness": "mm"},
-    )
-    return cohort, analysis
 
 
 def shapes_of(sides="LR"):
-    """A bent wall on each side."""
+    """The middle of a bent wall on each side."""
     u, y = np.meshgrid(np.linspace(0, np.pi, GRID[0]), np.linspace(-15, 15, GRID[1]), indexing="ij")
-    shapes = {}
-    for hemi in sides:
-        lateral = 1 if hemi == "R" else -1
-        layers = [
-            np.stack([lateral * r * np.sin(u), y, -r * np.cos(u)], axis=-1) for r in (4.0, 5.0, 6.0)
-        ]
-        shapes[hemi] = AverageShape(mean=np.array(layers), by_group={}, counts={})
-    return shapes
+    triangles = sheet_triangles(*GRID).astype(np.int64)
+    return {
+        hemi: Mesh(
+            points=np.stack([lateral * 5 * np.sin(u), y, -5 * np.cos(u)], axis=-1).reshape(-1, 3),
+            triangles=triangles,
+        )
+        for hemi in sides
+        for lateral in [1 if hemi == "R" else -1]
+    }
 
 
-def drawn(case, shapes=None):
-    files = encode("maps", lambda: draw_measure(*case, shapes or {}, {}, "thickness"))
-    return dict(files)
+def draw(results):
+    return draw_measure(results, "thickness", {})
+
+
+def drawn(results):
+    return dict(encode("maps", lambda: draw(results)))
 
 
 def maps_of(figure):
@@ -214,9 +228,8 @@ NONE = np.zeros(GRID[0] * GRID[1], dtype=bool)
 SOME = np.arange(GRID[0] * GRID[1]) < 40
 
 
-def test_the_threshold_is_drawn_exactly_where_something_survives():
-    cohort, analysis = measured(SOME)
-    (figure,) = draw_measure(cohort, analysis, shapes_of(), {}, "thickness")
+def test_the_threshold_is_drawn_exactly_where_something_survives(tmp_path):
+    (figure,) = draw(measured(tmp_path, SOME))
     maps = maps_of(figure)
     assert set(maps) == {
         f"map-{kind}-{n}-{hemi}"
@@ -226,32 +239,41 @@ def test_the_threshold_is_drawn_exactly_where_something_survives():
     enclosed = {name for name, axes in maps.items() if bold_lines(axes)}
     assert enclosed == {"map-effect-0-L", "map-significance-0-L"}
     (line,) = bold_lines(maps["map-effect-0-L"])
-    inside = [path.contains_points(grid_of(cohort)) for path in line.get_paths()]
+    inside = [path.contains_points(nodes()) for path in line.get_paths()]
     np.testing.assert_array_equal(np.any(inside, axis=0), SOME)
     titles = [text.get_text() for text in figure.texts]
     assert "Significant: 40 left, 0 right of 147 points" in titles
     words = {"Left", "Right", "unfolded", "superior", "inferior", "a", "b", "c", "d"}
     assert words | {"medial", "lateral", "med.", "lat.", "anterior", "posterior"} <= set(titles)
-    names = [text.get_text() for text in maps["map-mean-0-R"].texts]
-    assert names == ["Sub", "CA1"]
-    cohort, analysis = measured(NONE)
-    (figure,) = draw_measure(cohort, analysis, {}, {}, "thickness")
+    assert titles.count("Sub") == titles.count("CA1") == 2  # below each side
+    (borders,) = [c for c in maps["map-mean-0-R"].collections if isinstance(c, LineCollection)]
+    between = np.concatenate(borders.get_segments())
+    np.testing.assert_allclose(between[:, 0], -0.9 + 6.5 / 20 * 1.8)  # nodes 7 and 8
+    (figure,) = draw(measured(tmp_path, NONE))
     assert not any(bold_lines(axes) for axes in maps_of(figure).values())
 
 
-def grid_of(cohort):
-    return np.stack(np.meshgrid(cohort.x, cohort.y, indexing="ij"), axis=-1).reshape(-1, 2)
+def nodes():
+    x, y = (np.linspace(-0.9, 0.9, n) for n in GRID)
+    return np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
 
 
-def test_sizes_and_type_are_those_of_journals():
+def test_colors_of_means_span_what_is_shown(tmp_path):
+    results = measured(tmp_path, SOME)
+    (figure,) = draw(results)
+    (image,) = maps_of(figure)["map-mean-1-L"].images
+    means = results.table("means")["mean"]
+    assert image.get_clim() == pytest.approx(np.percentile(means, (1, 99)))
+
+
+def test_sizes_and_type_are_those_of_journals(tmp_path):
     """Both sides with surfaces take two columns of a page, all else takes one."""
-    for sides, shapes, width in (
-        ("LR", shapes_of(), 180),
-        ("LR", {}, 85),
-        ("L", shapes_of("L"), 85),
+    for number, (sides, surface, width) in enumerate(
+        (("LR", True, 180), ("LR", False, 85), ("L", True, 85))
     ):
-        cohort, analysis = measured(SOME, sides)
-        (figure,) = draw_measure(cohort, analysis, shapes, {}, "thickness")
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        (figure,) = draw(measured(folder, SOME, sides, surface=surface))
         inches = figure.get_size_inches()
         assert inches[0] * 25.4 == pytest.approx(width, abs=0.05)
         assert inches[1] * 25.4 <= 235.5
@@ -262,11 +284,11 @@ def test_sizes_and_type_are_those_of_journals():
         assert {text.get_fontsize() for text in texts} == {7.0, 8.0, 9.0}
 
 
-def test_files_are_the_same_each_time_and_small(monkeypatch):
-    first = drawn(measured(SOME, "L"), shapes_of("L"))
+def test_files_are_the_same_each_time_and_small(tmp_path, monkeypatch):
+    first = drawn(measured(tmp_path, SOME, "L"))
     assert [name.rpartition(".")[2] for name in first] == ["png", "svg", "pdf"]
     monkeypatch.setattr("time.time", lambda: 1e9)
-    assert drawn(measured(SOME, "L"), shapes_of("L")) == first
+    assert drawn(measured(tmp_path, SOME, "L")) == first
     picture = Image.open(io.BytesIO(first["maps.png"]))
     assert picture.width == 1004  # 85 mm
     assert max(map(len, first.values())) < 1e6
@@ -289,11 +311,14 @@ def words_of(printed):
     return {b"".join(re.findall(rb"\x00([^\x00()])", line)).decode() for line in lines}
 
 
-def test_both_sides_and_both_views_are_seen():
+def pictures_of(figure):
+    return [image.get_array() for image in figure.findobj(BboxImage)]
+
+
+def test_both_sides_and_both_views_are_seen(tmp_path):
     """Each view is a picture of its own, colored, and not clipped by its box."""
-    cohort, analysis = measured(SOME)
-    (figure,) = draw_measure(cohort, analysis, shapes_of(), {}, "thickness")
-    pictures = [image.get_array() for image in figure.images]
+    (figure,) = draw(measured(tmp_path, SOME))
+    pictures = pictures_of(figure)
     assert len(pictures) == 4 * 4
     for picture in pictures:
         inked = picture[..., 3] > 0  # all around is clear
@@ -303,37 +328,44 @@ def test_both_sides_and_both_views_are_seen():
     assert len({picture.tobytes() for picture in pictures[:4]}) == 4
 
 
-def test_many_contrasts_are_split_into_pages():
-    cohort, analysis = measured(SOME, groups=("CN", "MCI", "AD"), contrasts=3)
-    figures = draw_measure(cohort, analysis, {}, {}, "thickness")
+def test_many_contrasts_are_split_into_pages(tmp_path):
+    figures = draw(measured(tmp_path, SOME, groups=("CN", "MCI", "AD"), contrasts=3, surface=False))
     kinds = [[name.split("-")[1] for name in maps_of(f) if name.endswith("L")] for f in figures]
     assert kinds == [["mean"] * 3 + ["effect", "significance"], ["effect", "significance"] * 2]
     assert all(figure.get_figheight() * 25.4 < 236 for figure in figures)
 
 
-def test_effects_without_sign_begin_at_zero():
-    cohort, analysis = measured(SOME, kind="F")
-    (figure,) = draw_measure(cohort, analysis, {}, {}, "thickness")
-    labels = {axes.get_ylabel(): axes.get_ylim() for axes in figure.axes if axes.get_ylabel()}
-    assert labels["partial eta squared"][0] == 0.0
-    assert labels["corrected p"][0] == 0.0
+def test_effects_without_sign_begin_at_zero(tmp_path):
+    (figure,) = draw(measured(tmp_path, SOME, kind="F", surface=False))
+    words = [text.get_text() for text in figure.texts]
+    assert {"partial eta squared", "corrected p"} <= set(words)
+    bars = [axes.get_ylim() for axes in figure.axes if axes.get_gid() is None]
+    assert [bar[0] for bar in bars[2:]] == [0.0, 0.0]  # after those of the means
 
 
-def test_the_threshold_is_drawn_on_other_programs_flat_surfaces():
+def test_the_threshold_is_drawn_on_other_programs_flat_surfaces(tmp_path):
     flat, _ = surface(20.0, 8.0, 0.0)
-    cohort, analysis = measured(flat.points[:, 0] > 2, "L", mesh=flat)
-    (figure,) = draw_measure(cohort, analysis, {}, {}, "thickness")
+    (figure,) = draw(measured(tmp_path, flat.points[:, 0] > 2, "L", mesh=flat))
     enclosed = {name for name, axes in maps_of(figure).items() if bold_lines(axes)}
     assert enclosed == {"map-effect-0-L", "map-significance-0-L"}
 
 
-def test_a_folded_surface_of_other_programs_is_seen_from_above_and_below():
-    shape = shapes_of("L")["L"].middle
+def test_a_folded_surface_of_other_programs_is_seen_from_above_and_below(tmp_path):
+    shape = shapes_of("L")["L"]
     survive = np.arange(len(shape.points)) < 40
-    cohort, analysis = measured(survive, "L", mesh=shape)
-    (figure,) = draw_measure(cohort, analysis, {}, {}, "thickness")
+    (figure,) = draw(measured(tmp_path, survive, "L", mesh=shape))
     assert maps_of(figure) == {}
-    assert len(figure.images) == 4 * 2
+    assert len(pictures_of(figure)) == 4 * 2
+
+
+def test_pictures_keep_their_size_at_other_resolutions(tmp_path):
+    results = measured(tmp_path, SOME, "L")
+    shown = []
+    for dpi in (150, 300):
+        files = dict(encode("maps", lambda: draw(results), ["png"], dpi))
+        picture = Image.open(io.BytesIO(files["maps.png"])).convert("L")
+        shown.append(np.asarray(picture.resize((50, 120)), dtype=float))
+    assert np.abs(shown[0] - shown[1]).mean() < 4  # of 255: lines and letters differ a little
 
 
 def test_legends_of_curves_are_beside_them_and_small_groups_have_no_calibration():
@@ -352,15 +384,33 @@ def test_legends_of_curves_are_beside_them_and_small_groups_have_no_calibration(
         cases.append((hemi, "thickness_mean", ("CN", "AD"), model))
     fields = dict.fromkeys(Analysis.__dataclass_fields__)
     analysis = Analysis(**{**fields, "pairs": cases[:2]})
-    for draw in (draw_roc, draw_calibration):
-        (figure,) = draw(analysis)
-        figure.draw_without_rendering()
+    keys = {"control": "CN", "case": "AD", "added": "thickness_mean"}
+    areas = {f"auc_{name}{end}": 0.6 for name in ("base", "full")
+             for end in ("", "_low", "_high", "_cv")}  # fmt: skip
+    points = dict(zip(("false_positives", "true_positives"), one.curve, strict=True))
+    tables = {
+        "classification": pd.DataFrame(
+            [{"hemi": hemi, **keys, **areas, "separated": False} for hemi in "LR"]
+        ),
+        "roc": pd.concat(
+            pd.DataFrame({"hemi": hemi, **keys, "classifier": name, **points})
+            for hemi in "LR"
+            for name in ("base", "full")
+        ),
+    }
+    saved = GroupResults(folder=Path(), record={}, _tables=tables)
+    for figures in (partial(draw_roc, saved), partial(draw_calibration, analysis)):
+        with style():
+            (figure,) = figures()
+            figure.draw_without_rendering()
         first, second, beside = figure.axes
         legend = beside.get_legend().get_window_extent()
         assert not legend.overlaps(first.get_window_extent())
         assert not legend.overlaps(second.get_window_extent())
         assert legend.y0 >= 0  # not cut off
         assert legend.x1 <= figure.bbox.width
+    (figure,) = draw_roc(saved)
+    np.testing.assert_allclose(figure.axes[0].lines[2].get_xydata(), np.transpose(one.curve))
     (figure,) = draw_calibration(Analysis(**{**fields, "pairs": cases}))
     assert [axis.get_title() for axis in figure.axes] == ["left", "right", ""]
 

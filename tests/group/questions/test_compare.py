@@ -11,12 +11,12 @@ import pandas as pd
 import pytest
 from PIL import Image
 from pyarrow import parquet
-from small_cohorts import GROUPS, NODES, PLAN, place_of, table, write_dataset
+from small_cohorts import GROUPS, NODES, PLAN, methods_of, place_of, table, write_dataset
 
 from hipsta_bids.cli.main import main
 from hipsta_bids.group.cohort import read
 from hipsta_bids.group.cohort.collect import GroupRequest
-from hipsta_bids.group.design.formula import Contrast
+from hipsta_bids.group.design.contrasts import Contrast
 from hipsta_bids.group.design.model import ModelRequest
 from hipsta_bids.group.design.settings import GlmSettings
 from hipsta_bids.group.output import write
@@ -37,7 +37,7 @@ def dataset(tmp_path_factory):
 @pytest.fixture(scope="module")
 def results(dataset, quick):
     data, out = dataset
-    assert main([str(data), str(out), "group", *quick]) == 0
+    assert main([str(data), str(out), "group", *quick, "--figures"]) == 0
     return out / "group" / MODEL
 
 
@@ -129,7 +129,7 @@ def test_findings_are_counted_with_and_without_registration(results):
     assert (with_it.n_unregistered != with_it.n_significant).any()
     moved = pd.read_table(results / "registration.tsv")
     assert (moved.difference_p < 0.05).all()
-    assert "largest difference of mean displacement between groups" in (
+    assert "largest difference of mean displacement between groups was" in (
         (results / "methods.md").read_text()
     )
 
@@ -146,18 +146,23 @@ def test_maps_file_is_typed_and_has_units(results):
 def test_record_and_methods_have_the_numbers(results, dataset, quick):
     record = json.loads((results / "analysis.json").read_text())
     data, out = dataset
-    assert record["command"] == ["hipsta-bids", str(data), str(out), "group", *quick]
+    command = ["hipsta-bids", str(data), str(out), "group", *quick, "--figures"]
+    assert record["command"] == command
     assert record["participants"] == sum(PLAN.sizes)
     assert record["references"]["group"] == GROUPS[0]
     assert record["settings"]["classification"]["repeats"] == 2
-    text = (results / "methods.md").read_text()
+    text = methods_of(results)
+    registration = table(results / "registration.tsv").set_index("hemi").loc["L"]
+    explained = registration.explained_before, registration.explained_after
     assert f"{PLAN.sizes[0]} CN, {PLAN.sizes[1]} AD" in text
     significant = int(statmap(results, "L").significant.sum())
     assert f"thickness, CN-AD, L: {significant} of" in text
-    assert "fitted (reference levels: group CN, sex F); contrasts: CN-AD." in text
-    assert "the two-stage procedure of Benjamini, Krieger and Yekutieli [3], for each map." in text
-    assert "were registered by alternating fits" in text
+    assert "sheet (reference levels: group CN, sex F). The contrast was CN-AD." in text
+    procedure = "the two-stage procedure of Benjamini, Krieger and Yekutieli [3]"
+    assert f"by {procedure}, over the points of each map." in text
+    assert "B-spline warps were estimated alternately [2]" in text
     assert "with a penalty" not in text
+    assert f"{explained[0]:.0%} before and {explained[1]:.0%} after registration (left)" in text
     model = json.loads((results / "model.json").read_text())
     assert model["BIDSModelVersion"] == "1.0.0"
 
@@ -235,9 +240,9 @@ def test_formula_contrast_reference_and_options(dataset, quick):
     assert record["references"] == {"group": "AD"}
     assert set(record["contrasts"]) == {"slope", "group[AD]-group[CN]"}
     assert not (folder / "template.json").exists()
-    text = (folder / "methods.md").read_text()
+    text = methods_of(folder)
     assert "Maps were not registered to each other." in text
-    assert "the procedure of Benjamini and Hochberg [2], for both hemispheres together." in text
+    assert "Benjamini and Hochberg [2], over the points of both hemispheres." in text
     assert "Wrobel" not in text  # who is not referred to
     maps = table(folder / "maps.tsv")
     assert set(maps.n_tests) == {2 * NODES[0] * NODES[1]}
@@ -357,7 +362,7 @@ def test_figures_are_drawn_as_pictures_and_drawings(results):
 def test_same_run_gives_the_same_files(results, dataset, quick):
     data, out = dataset
     before = {path.name: path.read_bytes() for path in results.rglob("*") if path.is_file()}
-    assert main([str(data), str(out), "group", *quick]) == 0
+    assert main([str(data), str(out), "group", *quick, "--figures"]) == 0
     after = {path.name: path.read_bytes() for path in results.rglob("*") if path.is_file()}
     assert before == after
 

@@ -12,6 +12,7 @@ from scipy import stats
 from small_cohorts import (
     GROUPS,
     PLAN,
+    methods_of,
     place_of,
     table,
     write_dataset,
@@ -81,7 +82,7 @@ def test_permutations_are_in_the_tables_of_the_map(dataset, quick):
         peak = table(folder / "peaks.tsv").query("measure == 'thickness' and hemi == 'L'").iloc[0]
         here = found[(found.x == peak.x) & (found.y == peak.y)].iloc[0]
         assert here.p_corrected == peak.p_corrected
-        text = (folder / "methods.md").read_text()
+        text = methods_of(folder)
         assert "100 permutations" in text
         assert "seed 3" in text
         enhanced = "the largest threshold-free cluster enhancement [" in text
@@ -104,6 +105,11 @@ def test_pooled_family_is_no_less_strict(dataset, quick):
     options = [*quick, *PLAIN, "--correction", "permutation-max", "--permutations", "100"]
     single = run(dataset, *options)
     pooled = run(dataset, *options, "--fdr-scope", "hemispheres")
+    every = run(dataset, *options, "--fdr-scope", "all")
+    overview = table(every / "maps.tsv").query("contrast == 'CN-AD'")
+    assert len(set(overview.n_tests)) == 1
+    assert overview.n_tests.iloc[0] == len(overview) * 147
+    assert "all maps of a contrast" in (every / "methods.md").read_text()
     name = "hemi-{}_contrast-CNAD_desc-thickness_statmap.tsv"
     for hemi in "LR":
         one, both = (table(folder / name.format(hemi)) for folder in (single, pooled))
@@ -146,7 +152,10 @@ def test_two_sessions_give_the_paired_t_test(sessions, quick):
     np.testing.assert_allclose(
         both.statistic, stats.ttest_rel(change["L"], change["R"]).statistic, rtol=1e-6
     )
-    assert "in their own unit. The contrast" in (folder / "methods.md").read_text()
+    assert (
+        "left minus right, in the unit of the measure. Points"
+        in (folder / "methods.md").read_text()
+    )
     # Ten digits are written.
     np.testing.assert_allclose(found.statistic, expected.statistic, rtol=1e-8)
     np.testing.assert_allclose(found.p, expected.pvalue, rtol=1e-8)
@@ -188,9 +197,9 @@ def test_longitudinal_model_finds_the_slopes(sessions, quick, random):
         assert found.se.mean() == pytest.approx(0.0052 if "AD" in contrast else 0.0035, rel=0.35)
         # Sessions of a participant do not count as participants.
         assert (found.df < 90).all()
-    text = (folder / "methods.md").read_text()
+    text = methods_of(folder)
     own = "intercepts" if random else "intercepts and slopes"  # three visits of 30
-    assert f"a linear mixed model with {own} of participants `" in text
+    assert f"It had random {own} of participants, and was estimated by restricted" in text
     assert "30 participants (90 visits)" in text
     # Visits do not count as people.
     measures = table(folder / "measures.tsv")
@@ -222,8 +231,9 @@ def test_default_model_with_a_curve_of_age_tests_it(sessions, quick):
     assert 0.2 < found.statistic.mean() < 3
     assert (found.df < 90).all()
     assert set(table(folder / "peaks.tsv").query("contrast == 'age nonlinear'").test) == {"F"}
-    text = (folder / "methods.md").read_text()
-    assert "Age was in the model with a natural cubic spline; the contrast age nonlinear" in text
+    text = methods_of(folder)
+    assert "modeled with a natural cubic spline. The contrast age nonlinear tested" in text
+    assert "Fai AHT, Cornelius PL" in text  # of tests by F
     assert not (folder / "classification.tsv").exists()
 
 
@@ -234,10 +244,11 @@ def test_permutations_of_repeated_visits_flip_signs_of_participants(sessions, qu
     # The loss of .1 mm per session is in all: none of the other signs gives as much.
     np.testing.assert_allclose(found.p_corrected * 20, (found.p_corrected * 20).round(), atol=1e-6)
     assert found.significant.mean() > 0.9
-    text = (folder / "methods.md").read_text()
-    assert "permutations within levels of sex of the residuals" in text
-    assert "for CN-AD, time in CN-AD, participants with as many visits changed places" in text
-    assert "for time in CN, time in AD, the signs of all visits of a participant" in text
+    text = methods_of(folder)
+    assert "20 permutations within levels of sex (seed 3)" in text
+    assert "Residuals of the linear model without the contrast were permuted" in text
+    exchanged = "participants with the same number of visits were exchanged"
+    assert f"For CN-AD, time in CN-AD, {exchanged}; for time in CN, time in AD, the signs" in text
     share = re.search(r"Slopes differed between participants at (\d+)% of the points", text)
     assert share is not None
     assert int(share[1]) < 50
@@ -345,9 +356,9 @@ def test_w_scores_are_those_of_a_model_without_the_participant(dataset, quick):
     # What counts as low is one in forty of a healthy participant's points.
     assert members.low.mean() == pytest.approx(0.025, abs=0.025)
     assert found[~found.reference].low.mean() > members.low.mean() + 0.02
-    text = (folder / "methods.md").read_text()
-    assert "against 16 with group CN" in text
-    assert "with the uncertainty of the model, is below 0.05." in text
+    text = methods_of(folder)
+    assert "against 16 participants with group CN." in text
+    assert "including the uncertainty of the model, was below 0.05." in text
 
 
 def test_w_scores_say_what_is_wrong_with_their_reference(dataset, capsys):

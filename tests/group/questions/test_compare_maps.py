@@ -28,7 +28,7 @@ from small_cohorts import (
 )
 
 from hipsta_bids.cli.main import main
-from hipsta_bids.group.design.formula import Contrast
+from hipsta_bids.group.design.contrasts import Contrast
 from hipsta_bids.group.design.settings import GlmSettings
 from hipsta_bids.group.output import write
 from hipsta_bids.group.stats.glm import fit_points
@@ -166,13 +166,14 @@ def test_results_without_sheets_are_complete(alone):
     assert any("30 L, 29 R of 30 visits, 160, 140 points" in note for note in record["notes"])
     text = (alone / "methods.md").read_text()
     assert "without registration" in text
-    assert "map of hipp" in text
+    assert f"Maps of hipp of {COUNT} participants were analyzed" in text
+    assert "Diers K" not in text  # whose sheets are not among the maps
     surface = nib.load(alone / "hemi-L_space-hipp_midthickness.surf.gii")
     assert surface.darrays[0].data.shape == (160, 3)
     shape = nib.load(alone / "hemi-L_contrast-CNAD_stat-t_desc-hipp_statmap.shape.gii")
     np.testing.assert_allclose(shape.darrays[0].data, statmap(alone, "L").statistic, rtol=1e-5)
     assert not (alone / "warps.tsv").exists()
-    assert {path.stem for path in (alone / "figures").glob("*.png")} == {"hipp_maps"}
+    assert {path.stem for path in (alone / "figures").glob("*.svg")} == {"hipp_maps"}
     for path in alone.glob("*_statmap.json"):
         assert "vertex" in json.loads(path.read_text())
     page = group_page(alone)

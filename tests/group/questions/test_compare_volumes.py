@@ -2,7 +2,9 @@
 
 import json
 import shutil
+from html import unescape
 
+import numpy as np
 import pandas as pd
 import pytest
 from small_cohorts import (
@@ -17,6 +19,8 @@ from small_cohorts import (
 from hipsta_bids.cli.main import main
 from hipsta_bids.group.output import write
 from hipsta_bids.io import files
+from hipsta_bids.reports.cells import number_text
+from hipsta_bids.reports.group import group_page
 
 SIDES = {"L": ("lh", "left"), "R": ("rh", "right")}
 COUNT = sum(PLAN.sizes)
@@ -181,3 +185,69 @@ def test_wrong_tables_are_refused_in_one_line(study, capsys, options, code, word
     assert error.count("\n") == 1
     assert words in error
     assert not (study / "out" / "group").exists()
+
+
+def with_summaries(study, changes):
+    """Plant differences of the patients: (mm, mm3) by hemisphere, of thickness and volume."""
+    random = np.random.default_rng(5)
+    for subject, group, *_ in read_participants(study / "bids"):
+        for hemi, (thicker, larger) in changes.items():
+            path = place_of(study / "out", subject.removeprefix("sub-"), hemi).path("summary")
+            header, row = (line.split("\t") for line in path.read_text().splitlines())
+            cells = dict(zip(header, row, strict=True))
+            patient = group == GROUPS[1]
+            thickness = 1.8 + 0.05 * random.standard_normal() + thicker * patient
+            volume = 500.0 + 20.0 * random.standard_normal() + larger * patient
+            cells |= {"thickness_mean": f"{thickness:.4f}", "volume": f"{volume:.2f}"}
+            files.write_tsv(path, header, [list(cells.values())])
+
+
+def opposite(study, capsys):
+    """Return notes on opposite changes, which record, methods text, page and output share."""
+    folder, words = study / "out" / "group" / "group-age-sex", "change in opposite directions"
+    notes = [n for n in files.read_json(folder / "analysis.json")["notes"] if words in n]
+    page = group_page(folder)
+    start = page.index('<section id="group-found"')
+    texts = [
+        (folder / "methods.md").read_text(),
+        unescape(page[start : page.index("</section>", start)]),
+        capsys.readouterr().out,
+    ]
+    for text in texts:
+        assert text.count(words) == len(notes)
+        assert all(note in text for note in notes)
+    return notes
+
+
+def test_a_thicker_sheet_of_less_volume_is_noted_with_possible_causes(study, capsys):
+    with_summaries(study, {"L": (0.1, -40.0), "R": (0.0, -40.0)})
+    assert run(study, "--no-classification") == 0
+    rows = measures(study).set_index(["measure", "hemi"])
+    assert (rows.p_fdr["volume"] < 0.05).all()
+    assert rows.p_fdr["thickness_mean", "L"] < 0.05 <= rows.p_fdr["thickness_mean", "R"]
+    (note,) = opposite(study, capsys)
+    volume, thickness = (rows.effect_size[name, "L"] for name in ("volume", "thickness_mean"))
+    assert volume > 0 > thickness
+    assert note.startswith("CN-AD: volume and mean thickness change in opposite directions (left")
+    sizes = [number_text(size) for size in (volume, thickness)]
+    assert f"(left: volume d {sizes[0]}, thickness_mean d {sizes[1]}" in note
+    assert "right" not in note
+    assert "Possible causes: labels that miss thin edges" in note
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        pytest.param((-0.1, -40.0), id="both fall"),
+        pytest.param((0.1, 40.0), id="both rise"),
+        pytest.param((0.0, -40.0), id="thickness stays"),
+        pytest.param((0.1, 0.0), id="volume stays"),
+    ],
+)
+def test_no_note_on_opposite_changes_otherwise(study, capsys, changes):
+    with_summaries(study, dict.fromkeys("LR", changes))
+    assert run(study, "--no-classification") == 0
+    rows = measures(study).set_index(["measure", "hemi"])
+    for name, change in zip(("thickness_mean", "volume"), changes, strict=True):
+        assert ((rows.p_fdr[name] < 0.05) == (change != 0.0)).all()
+    assert opposite(study, capsys) == []

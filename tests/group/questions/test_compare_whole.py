@@ -51,8 +51,7 @@ def only_maps(*given):
 def folder(tmp_path_factory):
     root = tmp_path_factory.mktemp("whole")
     data, out = write_dataset(root, region=REGION, plan=IN_HEAD, known=known_nodes())
-    with pytest.MonkeyPatch.context() as patch:  # figures as the page shows them alone
-        patch.setattr(figures, "_METADATA", {"svg": {"Date": None, "Creator": None}})
+    with pytest.MonkeyPatch.context() as patch:
         patch.setattr(write, "draw_figures", only_maps)
         assert main([str(data), str(out), "group", "--region", REGION, *QUICK, *EXPORT]) == 0
     return out / "group" / f"thickness_group_{REGION}"
@@ -105,7 +104,7 @@ def test_what_is_experimental_is_said(folder):
     assert "Region whole is experimental." in page
     text = (folder / "methods.md").read_text()
     assert "the whole hippocampus on one sheet (experimental)" in text
-    assert "No value was imputed" in text
+    assert "Missing values were not imputed" in text
 
 
 def test_figures_show_how_many_have_a_value(folder):

@@ -37,7 +37,7 @@ def _only_what_counts():
     """Figures and classifiers take longer than all else."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(write, "draw_figures", lambda *_: iter(()))
-        patch.setattr(write, "write_figures", lambda *_: [])
+        patch.setattr(write, "write_figures", lambda *_, **__: [])
         patch.setattr(analysis, "classify_groups", lambda *_: ([], []))
         yield
 
@@ -302,6 +302,18 @@ def test_sites_that_differ_are_refused_by_name(plain, tmp_path, capsys, change, 
     assert said in error
     assert error.count("\n") == 1
     assert not (tmp_path / "out").exists()
+
+
+def test_sites_with_other_segmentations_are_named(plain, tmp_path, capsys):
+    kinds = [json.loads(path.read_text())["labels"]["version"] for path in plain]
+    assert kinds[0] == kinds[1], "no note without a reason"
+    other = edited(plain[1], tmp_path / "other.json", labels=lambda kind: kind | {"version": ["9"]})
+    for summary, expected in ((plain[1], 0), (other, 1)):
+        assert main(["meta", str(plain[0]), str(summary), str(tmp_path / "out")]) == 0
+        note = f"labels of sites differ in version: {kinds[0][0]} at a; 9 at b"
+        assert capsys.readouterr().out.count(note) == expected
+    record = (tmp_path / "out" / "meta" / "meta.json").read_text()
+    assert note in record
 
 
 def test_contrasts_that_mean_something_else_are_refused(plain, tmp_path, capsys):

@@ -12,6 +12,7 @@ from pyarrow import parquet
 from small_cohorts import (
     NODES,
     begin_dataset,
+    methods_of,
     place_of,
     read_participants,
     table,
@@ -21,7 +22,8 @@ from small_cohorts import (
 
 from hipsta_bids.cli.main import main
 from hipsta_bids.group.cohort.data import Cohort, Measures
-from hipsta_bids.group.design.formula import Contrast, model_from_shortcut, parse_model
+from hipsta_bids.group.design.contrasts import Contrast
+from hipsta_bids.group.design.formula import model_from_shortcut, parse_model
 from hipsta_bids.group.design.model import Comparison
 from hipsta_bids.group.design.settings import GlmSettings, GroupSettings
 from hipsta_bids.group.output import write
@@ -79,7 +81,9 @@ def results(study, quick):
         patch.setattr(
             write,
             "draw_figures",
-            lambda cohort, analysis, _: [("sites", partial(draw_sites, cohort, analysis))],
+            lambda _, cohorts, analyses, *__: [
+                ("sites", partial(draw_sites, cohorts[""], analyses[""]))
+            ],
         )
         assert main([str(data), str(out), "group", "--harmonize", "site", *quick]) == 0
     return out / "group" / MODEL
@@ -128,10 +132,10 @@ def test_record_text_and_page_say_what_was_done(results):
     assert record["participants"] == {"A": 18, "B": 18}
     assert record["formula"] == "group + age + sex"
     assert record["classified"] is False
-    text = (results / "methods.md").read_text()
-    assert "keeps `group + age + sex`" in text
-    assert "site is also a factor of the model, which costs 1 degree of freedom. Without" in text
-    assert "Classifiers were given the measures before harmonization" in text
+    text = methods_of(results)
+    assert "and preserved `group + age + sex`." in text
+    assert "site was also a factor of the model, at a cost of 1 degree of freedom" in text
+    assert "Classifiers used the measures before harmonization" in text
     page = group_page(results)
     assert 'id="group-harmonization"' in page
     assert "Sites before and after harmonization" in page
@@ -167,9 +171,9 @@ def test_saved_effects_give_the_same_maps_again(results, study, quick):
         table(again / name).estimate, table(results / name).estimate, atol=0.02
     )
     assert set(table(again / "sites.tsv").estimated) == {False}
-    text = (again / "methods.md").read_text()
-    assert "Parameters of 2 of these were from an earlier analysis." in text
-    assert "degree of freedom. Without it" not in text
+    text = methods_of(again)
+    assert "Parameters of 2 levels were taken from an earlier analysis." in text
+    assert "at a cost of" not in text
     assert files.read_json(again / "harmonization.json")["Sites"] == {"A": 18, "B": 18}
 
 
@@ -205,8 +209,8 @@ def test_repeated_sessions(tmp_path, quick, capsys):
     sites = table(folder / "sites.tsv")
     own = sites[(sites.measure == "thickness") & (sites.hemi == "L")].set_index("site")
     assert own.site_shift["B"] - own.site_shift["A"] == pytest.approx(SHIFT, abs=0.06)
-    text = (folder / "methods.md").read_text()
-    assert "Participants had random intercepts" in text
+    text = methods_of(folder)
+    assert "Random intercepts of participants were preserved" in text
     assert json.loads((folder / "harmonization.json").read_text())["Repeated"] is True
 
     assert main([*call, "--paired", "1", "2"]) == 0
@@ -433,7 +437,7 @@ def test_classifiers_get_measures_whose_parameters_do_not_know_the_groups(study,
     assert main([*call, "--harmonize-model", saved, "--name", "fair"]) == 0
     fair = out / "group" / "fair"
     assert json.loads((fair / "analysis.json").read_text())["harmonization"]["classified"] is True
-    assert "Classifiers were given" not in (fair / "methods.md").read_text()
+    assert "Classifiers used" not in (fair / "methods.md").read_text()
     areas = [table(folder / "classification.tsv").auc_base for folder in (fair, results)]
     # Volumes are larger at site B, which has most of AD, whose volumes are smaller.
     assert (areas[0] > areas[1]).all()

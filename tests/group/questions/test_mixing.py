@@ -325,9 +325,49 @@ def test_norms_and_scores(tmp_path, capsys):
     score = [*command, "--norms", str(folder / "norms.json")]
     assert main(score) == ExitCode.BAD_DATA
     assert "differ in atlas" in said(capsys)
-    settle(lambda _: OTHER)
+    settle(lambda _: USUAL)  # one of the two kinds that the norms rest on
     assert main(score) == ExitCode.OK
     assert "differ in" not in said(capsys)
+    settle(lambda _: USUAL | {"version": "v21", "voxel_size": "0.34 x 0.34 x 0.34"})
+    assert main(score) == ExitCode.BAD_DATA
+    line = said(capsys)
+    assert f"differ in version: v21, but v22 in {folder / 'norms.json'};" in line
+    assert "voxel_size" not in line, "edges within 5 % are alike"
+    assert main([*score, "--mixed", "version"]) == ExitCode.OK
+    assert "version: v21, but v22 in" in said(capsys)
+
+
+def test_effects_of_sites_of_another_kind(tmp_path, capsys):
+    """Effects of sites that were estimated from other segmentations are refused."""
+    data, out = write_people(tmp_path / "sites", {"A": 12, "B": 12}, 1)
+    paths = sorted(out.rglob("*_desc-qc_metrics.json"))
+
+    def settle(origin):
+        for path in paths:
+            path.write_text(json.dumps(json.loads(path.read_text()) | {"provenance": origin}))
+
+    settle(USUAL)
+    command = [
+        str(data),
+        str(out),
+        "group",
+        "--formula",
+        "thickness_mean ~ age + C(site)",
+        "--no-reports",
+    ]
+    command += ["--align", "none"]
+    assert main([*command, "--harmonize", "site", "--name", "first"]) == ExitCode.OK
+    saved = out / "group" / "first" / "harmonization.json"
+    assert files.read_json(saved)["Labels"]["analysis"] == ["T1"]
+    settle(USUAL | {"analysis": "T1-T2"})
+    again = [*command, "--harmonize-model", str(saved), "--name", "second"]
+    assert main(again) == ExitCode.BAD_DATA
+    assert f"differ in analysis: T1-T2, but T1 in {saved};" in said(capsys)
+    assert main([*again, "--mixed", "analysis"]) == ExitCode.OK
+    second = files.read_json(saved.parents[1] / "second" / "harmonization.json")
+    assert second["Labels"]["analysis"] == ["T1", "T1-T2"]
+    settle(USUAL)
+    assert main(again) == ExitCode.OK
 
 
 def test_tests_are_those_of_participants(tmp_path, call):

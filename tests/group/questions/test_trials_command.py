@@ -107,7 +107,7 @@ def test_retest_registers_sheets_as_comparisons_do_and_draws_them(dataset):
     nodes = [f"node_{i + 1}" for i in range(NODES[0])]
     np.testing.assert_allclose(written[nodes], warps, atol=1e-9)
     assert (folder / "template.json").is_file()
-    assert (folder / "figures" / "thickness_retest.png").is_file()
+    assert (folder / "figures" / "thickness_retest.svg").is_file()
     page = group_page(folder)
     assert "Thickness: agreement between sessions at each point" in page
     assert page.count("data:image/svg+xml") == 1
@@ -168,7 +168,7 @@ def test_sample_size_of_slowing_among_patients_draws_a_map(dataset):
     assert ticks == sorted({*ticks} & {20, 30, 50, 100, 200, 300, 500, 1000, 2000, 3000, 5000})
     assert per_arm.min() <= ticks[0] < ticks[-1] <= per_arm.max()
     text = (folder / "methods.md").read_text()
-    assert "25 % of the change over time is prevented, with a power of 0.9" in text
+    assert "a power of 0.9. In this trial, treatment prevents 25 % of the change over time." in text
     assert "`time + age_first + sex`" in text
     page = group_page(folder)
     assert "Visits: months 0, 12, 24" in page
@@ -210,7 +210,7 @@ def test_maps_of_other_programs_lie_on_their_surface(tmp_path):
     np.testing.assert_allclose(sizes.sd_endpoint, total, rtol=1e-5)
     assert (folder / "hemi-L_space-hipp_midthickness.surf.gii").is_file()
     text = (folder / "methods.md").read_text()
-    assert "(hipp) were taken as they are" in text
+    assert "(hipp) were analyzed without registration" in text
     assert "could not be made" not in group_page(folder)
 
 

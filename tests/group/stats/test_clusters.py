@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from hipsta_bids.group.design.formula import Contrast
+from hipsta_bids.group.design.contrasts import Contrast
 from hipsta_bids.group.design.settings import GlmSettings, MultiplicitySettings
 from hipsta_bids.group.output.columns import Frame, find_clusters, peak_table
 from hipsta_bids.group.stats import clusters
@@ -235,7 +235,7 @@ def test_f_tests_report_eta_squared_and_empty_maps_nothing():
     assert peak_table(blank, control_fdr(blank.p, 0.05), FRAME, EDGES).empty
 
 
-def test_families_are_maps_or_both_hemispheres():
+def test_families_are_maps_hemispheres_or_all_maps_of_a_contrast():
     random = np.random.default_rng(1)
     maps = {
         MapKey("thickness", "group", "L"): random.random(np.prod(SHAPE)) * 1e-4,
@@ -254,6 +254,13 @@ def test_families_are_maps_or_both_hemispheres():
     np.testing.assert_array_equal(both[right].rejected, pooled.rejected[1])
     assert both[right].cutoff == pooled.cutoff
     np.testing.assert_array_equal(both[age].adjusted, each[age].adjusted)
+    more = maps | {MapKey("curvature", "group", "L"): random.random(np.prod(SHAPE))}
+    every = discover(more, MultiplicitySettings(scope="all"))
+    of_group = [key for key in more if key.contrast == "group"]
+    pooled = control_fdr(np.stack([more[key] for key in of_group]), 0.05)
+    for key, adjusted in zip(of_group, pooled.adjusted, strict=True):
+        np.testing.assert_array_equal(every[key].adjusted, adjusted)
+    np.testing.assert_array_equal(every[age].adjusted, each[age].adjusted)
     single = discover(maps, MultiplicitySettings(method="bh"))
     expected = control_fdr(maps[left], 0.05, "bh")
     np.testing.assert_array_equal(single[left].adjusted, expected.adjusted)

@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 from hipsta_bids.errors import ModelError
-from hipsta_bids.group.design.formula import Contrast
+from hipsta_bids.group.design.contrasts import Contrast
 from hipsta_bids.group.design.settings import GlmSettings
 from hipsta_bids.group.stats.glm import f_limits, fit_measures, fit_points, t_limits
 

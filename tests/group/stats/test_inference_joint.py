@@ -7,9 +7,9 @@ from scipy import stats
 from small_cohorts import table, write_dataset
 
 from hipsta_bids.cli.main import main
-from hipsta_bids.group.design.formula import Contrast
+from hipsta_bids.group.design.contrasts import Contrast
 from hipsta_bids.group.design.settings import GlmSettings, MultiplicitySettings
-from hipsta_bids.group.output import write
+from hipsta_bids.group.output import figures, write
 from hipsta_bids.group.stats.clusters import sheet_edges
 from hipsta_bids.group.stats.glm import fit_points
 from hipsta_bids.group.stats.inference import PermutationPart, combine_evidence, permute
@@ -78,7 +78,11 @@ def dataset(tmp_path_factory):
 @pytest.fixture(autouse=True)
 def _no_figures(monkeypatch):
     """Figures of single measures take longer than all else."""
-    monkeypatch.setattr(write, "draw_figures", lambda *_: iter(()))
+    monkeypatch.setattr(write, "draw_figures", only_joint)
+
+
+def only_joint(*given):
+    return ((name, draw) for name, draw in figures.draw_figures(*given) if name == "joint_maps")
 
 
 def run(dataset, quick, *options):
@@ -117,8 +121,7 @@ def test_joint_test_is_in_all_results(dataset, quick):
     assert list((folder / "figures").glob("joint_maps.*"))
 
 
-def test_both_sides_of_a_measure_together(dataset, quick, monkeypatch):
-    monkeypatch.setattr(write, "draw_joint", lambda *_: [])
+def test_both_sides_of_a_measure_together(dataset, quick):
     how = ["--correction", "permutation-tfce", "--joint-sides"]
     folder = run(dataset, quick, "--joint", "thickness", *how)
     maps = table(folder / "maps.tsv").set_index(["measure", "hemi"])
@@ -127,6 +130,10 @@ def test_both_sides_of_a_measure_together(dataset, quick, monkeypatch):
     assert {"p_thickness_left", "p_thickness_right"} <= set(rows)
     assert maps.n_significant["joint", "both"] > 0
     assert "Both sides:" in group_page(folder)
+    drawing = (folder / "figures" / "joint_maps.svg").read_text()
+    n, tested = maps.n_significant["joint", "both"], maps.n_tests["joint", "both"]
+    assert f">Significant: {n} of {tested} points<" in drawing
+    assert ">Joint evidence, CN-AD<" in drawing
 
 
 def test_maps_of_left_minus_right_together(dataset, quick):

@@ -8,7 +8,7 @@ import pytest
 from scipy import stats
 
 from hipsta_bids.errors import ModelError
-from hipsta_bids.group.design.formula import Contrast
+from hipsta_bids.group.design.contrasts import Contrast
 from hipsta_bids.group.design.settings import GlmSettings, MultiplicitySettings
 from hipsta_bids.group.stats.clusters import sheet_edges
 from hipsta_bids.group.stats.exchangeability import Visits, choose_exchange

@@ -8,7 +8,7 @@ from scipy import stats
 from statsmodels.regression.mixed_linear_model import MixedLM
 
 from hipsta_bids.errors import ModelError
-from hipsta_bids.group.design.formula import Contrast
+from hipsta_bids.group.design.contrasts import Contrast
 from hipsta_bids.group.design.settings import GlmSettings, LongitudinalSettings
 from hipsta_bids.group.stats.glm import fit_points
 from hipsta_bids.group.stats.mixed import CORRELATIONS, MAX_CORRELATION, fit_mixed

@@ -1,0 +1,205 @@
+"""Rows of the figures of maps: means, effects and significance, read from the files of an analysis.
+
+No model is fitted for a figure: what a figure shows is in the tables of its folder.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas as pd
+
+from hipsta_bids.group.output import panels, style
+from hipsta_bids.group.output.ground import read_grounds
+from hipsta_bids.group.output.panels import Row
+from hipsta_bids.group.stats.arrays import Bool, Float
+from hipsta_bids.reports import cells, display, group_maps
+from hipsta_bids.reports.display import parts_of
+from hipsta_bids.reports.group_tables import GroupResults, map_unit, records
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_LEVEL = 0.05
+_LEAST_Z = 4.0  # at the end of the colors of joint evidence
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ContrastMap:
+    """The test of a contrast at each point (points,) of one side."""
+
+    kind: str
+    """``t``, ``F``, or ``z`` of several measures together."""
+    effect: Float
+    statistic: Float
+    df: Float
+    adjusted: Float
+    rejected: Bool
+    alpha: float
+
+
+Tests = Mapping[str, Mapping[str, Mapping[str, ContrastMap]]]
+"""By side, measure and contrast."""
+
+
+def draw_measure(
+    results: GroupResults, measure: str, views: panels.Views, dpi: float = style.DOTS_PER_INCH
+) -> "list[Figure]":
+    """Draw all maps of a measure: one figure, or several where they do not fit a page."""
+    blocks = [[row] for row in mean_rows(results, measure)]
+    blocks += contrast_rows(results, measure)
+    return panels.draw_pages(read_grounds(results, measure), blocks, views=views, dpi=dpi)
+
+
+def contrast_rows(results: GroupResults, measure: str) -> Iterator[list[Row]]:
+    """Show effect sizes and corrected p-values of each contrast of a map that was tested."""
+    return contrasts(read_tests(results), measure)
+
+
+def read_tests(results: GroupResults) -> Tests:
+    """Read the tests of all maps."""
+    settings = results.record.get("settings") or {}
+    alpha = float((settings.get("multiplicity") or {}).get("alpha", _LEVEL))
+    tests: dict[str, dict[str, dict[str, ContrastMap]]] = {}
+    for row in records(results.table("maps")):
+        points, measure = results.table(str(row["file"])), str(row["measure"])
+        kind = group_maps.kind_of_test(measure, points)
+        names = {"statistic": "statistic", "effect": group_maps.EFFECT_COLUMNS[kind]}
+        names |= {"df": "df", "adjusted": "p_corrected"}
+        values = {
+            field: points[name].to_numpy(np.float64) if name in points else np.full(1, np.nan)
+            for field, name in names.items()
+        }
+        rejected = (points["significant"] == True).to_numpy(bool)  # noqa: E712  (may be missing)
+        tests.setdefault(str(row["hemi"]), {}).setdefault(measure, {})[str(row["contrast"])] = (
+            ContrastMap(kind=kind, rejected=rejected, alpha=alpha, **values)
+        )
+    return tests
+
+
+def mean_rows(results: GroupResults, measure: str) -> Iterator[Row]:
+    """Show the mean map of each group, on one scale that the maps span."""
+    means = results.everywhere("means")
+    means = means[means["measure"] == measure] if len(means) else means
+    if not len(means):
+        return
+    comparison = results.record.get("comparison") or {}
+    change, unit = bool(comparison.get("pair")), map_unit(results, measure)
+    is_difference = means["hemi"] == cells.DIFFERENCE
+    for part, difference in ((means[~is_difference], False), (means[is_difference], True)):
+        scale = _mean_scale(measure, part, change=change or difference)
+        title = "mean change" if change else "mean"
+        for index, (group, rows) in enumerate(part.groupby("group", sort=False)):
+            by_side = {str(hemi): own for hemi, own in rows.groupby("hemi", sort=False)}
+            counts = {hemi: int(own["n"].max()) for hemi, own in by_side.items()}
+            number = ", ".join(f"{n} {cells.SIDES[hemi]}" for hemi, n in counts.items())
+            if len(set(counts.values())) == 1:
+                number = f"n = {max(counts.values())}"
+            yield Row(
+                kind="mean",
+                index=index,
+                title=f"{title.capitalize()}, {group} ({number})",
+                label=cells.with_brackets(f"{title},\n{cells.display_name(measure)}", unit),
+                scale=scale,
+                values={hemi: own["mean"].to_numpy(np.float64) for hemi, own in by_side.items()},
+            )
+    yield from _count_rows(results, measure)
+
+
+def _mean_scale(measure: str, means: pd.DataFrame, *, change: bool) -> dict[str, Any]:
+    """Return the colors of means, whose ends are percentiles of all that are shown."""
+    kind = display.kind_of(measure, change=change)
+    low, high = display.span_of(kind, [means["mean"].to_numpy(np.float64)])
+    return {"cmap": kind.colors, "vmin": low, "vmax": high}
+
+
+def _count_rows(results: GroupResults, measure: str) -> Iterator[Row]:
+    """Show how many sheets have a value, where head and tail differ in it."""
+    maps = results.table("maps")
+    first = records(maps[maps["measure"] == measure].drop_duplicates("hemi"))
+    points = {str(row["hemi"]): results.table(str(row["file"])) for row in first}
+    if all("y" in own and parts_of(np.unique(own["y"])) is not None for own in points.values()):
+        counts = {hemi: own["n"].to_numpy(np.float64) for hemi, own in points.items()}
+        yield Row(
+            kind="count",
+            index=0,
+            title="Sheets with a value at each point",
+            label="n",
+            scale={"cmap": "cividis", "vmin": 0, "vmax": max(n.max() for n in counts.values())},
+            values={hemi: np.where(n > 0, n, np.nan) for hemi, n in counts.items()},
+        )
+
+
+def contrasts(
+    every_test: Tests, measure: str, like: Mapping[str, str] | None = None
+) -> Iterator[list[Row]]:
+    """Show effect sizes and corrected p-values of each contrast of a measure.
+
+    Tests of all measures share their colors; ``like`` names contrasts that
+    have the colors of others.
+    """
+    tests = {hemi: own[measure] for hemi, own in every_test.items() if measure in own}
+    signed = {
+        hemi: {
+            name: group_maps.signed_logarithm(test.adjusted, test.statistic)
+            for name, test in own.items()
+        }
+        for hemi, own in tests.items()
+    }
+    top = display.significance_reach([one for own in signed.values() for one in own.values()])
+    for index, name in enumerate(dict.fromkeys(name for own in tests.values() for name in own)):
+        sides = {hemi: own[name] for hemi, own in tests.items() if name in own}
+        first = next(iter(sides.values()))
+        reach = _reach(every_test, first.kind, (like or {}).get(name, name), sides)
+        low, colors, p_colors = display.effect_colors(first.kind)
+        survive = {hemi: test.rejected for hemi, test in sides.items()}
+        word = "Joint evidence" if first.kind == "z" else "Effect"
+        yield [
+            Row(
+                kind="effect",
+                index=index,
+                title=f"{word}, {name}",
+                label=group_maps.EFFECT_NAMES[first.kind],
+                scale={"cmap": colors, "vmin": low * reach, "vmax": reach},
+                values={hemi: test.effect for hemi, test in sides.items()},
+                survive=survive,
+            ),
+            Row(
+                kind="significance",
+                index=index,
+                title=f"Significant: {_counts(sides)}",
+                label="corrected p" + (", signed" if low else ""),
+                scale={"cmap": p_colors, "vmin": low * top, "vmax": top},
+                values={hemi: signed[hemi][name] for hemi in sides},
+                survive=survive,
+                level=first.alpha,
+            ),
+        ]
+
+
+def _reach(every_test: Tests, kind: str, name: str, sides: Mapping[str, ContrastMap]) -> float:
+    """Return the effect size at the end of the colors of a contrast."""
+    if kind == "z":
+        return max(_LEAST_Z, *(float(np.nanmax(one.effect)) for one in sides.values()))
+    tests = [own[name] for side in every_test.values() for own in side.values() if name in own]
+    return display.effect_reach(
+        [display.Effects(t.kind, t.effect, t.statistic, t.df) for t in tests if t.kind == kind]
+    )
+
+
+def _counts(sides: Mapping[str, ContrastMap]) -> str:
+    """Write how many points survive, by side."""
+    tested = {hemi: int(np.isfinite(test.adjusted).sum()) for hemi, test in sides.items()}
+    uniform = len(set(tested.values())) == 1
+    counts = ", ".join(
+        " ".join(
+            (
+                str(int(test.rejected.sum())),
+                *(() if uniform else (f"of {tested[hemi]}",)),
+                *(() if hemi == cells.BOTH_SIDES else (cells.SIDES[hemi],)),
+            )
+        )
+        for hemi, test in sides.items()
+    )
+    return counts + (f" of {max(tested.values())} points" if uniform else "")

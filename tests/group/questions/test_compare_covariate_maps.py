@@ -1,0 +1,115 @@
+"""Models with ``map(NAME)``: a covariate with a value at each point."""
+
+import json
+
+import numpy as np
+import pytest
+import statsmodels.formula.api as smf
+from small_cohorts import (
+    NODES,
+    PLAN,
+    begin_dataset,
+    place_of,
+    table,
+    write_dataset,
+    write_hemisphere,
+    write_participants,
+)
+
+from hipsta_bids.cli.main import main
+from hipsta_bids.errors import ExitCode
+
+FAST = ("--align", "none", "--no-classification", "--no-reports")
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory):
+    return write_dataset(tmp_path_factory.mktemp("maps"))
+
+
+def sheets(out, measure):
+    """(participants, points) of the left sheets, as they were written."""
+    places = [place_of(out, f"{i + 1:02d}", "L") for i in range(sum(PLAN.sizes))]
+    return np.array([table(place.path("sheet"))[measure].to_numpy() for place in places])
+
+
+def test_a_map_is_a_covariate_at_each_point(study):
+    data, out = study
+    command = [str(data), str(out), "group", "--formula", "thickness ~ group + map(curvature)"]
+    assert main([*command, "--name", "maps", *FAST]) == ExitCode.OK
+    folder = out / "group" / "maps"
+    record = json.loads((folder / "analysis.json").read_text())
+    assert set(record["contrasts"]) == {"CN-AD", "map(curvature)"}
+    people = table(data / "participants.tsv")
+    thickness, curvature = sheets(out, "thickness"), sheets(out, "curvature")
+    found = {
+        name: table(folder / f"hemi-L_contrast-{name}_desc-thickness_statmap.tsv")
+        for name in ("CNAD", "MapCurvature")
+    }
+    for point in (0, 40, 100, 146):
+        rows = people.assign(y=thickness[:, point], c=curvature[:, point])
+        fit = smf.ols("y ~ C(group, Treatment('CN')) + c", rows).fit()
+        expected = {"CNAD": -fit.params.iloc[1], "MapCurvature": fit.params.iloc[2]}
+        for name, estimate in expected.items():
+            assert found[name]["estimate"][point] == pytest.approx(estimate, rel=1e-5), name
+        assert found["MapCurvature"]["p"][point] == pytest.approx(fit.pvalues.iloc[2], rel=1e-4)
+    assert not (folder / "summaries.tsv").exists()
+    methods = (folder / "methods.md").read_text()
+    assert "`group + map(curvature)`, was fitted" in methods
+    assert "Casanova R" in methods
+    assert record["formula"] == "group + map(curvature)"
+    notes = "\n".join(record["notes"])
+    assert "summary measures are not tested: map(curvature) has values at points only" in notes
+
+
+def test_change_by_the_map_at_baseline(tmp_path):
+    """A change that depends on the baseline is found where it does; other maps have no effect."""
+    data, out = begin_dataset(tmp_path)
+    random, rows = np.random.default_rng(2), []
+    for i in range(40):
+        base = 2 + 0.3 * random.standard_normal(NODES)
+        loss = 0.4 * (base - 2) * (np.arange(NODES[0])[:, None] < 10)
+        after = base - loss + 0.05 * random.standard_normal(NODES)
+        bend = 0.1 * random.standard_normal(NODES)
+        for session, wall in (("1", base), ("2", after)):
+            for hemi in "LR":
+                place = place_of(out, f"{i + 1:02d}", hemi, session=session)
+                write_hemisphere(place, wall, bend)
+        rows.append([f"sub-{i + 1:02d}", "CN", f"{60 + i % 20}", "FM"[i % 2]])
+    write_participants(data, rows)
+    command = [str(data), str(out), "group", "--paired", "1", "2", "--name", "change", *FAST]
+    formula = "thickness ~ age + map(thickness)"
+    assert main([*command, "--formula", formula]) == ExitCode.OK
+    folder = out / "group" / "change"
+    slope = table(folder / "hemi-L_contrast-MapThickness_desc-thickness_statmap.tsv")
+    medial = slope["node_x"] <= 10
+    np.testing.assert_allclose(slope["estimate"][medial].mean(), -0.4, atol=0.03)
+    assert (slope["p"][medial] < 0.05).mean() > 0.95
+    assert (slope["p"][~medial] < 0.05).mean() < 0.15
+
+
+@pytest.mark.parametrize(
+    ("options", "code", "said"),
+    [
+        (["thickness ~ group * map(curvature)"], 65, "add map(NAME) to other terms"),
+        (["thickness ~ group + map(thickness)"], 65, "map(thickness) in the formula explains"),
+        (["thickness ~ group + map(curvatur)"], 65, "did you mean curvature?"),
+        (["thickness ~ group + map(volume)"], 65, "map(volume) in the formula: it is no map"),
+        (["volume ~ group + map(curvature)"], 65, "not with summary measures alone"),
+        (["thickness ~ group + map(curvature)", "--asymmetry"], 65, "not with --asymmetry"),
+        (["thickness ~ group + map(curvature)", "--export-summary", "a"], 65, "map()"),
+        (
+            ["thickness ~ group + map(curvature)", "--correction", "permutation-tfce"],
+            65,
+            "not with --fdr with permutations",
+        ),
+    ],
+)
+def test_what_maps_cannot_do_is_one_line(study, capsys, options, code, said):
+    data, out = study
+    formula, *more = options
+    command = [str(data), str(out), "group", "--formula", formula, "--name", "refused", *FAST]
+    assert main([*command, *more]) == code
+    error = capsys.readouterr().err
+    assert said in error, error
+    assert error.count("\n") == 1
