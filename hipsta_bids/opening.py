@@ -30,7 +30,7 @@ class UnfitFileError(OSError):
 
 
 def not_fetched(path: Path) -> str | None:
-    """Tell what to do if the content of a file is elsewhere; links and small files are opened."""
+    """Return the remedy if the content of a file is elsewhere; links and small files are opened."""
     try:
         status = path.lstat()
         if stat.S_ISLNK(status.st_mode) or 0 < status.st_size < _POINTER_SIZE:

@@ -19,7 +19,7 @@ _LISTENER: ContextVar[Listener | None] = ContextVar("listener", default=None)
 
 @contextmanager
 def listening(listener: Listener) -> Iterator[None]:
-    """Have a listener told what is done inside the block."""
+    """Report the stages inside the block to a listener."""
     token = _LISTENER.set(listener)
     try:
         yield
@@ -28,14 +28,14 @@ def listening(listener: Listener) -> Iterator[None]:
 
 
 def tell(stage: str, count: int | None = 0, total: int = 0, current: str = "") -> None:
-    """Say what is being done. A stage ends when another begins."""
+    """Report the current stage. A stage ends when another begins."""
     listener = _LISTENER.get()
     if listener is not None:
         listener(stage, count, total, current)
 
 
 def each(stage: str, items: Sequence[Item]) -> Iterator[Item]:
-    """Yield items, and tell how many are done."""
+    """Yield items, and report how many are done."""
     tell(stage, 0, len(items))
     for count, item in enumerate(items, start=1):
         yield item

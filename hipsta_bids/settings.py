@@ -20,41 +20,43 @@ class BodySettings(toml.SettingsTable):
     """From labels to the body's mask and end planes."""
 
     region: Literal["body", "extended", "entorhinal", "headbody", "whole"] = "body"
-    """What is measured: ``body`` (the subfields between the end planes), ``extended`` (with the
-    neighboring cortex), ``entorhinal`` (that cortex alone), and, experimental, ``headbody`` and
-    ``whole`` (with the tail)."""
+    """Region: ``body`` (subfields between the end planes), ``extended`` (with neighboring
+    cortex), ``entorhinal`` (that cortex alone). Experimental: ``headbody``, and ``whole`` (with
+    the tail)."""
     min_cortex_reach: toml.PositiveFraction = 0.9
     """Refuse cortex with labels along less than this share of the body."""
     layer_rule: Literal["nearest-sheet", "nearest-label"] = "nearest-sheet"
-    """Who gets the molecular layer: ``nearest-sheet`` (the nearest sheet subfield; Diers et al.
-    2023) or ``nearest-label`` (the nearest label; voxels nearest to DG or CA4 are left out)."""
+    """The molecular layer belongs to the nearest subfield of the sheet (``nearest-sheet``; Diers et
+    al. 2023), or to the ``nearest-label``. Voxels nearest to DG or CA4 are then excluded."""
     join_every_layer: bool = False
-    """Join the molecular layer to the sheet also where the protocol leaves it out (HippUnfold)."""
+    """Join the molecular layer to the sheet also where the protocol excludes it (HippUnfold)."""
     min_length: NonNegativeFloat = 5.0
     """Shortest body that is measured, mm."""
     min_end_voxels: NonNegativeInt = 50
     """Fewer head or tail voxels than this count as no label."""
     plane_reach: PositiveFloat = 3.0
-    """End planes are fitted to labels within this distance of the interface, mm; head and tail
-    labels that lie up to it on the wrong side get the subfield of a neighbor."""
+    """End planes are fitted to labels within this distance of the interface, mm. Head and tail
+    labels beyond the plane, up to this distance, get the subfield of a neighbor."""
     end_rule: Literal["graded", "last-slice"] = "graded"
-    """Ends without labels of head or tail: a mean over graded evidence, or ``last-slice`` (the last
-    slice with CA1 and CA2 or CA3 posteriorly, with CA2 or CA3 anteriorly; Diers et al. 2023)."""
+    """Ends without labels of head or tail: ``graded``, a mean over several cues. ``last-slice``:
+    the last slice with CA1 and CA2 or CA3 posteriorly, with CA2 or CA3 anteriorly (Diers et al.
+    2023)."""
     mending: Literal["gaps", "closing"] = "gaps"
-    """Before the surface: ``gaps`` (slits, pits and cavities that match no fold are filled), or
-    ``closing`` (the mask is dilated and eroded by a voxel; Diers et al. 2023)."""
+    """Before the surface: ``gaps`` fills slits, pits and cavities that match no fold. ``closing``
+    dilates and erodes the mask by a voxel (Diers et al. 2023)."""
     end_margin: NonNegativeFloat = 0.0
     """Taken off either end where head or tail labels are missing, mm."""
     slit_area: NonNegativeFloat = 2.5
-    """Gaps larger than this are filled if they go through the sheet, mm2."""
+    """Gaps through the sheet are filled if they are larger than this, mm2."""
     slit_voxel: NonNegativeFloat = 0.8
     """Gaps are filled if no voxel edge is longer, mm: folds between thick slices look alike."""
     end_fullness: toml.OpenFraction = 0.9
-    """Cross-sections where labels end obliquely go below this share of those behind them."""
+    """Cross-sections in oblique ends of labels are smaller than this share of the cross-sections
+    behind them."""
     end_reach: NonNegativeFloat = 3.0
-    """Length behind an end that is compared, and of which all may be left out, mm."""
+    """Length behind an end that is compared, mm; all of it may be excluded."""
     max_mask_ratio: PositiveFloat = 1.5
-    """Flag an edited mask whose voxels are more than this many times those of the labels."""
+    """Flag an edited mask with more than this many times the voxels of the labels."""
     max_mask_change: NonNegativeFloat = 0.5
     """Flag an edited mask that adds and removes more than this share of the body."""
 
@@ -67,11 +69,11 @@ class GridSettings(toml.SettingsTable):
     smoothing: Annotated[float, Field(ge=0, le=3)] = 0.9
     """Standard deviation of the Gaussian, in in-plane voxels of the segmentation."""
     min_smoothing: NonNegativeFloat = 0.36
-    """Least standard deviation of that Gaussian, mm, so that finer voxels do not change maps:
-    what smoothing takes from thin edges and narrow bends changes the mean thickness."""
+    """Least standard deviation of that Gaussian, mm. It keeps finer voxels from changing maps:
+    smoothing of thin edges and narrow bends changes the mean thickness."""
     beyond: NonNegativeFloat = 1.75
-    """The body goes on for this much beyond each end plane, mm, as it is there: columns would be
-    oblique, and too long, next to a plane that cuts the sheet obliquely."""
+    """The body is continued by this much beyond each end plane, mm. Columns next to a plane that
+    cuts the sheet obliquely would be oblique, and too long."""
 
 
 class SliceSettings(toml.SettingsTable):
@@ -124,17 +126,17 @@ class BoundarySettings(toml.SettingsTable):
     solver: Literal["two-level", "lapy"] = "two-level"
     """What solves Laplace's equation, for boundaries and coordinates; ``lapy`` is slower."""
     operator: Literal["sharp-bends", "published"] = "sharp-bends"
-    """What slows diffusion on the wall: convex bends beyond ``sharp_bend``, or ``published``: both
+    """Diffusion on the wall is slowed by convex bends beyond ``sharp_bend``. ``published``: by both
     principal curvatures, without a threshold (Diers et al. 2023, appendix A)."""
     edges: Literal["faces", "zero-lines"] = "faces"
-    """Where x is fixed: on the end faces of the sheet, or ``zero-lines``: on the zero lines of the
-    eigenfunction as they are (Diers et al. 2023)."""
+    """x is fixed on the end faces of the sheet (``faces``). ``zero-lines``: on the zero lines of
+    the eigenfunction as they are (Diers et al. 2023)."""
     sharp_bend: NonNegativeFloat = 0.5
     """Convex bends with less curvature than this do not slow diffusion, 1/mm."""
     anisotropy: NonNegativeFloat = 8.0
-    """Diffusion across sharper ones, of curvature k, is slowed by exp(-anisotropy (k -
-    sharp_bend)), mm. By the operator ``published`` exp(-anisotropy |k|) in both directions, k in
-    LaPy's units, which grow with the mesh's edges; Hipsta takes 40."""
+    """Diffusion across bends of curvature k beyond ``sharp_bend`` is slowed by exp(-anisotropy (k -
+    sharp_bend)), mm. ``published``: exp(-anisotropy |k|) in both directions, k in LaPy's units,
+    which grow with the mesh's edges. Hipsta takes 40."""
 
 
 class SheetSettings(toml.SettingsTable):
@@ -160,8 +162,8 @@ class SheetSettings(toml.SettingsTable):
     max_filled: toml.Fraction = 0.2
     """Refuse a sheet with a larger fraction of columns that could not be measured."""
     depths: Literal["distance", "volume"] = "distance"
-    """How layers are spaced along each column: ``distance`` (evenly) or ``volume`` (the same volume
-    between any two; Bok 1929, Leprince et al. 2015). The measures do not depend on it."""
+    """Spacing of layers along each column: ``distance`` (even), or ``volume`` (equal volumes; Bok
+    1929, Leprince et al. 2015). The measures do not depend on it."""
 
 
 class MeasureSettings(toml.SettingsTable):
@@ -172,7 +174,7 @@ class MeasureSettings(toml.SettingsTable):
     curvature_order: Annotated[int, Field(ge=2)] = 3
     """Order of the local polynomials."""
     gaussian_window: toml.Odd = 21
-    """Grid nodes along y over which they are fitted for the Gaussian curvature, odd: it multiplies
+    """Grid nodes along y of the fit for the Gaussian curvature, odd. That curvature multiplies
     noise along the axis with the curvature across it."""
     max_curvature: PositiveFloat = 2.5
     """Principal curvatures are bounded by this, 1/mm: the working grid holds no sharper bend."""
@@ -238,8 +240,8 @@ class CheckSettings(toml.SettingsTable):
     flag_loose_part: NonNegativeFloat = 0.15
     """Flag a second piece of voxels, connected by faces, above this share of the sheet."""
     flag_rival: NonNegativeFloat = 0.12
-    """Flag if a second choice that is as likely, or a second group of copies (`--uncertainty`),
-    moves the map by more than this (RMS), mm."""
+    """Flag if an equally likely second choice, or a group of copies (`--uncertainty`), moves the
+    map by more (RMS), mm."""
 
 
 class MapSettings(toml.SettingsTable):
@@ -252,7 +254,7 @@ class MapSettings(toml.SettingsTable):
 
 
 class UncertaintySettings(toml.SettingsTable):
-    """Perturbed copies of the labels; their spread says how certain a map is (`--uncertainty`)."""
+    """Perturbed copies of the labels; their spread is the uncertainty of maps (--uncertainty)."""
 
     relabeling: NonNegativeFloat = 0.3
     """Boundaries are drawn elsewhere by this in all, mm: SD along each axis."""
@@ -263,11 +265,11 @@ class UncertaintySettings(toml.SettingsTable):
     """End planes are placed elsewhere by this, slices: SD along the normal. An end without a label
     moves by its standard error if that is larger."""
     jitter: NonNegativeFloat = 0.5
-    """Part of these errors is independent from voxel to voxel, evenly distributed up to this,
-    voxels along each axis of the voxels. 0, with ``relabeling`` 0: labels without errors."""
+    """Part of these errors is independent between voxels: even, up to this, in voxels along each
+    axis. With 0, and ``relabeling`` 0, labels have no errors."""
     rotation: Annotated[float, Field(ge=0, le=45)] = 5.0
-    """Voxels are turned by up to this about each axis, degrees, and shifted by up to half of one:
-    as if the body had lain elsewhere in the scanner."""
+    """Rotation of the voxels about each axis, up to this, degrees, with a shift up to half a voxel.
+    It simulates another position in the scanner."""
 
 
 class SurrogateSettings(toml.SettingsTable):
@@ -316,7 +318,7 @@ class Settings(toml.SettingsTable):
 
 
 def load_settings(path: Path | None) -> Settings:
-    """Read a user's TOML file; what it leaves out keeps its default.
+    """Read a user's TOML file; settings that it omits keep their defaults.
 
     Parameters
     ----------

@@ -49,7 +49,7 @@ def _set(
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class EditedMask:
-    """The body as a person corrected it."""
+    """The body as corrected by hand."""
 
     inside: Bool
     """(I, J, K) whether a voxel of the labels' grid belongs to the body."""
@@ -102,7 +102,7 @@ class Hemisphere(Visit):
 
 @dataclass(frozen=True, kw_only=True)
 class GivenEnd:
-    """An end of the body that a person has placed."""
+    """An end of the body placed by hand."""
 
     end: End
     point: tuple[float, float, float]
@@ -134,7 +134,9 @@ class LabelVolume:
     def __post_init__(self) -> None:
         shape = np.shape(self.tissue)
         if self.edited_mask is not None and self.edited_mask.inside.shape != shape:
-            raise ValueError(f"LabelVolume.edited_mask: shape differs from that of tissue, {shape}")
+            raise ValueError(
+                f"LabelVolume.edited_mask: shape differs from the shape of tissue, {shape}"
+            )
         _set(self, "tissue", np.uint8, (None, None, None))
         _set(self, "part", np.uint8, shape)
         affine = _set(self, "affine", np.float64, (4, 4))
@@ -142,7 +144,7 @@ class LabelVolume:
             raise ValueError("LabelVolume.affine is singular or not finite")
 
     def in_file(self, inside: Bool) -> BodyMask:
-        """Say where in the file a mask (I, J, K) of this part lies."""
+        """Return the place in the file of a mask (I, J, K) of this part."""
         first, second, third = inside.shape
         affine = self.affine.copy()
         affine[:3, 3] -= affine[:3, :3] @ np.array(self.start)
@@ -176,7 +178,7 @@ class Surface:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TetMesh:
-    """A tetrahedral mesh whose first vertices are those of the surface, in the same order."""
+    """A tetrahedral mesh whose first vertices are the surface's, in the same order."""
 
     vertices: Float
     """(V, 3) RAS mm."""
@@ -227,7 +229,7 @@ FAMILY = {
 
 
 class Decision(StrEnum):
-    """What is to be done with a hemisphere; it rests on its flags."""
+    """Decision on a hemisphere, from its flags."""
 
     USE = "use"
     LOOK = "look"
@@ -270,13 +272,13 @@ class Finding:
 
     @property
     def raised(self) -> bool:
-        """Whether a person should look at it."""
+        """Whether a rater should look at it."""
         return self.value > self.limit
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Flag:
-    """Something a person should look at before trusting a map."""
+    """Something a rater should look at before a map is used."""
 
     reason: str
     """Name of the reason in kebab case, for programs."""
@@ -342,7 +344,9 @@ class HemisphereMaps:
         shape = self.sheet.points.shape[:2]
         wrong = [name for name, values in self.maps.items() if values.shape != shape]
         if wrong:
-            raise ValueError(f"HemisphereMaps.maps: {wrong[0]} has not the sheet's shape {shape}")
+            raise ValueError(
+                f"HemisphereMaps.maps: the shape of {wrong[0]} differs from the sheet's, {shape}"
+            )
         _set(self, "subfield", np.uint8, shape)
         _set(self, "repaired", np.bool_, shape)
         ordered = sorted(self.flags, key=lambda flag: flag.consequence, reverse=True)
@@ -355,7 +359,7 @@ class HemisphereMaps:
 
     @property
     def decision(self) -> Decision:
-        """Whether a person should look before use; ``failed`` hemispheres have no maps."""
+        """Whether a rater should look before use; ``failed`` hemispheres have no maps."""
         return Decision.LOOK if self.flags else Decision.USE
 
 

@@ -72,8 +72,9 @@ TOPICS = (
         figure="curvature",
         title="Mean curvature",
         text="Circles that touch the three surfaces at one column, with the measured radii. Mean"
-        " curvature is half the sum of the principal curvatures, from the first and second"
-        " fundamental form of cubic polynomials in windows of 9 x 9 grid points. It is positive"
+        " curvature is half the sum of the principal curvatures. They follow from the first and"
+        " second fundamental form of cubic polynomials in windows of 9 x 9 grid points. Curvature"
+        " is positive"
         " where the surface is concave towards the interior side; a cylinder of radius r has"
         " 1/(2r). Voxels roughen single points, most on the interior wall. Means exclude the"
         " four outermost rows and columns of grid points.",

@@ -38,9 +38,10 @@ The output folder is a BIDS derivative dataset. Files of a hemisphere lie in `su
 and begin with `sub-X[_ses-Y]_hemi-<L|R>`. `P` is the segmentation protocol. Regions other than the
 body have `label-NAME` after `seg-P`. Missing values are `n/a` in tables and NaN in GIFTI files.
 
-The axes have the same meaning in both hemispheres: x from the medial to the lateral edge, y from
-the posterior to the anterior end plane, z from the interior to the exterior wall. Head and tail are
-excluded from all numbers of the body. [Measures](measures.md) defines the measures."""
+The axes have the same meaning in both hemispheres. Axis x runs from the medial to the lateral edge,
+and y from the posterior to the anterior end plane. Axis z runs from the interior to the exterior
+wall. Head and tail are excluded from all numbers of the body. [Measures](measures.md) defines the
+measures."""
 
 SIDECARS_TEXT = """\
 Each table has a JSON file with the columns and units. Each image has a JSON file with its inputs
@@ -85,8 +86,8 @@ average site, `below_N` the cross-validated share below centile N (5, 25, 50, 75
 
 SETTINGS_TEXT = """\
 Settings change results. `hipsta-bids settings` prints the settings of the participant level as a
-TOML file, `hipsta-bids settings group` those of the group level. Keep the lines that you change,
-and give the file with `--settings`:"""
+TOML file, `hipsta-bids settings group` the settings of the group level. Keep the lines that you
+change, and give the file with `--settings`:"""
 
 ONE_SET_TEXT = """\
 An output folder holds results of one set of settings. Do not pool results of different settings.

@@ -70,8 +70,8 @@ def load(out_dir: str | Path, *, protocol: str | None = None, region: str = "bod
     """Load an output dataset as a table of measures and one lazy dataset of xarray.
 
     Nothing but the small records and summaries is read at once. Maps are read when their values
-    are used, and only those of the participants, sides and measures that are used: select first,
-    then compute. ``.load()`` reads all that is left.
+    are used, and only of the participants, sides and measures that are used: select first, then
+    compute. ``.load()`` reads all others.
 
     Parameters
     ----------
@@ -80,7 +80,7 @@ def load(out_dir: str | Path, *, protocol: str | None = None, region: str = "bod
     protocol : str, optional
         Name of one segmentation protocol; else all that the folder has results of.
     region : {"body", "extended", "entorhinal", "headbody", "whole"}
-        What was measured.
+        The region measured.
 
     Returns
     -------
@@ -90,13 +90,13 @@ def load(out_dir: str | Path, *, protocol: str | None = None, region: str = "bod
         (``thickness_sd``) and maps of other volumes, by their names; by protocol, participant
         (``sub-01``), session (``ses-1``; ``n/a`` in datasets without), side (``L``, ``R``), x and
         y (-1 to 1 in the body), with units; NaN where there is no map. ``decision`` has
-        no x and y. ``measures``: one row per hemisphere, failed ones included, whose
-        ``participant_id`` is that of ``participants.tsv``.
+        no x and y. ``measures``: one row per hemisphere, failed ones included, with the
+        ``participant_id`` of ``participants.tsv``.
 
     Raises
     ------
     FileNotFoundError
-        If there is no such folder.
+        If the folder does not exist.
     NothingToDoError
         If no results are there, or none of this protocol and region.
 
@@ -112,7 +112,7 @@ def load(out_dir: str | Path, *, protocol: str | None = None, region: str = "bod
     """
     root = Path(out_dir)
     if not root.is_dir():
-        raise MissingFileError(f"{root}: no such folder; check its name")
+        raise MissingFileError(f"{root}: folder not found; check its name")
     hemispheres = list(find_results(root))
     selected = [
         side
@@ -123,7 +123,7 @@ def load(out_dir: str | Path, *, protocol: str | None = None, region: str = "bod
         names = {(side.result.name.seg, side.result.name.region) for side in hemispheres}
         available = ", ".join(f"{seg} (region {measured})" for seg, measured in sorted(names))
         available = f"there is {available}" if available else "run the participant level first"
-        raise NothingToDoError(f"{root}: no such hemisphere; {available}")
+        raise NothingToDoError(f"{root}: hemisphere not found; {available}")
     table = pd.DataFrame([_row(side) for side in selected])
     return Results(maps=_lazy_dataset(root, selected, table), measures=table)
 

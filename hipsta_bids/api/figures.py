@@ -81,9 +81,9 @@ def figure(
     Raises
     ------
     ValueError
-        If there is no such figure, measure, contrast or format.
+        If the figure, measure, contrast or format is unknown.
     NothingToDoError
-        If the folder has no such participant or analysis.
+        If the folder lacks the participant or the analysis.
 
     Examples
     --------
@@ -119,7 +119,7 @@ def figure(
 
 
 def check_format(path: Path) -> str:
-    """Return the format of a figure by its file's name; UsageError if there is no such format."""
+    """Return the format of a figure by its file's name; UsageError for other formats."""
     kind = path.suffix.removeprefix(".").lower()
     if kind not in style.KINDS:
         raise UsageError(f"{path}: no format of figures; use .pdf, .svg or .png")

@@ -99,7 +99,7 @@ class Measurement:
 
     @property
     def decision(self) -> str:
-        """``use``, or ``look``: a person should look before use."""
+        """``use``, or ``look``: look at the map before use."""
         return self.hemisphere.decision.value
 
     @property
@@ -109,7 +109,7 @@ class Measurement:
 
     @property
     def message(self) -> str:
-        """Why a person should look; empty if nobody need."""
+        """Why to look at the map; empty if there is no need."""
         return outputs.verdict(self.hemisphere)[2] or ""
 
     @cached_property
@@ -303,8 +303,8 @@ def measure(
         Path of an image, an image of nibabel, or an array (I, J, K) of the protocol's codes; or a
         :class:`~hipsta_bids.types.LabelVolume`, which needs no protocol.
     side : {"L", "R"}
-        Hemisphere. Of an image with codes of both, in a protocol that shifts those of one side,
-        the other is left out.
+        Hemisphere. Of an image with codes of both, in a protocol that shifts the codes of one side,
+        the other is excluded.
     protocol : str, Path or Protocol
         What the codes mean: a name of ``hipsta-bids protocols``, as ``"freesurfer"`` or
         ``"hippunfold"``, or a TOML file. A wrong one may give a plausible, wrong map.
@@ -312,7 +312,7 @@ def measure(
         (4, 4), voxel index to RAS mm; for arrays only.
     region : {"body", "extended", "entorhinal", "headbody", "whole"}
         What to measure; the second and third need labels of the cortex beside it, the last two,
-        which are experimental, those of subfields in the head.
+        which are experimental, labels of subfields in the head.
     settings : Settings, str or Path, optional
         Settings of the participant level, or a TOML file with some.
 

@@ -42,7 +42,7 @@ def plot_sheet(
     """Draw a map on the unfolded sheet, with borders and names of subfields.
 
     Maps of both sides lie alike: medial left, lateral right, anterior up. Columns that were
-    repaired are hatched, those that were filled from their neighbors crossed.
+    repaired are hatched; columns filled from their neighbors are crossed.
 
     Parameters
     ----------
@@ -53,7 +53,7 @@ def plot_sheet(
     ax : Axes, optional
         Where to draw; else the current axes of pyplot.
     limits : tuple of float, optional
-        Values at both ends of the colors; else those of the pages for thickness and mean
+        Values at both ends of the colors; else the limits of the pages for thickness and mean
         curvature, and percentiles of this map for others. Give the same to maps that are compared.
     colorbar : bool
         Whether to add one.
@@ -65,7 +65,7 @@ def plot_sheet(
     Raises
     ------
     ValueError
-        If there is no such map, or the data are not those of one hemisphere.
+        If the map does not exist, or the data are not of one hemisphere.
 
     Examples
     --------
@@ -186,7 +186,7 @@ def plot_group(
     limits: tuple[float, float] | None = None,
     colorbar: bool = True,
 ) -> "Axes":
-    """Draw the effect size of a contrast on the sheet, with a line round what is significant.
+    """Draw the effect size of a contrast on the sheet, with a line round significant points.
 
     Parameters
     ----------
@@ -213,7 +213,7 @@ def plot_group(
     Raises
     ------
     ValueError
-        If there is no such side or contrast, or the maps are not on the sheet.
+        If the side or contrast does not exist, or the maps are not on the sheet.
 
     Examples
     --------

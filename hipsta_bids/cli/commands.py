@@ -225,7 +225,7 @@ def run_meta_analysis(arguments: Sequence[str]) -> ExitCode:
     for note in notes:
         echo(f"note: {note}")
     echo(f"results: {options.out / 'meta'}")
-    echo(f"what was done and found: {page}")
+    echo(f"report: {page}")
     return ExitCode.OK
 
 

@@ -49,7 +49,7 @@ _NARROWEST, _GAP = 16, 2
 
 
 def has_color(stream: TextIO) -> bool:
-    """Tell whether a stream shows colors: a terminal, unless the environment says otherwise.
+    """Check whether a stream shows colors: a terminal, unless the environment forbids them.
 
     ``NO_COLOR`` and ``FORCE_COLOR`` count if they are not empty, in this order, then ``TERM=dumb``.
     """
@@ -85,7 +85,7 @@ def echo(text: str) -> None:
 
 
 def warn(text: str) -> None:
-    """Print one line about what went wrong, to the standard error."""
+    """Print one line about a problem, to the standard error."""
     _print(" ".join(text.split()), sys.stderr)
 
 
@@ -96,7 +96,7 @@ def echo_start(level: str, bids_dir: Path) -> None:
 
 @contextmanager
 def quiet(enabled: bool) -> Iterator[None]:
-    """Print nothing but what went wrong, if that is wanted."""
+    """Print only problems, if that is wanted."""
     if not enabled:
         yield
         return
@@ -125,7 +125,7 @@ class Progress:
         self._close(announced=kind is None)
 
     def show(self, stage: str, count: int | None = 0, total: int = 0, current: str = "") -> None:
-        """Show what is being done; a stage ends with a line that has its time."""
+        """Show the current stage; a stage ends with a line that has its time."""
         if stage != self._stage:
             self._close(announced=True)
             self._stage, self._start = stage, time.monotonic()
@@ -163,7 +163,7 @@ class Progress:
 
 @contextmanager
 def searching(*, has_bar: bool) -> Iterator[None]:
-    """Show that segmentations are sought; what is found has lines of its own."""
+    """Show that segmentations are sought; the results have lines of their own."""
     with Progress(0 if has_bar else -1) as progress:
         progress.show(_SEARCH)
         yield
@@ -209,7 +209,7 @@ def summary_line(outcome: "Outcome") -> str:
 
 
 def echo_result(result: "RunResult", out_dir: Path, *, has_pages: bool) -> None:
-    """Print where the outputs are and what is to be done with how many hemispheres."""
+    """Print the folder of the outputs, and the number of hemispheres by decision."""
     counts = ", ".join(f"{n} {decision}" for decision, n in sorted(result.counts.items()))
     missing = result.n_requested - len(result.outcomes)
     counts += f", {missing} not run" if missing else ""
@@ -224,14 +224,14 @@ def echo_result(result: "RunResult", out_dir: Path, *, has_pages: bool) -> None:
     for copy in result.copies[:_LISTED_ROWS]:
         warn(f"warning: {copy}")
     if len(result.copies) > _LISTED_ROWS:
-        warn(f"warning: {len(result.copies) - _LISTED_ROWS} more such groups, see status.tsv")
+        warn(f"warning: {len(result.copies) - _LISTED_ROWS} more groups of copies, see status.tsv")
     for problem in result.page_problems:
         warn(f"warning: report: {problem}")
     echo(f"log: {result.log}")
 
 
 def echo_table(rows: Sequence[Mapping[str, str]]) -> None:
-    """Print rows as aligned columns; empty columns are left out, and tables without rows.
+    """Print rows as aligned columns; omit empty columns, and tables without rows.
 
     On a terminal wide columns are wrapped and long words, as paths, lose their middle, so that a
     row fits; where that takes narrow columns, each cell has a line. Elsewhere all is there.

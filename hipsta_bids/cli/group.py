@@ -31,8 +31,9 @@ if TYPE_CHECKING:
 LEVEL = "group"
 
 _EPILOG = """\
-without --model and --formula: group + age + sex (+ site), each group against its reference level
-(CN, CU, HC, control ..., else the most frequent), from BIDS_DIR/participants.tsv
+without --model and --formula: group + age + sex (+ site) from BIDS_DIR/participants.tsv
+
+each group is compared with its reference level (CN, CU, HC, control ..., else the most frequent)
 
 --retest, --power, --fit-norms and --norms answer questions of their own, in OUT_DIR/group/retest/,
 power-.../, norms/ and scores/
@@ -63,8 +64,8 @@ def group_parser() -> Parser:
     adder(parser.add_argument_group("other sites"))(
         "--export-summary",
         "SITE",
-        "also write summary.json, estimates without values of participants, for `hipsta-bids"
-        " meta`; SITE is this site's name (default: that of the folder BIDS_DIR)",
+        "also write summary.json for `hipsta-bids meta`, without values of participants; "
+        "SITE: this site's name (default: BIDS_DIR's)",
         nargs="?",
         const="",
     )
@@ -83,15 +84,15 @@ def _add_sheets(parser: Parser) -> None:
     add(
         "--segmentations",
         "DIR...",
-        "folders of FreeSurfer, ASHS or HippUnfold, if they have moved since the participant"
-        " level: for the intracranial and other volumes beside the segmentations",
+        "folders of FreeSurfer, ASHS or HippUnfold that have moved since the participant "
+        "level; for volumes",
     )
     add(
         "--maps",
         "NAME=PATTERN...",
-        "other programs' maps with corresponding points, GIFTI, CIFTI or TSV, with sheets or alone:"
-        " path (also in BIDS_DIR) with {subject}, {session}, {hemi} or {side} (lh, rh), *; CIFTI"
-        " (.dscalar.nii) without {hemi}",
+        "maps of other programs (GIFTI, CIFTI, TSV), also without sheets: path, also in "
+        "BIDS_DIR, with {subject}, {session}, {hemi} (or {side}), *. CIFTI (.dscalar.nii) has "
+        "both sides.",
         type=named_pattern,
     )
     add(
@@ -105,8 +106,8 @@ def _add_sheets(parser: Parser) -> None:
     add(
         "--mixed",
         "FIELD...",
-        "in what segmentations may differ, else they may not: tool, version, analysis (T1, T1-T2),"
-        " atlas, hierarchy, space, design (longitudinal or not), edited, voxel_size",
+        "differences of segmentations that are allowed: tool, version, analysis, atlas, "
+        "hierarchy, space, design, edited, voxel_size",
     )
     add(
         "--region",
@@ -125,36 +126,39 @@ def _add_sheets(parser: Parser) -> None:
     add(
         "--exclude-participant-label",
         "LABEL...",
-        "leave out these, with or without prefix",
+        "exclude these, with or without prefix",
         type=bids_label("sub-"),
     )
     add(
         "--exclude-look --exclude-flagged",
         "",
-        "leave out hemispheres to look at first, unless --ratings says use",
+        "exclude hemispheres to look at first, unless --ratings has use",
     )
     add(
         "--exclude-qc",
         "CONDITION...",
-        "leave out by quality metrics, as 'filled_fraction > 0.01' 'voxels_across < 3'; one that is"
-        " fulfilled is enough",
+        "exclude by quality metrics, as 'filled_fraction > 0.01' 'voxels_across < 3'; one "
+        "criterion is enough",
         type=_condition,
     )
     add(
         "--exclude",
         "FILE.tsv",
-        "leave out: columns participant_id, perhaps session_id, hemi, protocol, region, reason",
+        "exclude: columns participant_id, perhaps session_id, hemi, protocol, region, reason",
     )
     add(
         "--mask",
         "MASK...",
-        "grid points that count as missing: repaired (columns that a repair touched), or a table"
-        " with x and y (numbers of nodes), perhaps participant_id, session_id, hemi",
+        "grid points to exclude: repaired (by the program), or a table with x, y (node numbers),"
+        " perhaps participant_id, session_id, hemi",
     )
     add(
         "--ratings",
         "FILE.tsv",
-        "ratings saved from report.html: leaves out what is rated exclude, and counts the others",
+        (
+            "ratings saved from report.html: excludes hemispheres rated exclude, and counts the "
+            "others"
+        ),
     )
 
 
@@ -169,9 +173,8 @@ def _add_model(parser: Parser) -> None:
     add(
         "--volumes",
         "NAME=PATTERN...",
-        "tables of volumes as FreeSurfer, ASHS or HippUnfold write them: path (also in"
-        " BIDS_DIR) with {subject}, {session}, {hemi} or {side} (lh, rh), * (those beside the"
-        " segmentations are found anyway)",
+        "tables of volumes (beside segmentations: found anyway): path, also in BIDS_DIR, "
+        "with {subject}, {session}, {hemi} or {side}, *",
         type=named_pattern,
     )
     add("--model", "FILE.json", "BIDS Stats Model with one dataset node")
@@ -184,17 +187,16 @@ def _add_model(parser: Parser) -> None:
     add(
         "--age-model",
         "",
-        "how age stands in the default model (default: linear); quadratic and spline (natural,"
-        " cubic) come with a test for nonlinearity",
+        "age in the default model (default: linear); quadratic and spline (natural cubic) "
+        "add a test for nonlinearity",
         choices=["linear", "quadratic", "spline"],
     )
     add("--reference", "FACTOR=LEVEL...", "reference levels", type=factor_level)
     add(
         "--measures",
         "NAME...",
-        "maps (columns of the sheet table, maps sampled by --map) or summary measures to fit"
-        " the model to, as does the left side of a formula (default: thickness curvature, and all"
-        " summary measures)",
+        "maps (columns of the sheet table or --map), summary measures, also left of a "
+        "formula (default: thickness curvature, all summaries)",
     )
     add("--name", "NAME", "folder of the results (default: the formula)", type=_name)
 
@@ -204,8 +206,8 @@ def _add_comparison(parser: Parser) -> None:
     add(
         "--longitudinal",
         "",
-        "all sessions, by a mixed model in which participants have an intercept or also a slope of"
-        " their own (default: auto, slopes where 10 participants have three visits)",
+        "all sessions, by a mixed model: random intercepts or also slopes (default: auto, "
+        "slopes from 10 participants with three visits)",
         nargs="?",
         const="auto",
         choices=["auto", "intercept", "slope"],
@@ -236,20 +238,20 @@ def _add_methods(parser: Parser) -> None:
     add(
         "--harmonize",
         "COLUMN",
-        "take shifts and scales of sites or scanners out of maps and summary measures (ComBat);"
-        " effects of the model are kept, and the model has the sites too",
+        "remove shifts and scales of sites or scanners (ComBat); effects of the model are "
+        "kept, sites are added to it",
     )
     add(
         "--harmonize-model",
         "FILE",
-        "do it with the harmonization.json of another analysis, for its sites and for new ones of"
-        " enough participants; with its --template",
+        "harmonize by the harmonization.json of another analysis, its sites or new ones; "
+        "with its --template",
     )
     add(
         "--correction",
         "",
-        "for the number of points: false discovery rate (fdr2, the default; bh), or"
-        " family-wise error by permutation of residuals (permutation-tfce, permutation-max)",
+        "false discovery rate (fdr2, the default; bh), or family-wise error by permutation "
+        "of residuals (permutation-tfce, permutation-max)",
         choices=["fdr2", "bh", "permutation-tfce", "permutation-max"],
     )
     add("--permutations", "N", "the data as they are included; default 5000", type=int)
@@ -260,11 +262,11 @@ def _add_methods(parser: Parser) -> None:
         type=positive_int,
         default=processors(),
     )
-    add("--blocks", "COLUMN", "permute inside its levels only, as those of site")
+    add("--blocks", "COLUMN", "permute inside the levels of this column only, as site")
     add(
         "--fdr-scope",
         "",
-        "what is one family of tests, for permutations too (default: map)",
+        "one family of tests, for permutations too (default: map)",
         choices=["map", "hemispheres", "all"],
     )
     add(
@@ -279,7 +281,7 @@ def _add_methods(parser: Parser) -> None:
         "MEASURE...",
         "measures and covariates of the base model of classification (default: volume)",
     )
-    add("--no-classification", "", "do not tell groups apart by logistic models")
+    add("--no-classification", "", "omit the classification of groups by logistic models")
     add(
         "--settings", "FILE.toml", "settings that change results (see `hipsta-bids settings group`)"
     )
@@ -292,16 +294,15 @@ def _add_reports(parser: Parser) -> None:
     add(
         "--reports-only",
         "",
-        "make these pages again from the results that are there, of all analyses or that of"
-        " --name, and end",
+        "make these pages again from existing results, of all analyses or of --name, and end",
     )
     adder(group)(
         "--figures",
         "",
-        "also write all figures for print, as PDF and PNG (default: SVG, of what the page shows;"
-        " `hipsta-bids figure` draws one later)",
+        "also write all figures for print, as PDF and PNG (default: SVG of the page);"
+        " `hipsta-bids figure` draws one later",
     )
-    adder(group)("-q --quiet", "", "say only what went wrong")
+    adder(group)("-q --quiet", "", "print only problems")
 
 
 def _folder(text: str) -> Path:
@@ -331,7 +332,7 @@ def _name(text: str) -> str:
 
 
 def is_group_level(arguments: Sequence[str]) -> bool:
-    """Tell a call of the group level from others, whatever folders are called."""
+    """Check whether a call is of the group level, whatever the names of folders."""
     if arguments[:1] == [LEVEL] and {"-h", "--help"} & set(arguments):
         return True
     if arguments[2:3]:
@@ -378,11 +379,11 @@ def _run(parsed: argparse.Namespace, arguments: Sequence[str]) -> ExitCode:
         warn(f"warning: {warning}")
     for note in result.notes:
         echo(f"note: {note}")
-    left_out = f"{result.n_excluded} hemispheres or visits left out"
-    left_out += " (excluded.tsv says which and why)" if result.n_excluded else ""
+    left_out = f"{result.n_excluded} hemispheres or visits excluded"
+    left_out += " (see excluded.tsv for the reasons)" if result.n_excluded else ""
     echo(f"{result.n_participants} participants in the model, {left_out}")
     echo(f"results: {result.folder}")
-    echo(f"what was done and found: {result.page or result.folder / 'methods.md'}")
+    echo(f"report: {result.page or result.folder / 'methods.md'}")
     if result.problem is not None:
         warn(f"report: {result.problem}")
     return ExitCode.OK

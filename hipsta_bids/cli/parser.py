@@ -38,7 +38,7 @@ class Parser(argparse.ArgumentParser):
     def parse_known_args(self, args: Sequence[str], namespace: Any = None) -> Any:  # type: ignore[override]  # noqa: ANN401  (as in argparse, but without its overloads)
         """Parse options in either spelling; the value of ``--slurm`` may begin with a dash.
 
-        Unknown options are told first: what follows one would be taken for something else.
+        Unknown options are reported first: the next argument would be taken for something else.
         """
         spelled: list[str] = []
         for text in args:
@@ -62,7 +62,7 @@ class Parser(argparse.ArgumentParser):
         return super().parse_known_args(spelled, namespace)
 
     def error(self, message: str) -> NoReturn:
-        """Turn argparse's message into the package's own error; name what is like unknown words."""
+        """Turn argparse's message into the package's own error; name words like unknown ones."""
         hint = ""
         unknown = message.removeprefix("unrecognized arguments: ")
         if unknown != message:
@@ -77,7 +77,7 @@ class Parser(argparse.ArgumentParser):
 def accept(parser: argparse.ArgumentParser, options: Mapping[str, str]) -> None:
     """Accept options that have no meaning here; ``--name VALUE`` takes a value. Not in the help.
 
-    What was given is in ``ignored`` of the namespace, in pairs with the reason.
+    The options given are in ``ignored`` of the namespace, in pairs with the reason.
     """
     for name, reason in options.items():
         flag, _, value = name.partition(" ")
@@ -106,9 +106,10 @@ def parser_of(command: str) -> tuple[Parser, Callable[..., None]]:
 def adder(group: argparse._ActionsContainer, command: str = "") -> Callable[..., None]:
     """Return a function that adds an argument to a group: spellings, value, text, and more.
 
-    Without a value it is a switch; ``A B`` takes two values; ``A...`` takes several, and more when
-    it is repeated. Paths are recognized by the value's name, numbers by the default. The texts of
-    a ``command`` are those of ``help.toml``.
+    Without a value it is a switch; ``A B`` takes two values; ``A...`` takes several,
+        and more when
+    it is repeated. Paths are recognized by the value's name, numbers by the
+        default. The texts of a ``command`` are in ``help.toml``.
     """
 
     def add(flags: str, value: str = "", text: str = "", **options: Any) -> None:  # noqa: ANN401  (argparse's)

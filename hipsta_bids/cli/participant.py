@@ -81,7 +81,7 @@ def add_selection(parser: Parser) -> None:
 
 
 def add_segmentations(parser: Parser) -> None:
-    """Add the options that say where segmentations are."""
+    """Add the options for the folders of segmentations."""
     add = adder(parser.add_argument_group("where the segmentations are"), _HELP)
     add("-d --derivatives", "NAME=PATH...", type=named_path)
     add("--freesurfer-dir --fs-subjects-dir", "DIR")
@@ -177,7 +177,7 @@ def _gigabytes(text: str) -> float:
 
 
 def run_participant_level(options: "Namespace", arguments: Sequence[str] = ()) -> ExitCode:
-    """Measure, collect or list hemispheres, as a parsed command line says."""
+    """Measure, collect or list hemispheres, by a parsed command line."""
     with console.quiet(options.quiet):
         return _run(options, arguments)
 
@@ -349,7 +349,7 @@ def check_output_is_no_input(out_dir: Path, items: "Sequence[HemisphereInput]") 
 
 
 def input_request(options: "Namespace") -> "InputRequest":
-    """Collect the options that say which inputs are asked for."""
+    """Collect the options that select inputs."""
     from hipsta_bids.inputs.scan import InputRequest  # noqa: PLC0415  (heavy)
 
     _settle_labels(options)

@@ -36,12 +36,17 @@ def add_questions(parser: Parser) -> None:
     add(
         "--power",
         "EFFECT=SHARE",
-        "participants per arm of a trial that is to find thinning=5%% of the mean, or"
-        " slowing=25%% of the change over time; from these participants, or from --retest",
+        "participants per arm to detect thinning=5%% of the mean or slowing=25%% of change, "
+        "from these participants or --retest",
         type=_effect,
     )
     add("--power-level", "P", "power to reach (default: 0.8)", type=float)
-    add("--dropout", "SHARE", "share of those enrolled who drop out (default: 0)", type=float)
+    add(
+        "--dropout",
+        "SHARE",
+        "share of the enrolled participants who drop out (default: 0)",
+        type=float,
+    )
     add(
         "--visits",
         "MONTHS",
@@ -52,8 +57,8 @@ def add_questions(parser: Parser) -> None:
     add(
         "--fit-norms",
         "",
-        "take these participants as a reference: mean and SD by age, sex and site at each point and"
-        " of each summary measure; norms.json holds no value of a participant",
+        "norms of these participants: mean and SD by age, sex and site, per point and "
+        "summary measure, without participants' values",
     )
     add(
         "--norms",
@@ -63,8 +68,7 @@ def add_questions(parser: Parser) -> None:
     add(
         "--controls",
         "COLUMN=LEVEL",
-        "who tells shift and scale of sites that the norms do not have, as group=CN; at least 25"
-        " at each",
+        "controls that estimate shift and scale of new sites, as group=CN; at least 25 per site",
         type=factor_level,
     )
     add = adder(parser.add_argument_group("for trials and norms"))
@@ -103,7 +107,7 @@ def _months(text: str) -> tuple[float, ...]:
 
 
 def is_question(parsed: argparse.Namespace) -> bool:
-    """Tell whether something other than a comparison is asked."""
+    """Check whether something other than a comparison is asked."""
     return any(getattr(parsed, name) for name in (*_TRIALS, *_NORMS))
 
 
@@ -139,8 +143,8 @@ def run_question(
     _refuse(parsed, _COMPARISON_ONLY, f"with {' and '.join(flags)}")
     if settings.harmonization.column:
         raise UsageError(
-            f"{' and '.join(flags)}: nothing is harmonized; leave harmonization.column out of the"
-            " settings (norms have sites in their model; for --power, put the site into --formula)"
+            f"{' and '.join(flags)}: harmonization is not possible; remove "
+            "harmonization.column from the settings"
         )
     if parsed.power is None:
         _refuse(parsed, _POWER_ONLY, "without --power")
@@ -169,4 +173,4 @@ def _refuse(parsed: argparse.Namespace, names: Sequence[str], context: str) -> N
     """Refuse options that would have no effect."""
     flags = [f"--{name.replace('_', '-')}" for name in names if getattr(parsed, name)]
     if flags:
-        raise UsageError(f"{', '.join(flags)}: has no meaning {context}; leave it out")
+        raise UsageError(f"{', '.join(flags)}: has no effect {context}; remove the option")

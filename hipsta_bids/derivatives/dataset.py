@@ -66,7 +66,7 @@ def read_description(root: Path) -> dict[str, Any] | None:
 
 
 def generated_by(description: Mapping[str, Any] | None) -> dict[str, str]:
-    """Names of the software that a dataset description says it was made by, with versions."""
+    """Names and versions of the software that made a dataset, by its description."""
     entries = (description or {}).get("GeneratedBy")
     if not isinstance(entries, list):
         entries = [(description or {}).get("PipelineDescription")]  # BIDS before 1.4
@@ -78,7 +78,7 @@ def generated_by(description: Mapping[str, Any] | None) -> dict[str, str]:
 
 
 def settle_settings(root: Path, settings: Settings) -> str:
-    """Record the resolved settings, or check that they are those of the earlier runs here.
+    """Record the resolved settings, or check that the earlier runs here had the same ones.
 
     One folder holds results of one set of settings only: maps made with different ones must
     not be pooled, so this holds for every run, ``--force`` or not.
@@ -94,8 +94,8 @@ def settle_settings(root: Path, settings: Settings) -> str:
         current = flatten(resolved)
         if recorded.keys() - current.keys():
             raise SettingsError(
-                f"{root}: holds results of version {earlier.get('version', 'unknown')}, which had"
-                " other settings; use a new output folder, or delete this one to redo all of it"
+                f"{root}: results of version {earlier.get('version', 'unknown')} with other "
+                "settings; use a new output folder, or delete this one"
             )
         changes = [
             f"{key} was {recorded.get(key, 'not there')}, now {current.get(key, 'not there')}"
@@ -103,8 +103,8 @@ def settle_settings(root: Path, settings: Settings) -> str:
             if recorded.get(key) != current.get(key)
         ]
         raise SettingsError(
-            f"{root}: holds results with other settings ({'; '.join(changes) or 'hash differs'});"
-            " use a new output folder, or delete this one to redo all of it"
+            f"{root}: results with other settings ({'; '.join(changes) or 'hash differs'}); "
+            "use a new output folder, or delete this one"
         )
     content = {"hash": digest, "version": __version__, "settings": resolved}
     files.write_json(path, content)
@@ -168,7 +168,7 @@ def _maker() -> dict[str, Any]:
 
 
 def container_of_process() -> dict[str, str]:
-    """Say which container this process is in: an entry of ``GeneratedBy``, empty outside."""
+    """Return the container of this process: an entry of ``GeneratedBy``, empty outside."""
     container = {
         key: os.environ[variable]
         for key, variable in CONTAINER_VARIABLES.items()
@@ -194,7 +194,7 @@ def _code_url() -> str | None:
 def link_to(folder: Path, root: Path) -> str:
     """Write where a folder is, as seen from the dataset: a relative path, else a ``file:`` URI.
 
-    The path is relative if it leads there and does not go through the root of the file system:
+    The path is relative if it leads there and does not pass the root of the file system:
     in a container the folders there are mounted one by one. Otherwise the folder is spelled as
     the user did, symbolic links included. :func:`linked_folder` is the inverse.
     """
@@ -389,7 +389,7 @@ def row_key(row: Row) -> tuple[str, ...]:
 
 
 def table_path(shard: str | None = None) -> str:
-    """Path in the output dataset of the table, or of that of one shard."""
+    """Path in the output dataset of the table, or of the table of one shard."""
     if shard is None:
         return DATASET_FILES["status"]
     return f"{DATASET_FILES['logs']}/{_SHARD_TABLE.replace('*', shard)}"
@@ -456,7 +456,7 @@ def name_of(row: Row) -> HemisphereName:
 
 
 def update_status(root: Path, rows: Iterable[Row], *, shard: str | None = None) -> None:
-    """Replace or add rows; those of other hemispheres stay.
+    """Replace or add rows; rows of other hemispheres stay.
 
     Safe for several runs at a time into the same folder, as on a cluster.
     """
@@ -477,7 +477,7 @@ def update_status(root: Path, rows: Iterable[Row], *, shard: str | None = None) 
 
 
 def write_sidecar(root: Path) -> None:
-    """Write ``status.json``, which says what the columns are."""
+    """Write ``status.json``, which defines the columns."""
     stages = {f"{STAGE_PREFIX}*": ["elapsed time of one stage, s"]}
     files.write_json(root / DATASET_FILES["status_sidecar"], describe_columns(COLUMNS | stages))
 
@@ -498,7 +498,7 @@ def counts_text(counts: Mapping[str, int]) -> str:
 
 
 def provenance_of(record: Mapping[str, Any]) -> dict[str, str]:
-    """Return where the labels of a quality record come from; ``n/a`` where it does not say."""
+    """Return the origin of the labels of a quality record; ``n/a`` where it has none."""
     entry = record.get("provenance")
     fields = entry if isinstance(entry, Mapping) else {}
     return {key: str(fields.get(key) or files.MISSING) for key in PROVENANCE}

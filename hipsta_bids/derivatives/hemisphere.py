@@ -49,8 +49,7 @@ _SUMMARY_ROWS = {row.name: row for row in SUMMARY}
 
 #: What all of these tables are about, whatever the columns.
 _MEASURED_REGION = (
-    "the sheet between the two end planes of the hippocampal body; head and tail are not measured"
-    " and not part of any number"
+    "the sheet between the two end planes of the hippocampal body; head and tail are in no number"
 )
 _WHOLE_REGION = "the hippocampal sheet with head, and tail where it has subfields; experimental"
 _MILLIMETER_DIGITS = 4
@@ -79,7 +78,7 @@ class ResultPlace:
         return [self.path(row.key) for row in OUTPUTS if optional or not row.optional]
 
     def extra_paths(self) -> list[Path]:
-        """Existing files that came with an option or another command."""
+        """Existing files of an option or another command."""
         folder = self.root / self.name.folder
         names = [output_name(self.name, row.key) for row in EXTRA_OUTPUTS]
         return [path for name in names for path in sorted(folder.glob(name))]
@@ -94,7 +93,7 @@ def remove_results(result: ResultPlace) -> None:
 
 
 def sheet_labels(protocol: Protocol) -> dict[Tissue, Label]:
-    """Choose one label per sheet tissue: that of the body, since the sheet is the body's."""
+    """Choose one label per sheet tissue: the body's, since the sheet is the body's."""
     first_labels: dict[Tissue, Label] = {}
     for label in sorted(protocol.labels, key=lambda label: label.part != Part.BODY):
         first_labels.setdefault(label.tissue, label)
@@ -232,7 +231,7 @@ def _measure(row: Column, wording: str = "{}") -> dict[str, object]:
 
 
 def summary_definition(column: str) -> dict[str, object]:
-    """Define a summary measure; the name of a subfield's begins with that of the measure."""
+    """Define a summary measure; the name of a subfield's begins with the measure's."""
     if column in _SUMMARY_ROWS:
         return _measure(_SUMMARY_ROWS[column])
     for row in PER_SUBFIELD:
@@ -378,8 +377,8 @@ def gifti_files(maps: HemisphereMaps, protocol: Protocol, hemi: str) -> Iterator
     """Encode the surfaces and the maps on them.
 
     Vertices are the sheet's columns, y fastest, as the rows of the sheet table are. Surfaces
-    need finite vertices: a column without a position gets that of its nearest neighbor on the
-    grid, while the maps keep their NaN.
+    need finite vertices: a column without a position gets its nearest neighbor's on the grid, while
+    the maps keep their NaN.
     """
     points = maps.sheet.points
     nx, ny = points.shape[:2]
@@ -496,7 +495,7 @@ def read_sheet(
     """Read columns of a table with one row per sheet point, as (Nx, Ny) arrays.
 
     Missing numbers are NaN, missing words empty. Without ``numbers`` all columns that hold numbers
-    are read; without ``shape`` the last row says how many nodes there are.
+    are read; without ``shape`` the last row has the number of nodes.
     """
     try:
         open_regular(path).close()
@@ -514,7 +513,7 @@ def read_sheet(
         ) from error
     expected = np.divmod(np.arange(len(x)), max(ny, 1))
     if len(x) != nx * ny or (x != expected[0] + 1).any() or (y != expected[1] + 1).any():
-        suffix = ", as the settings say" if shape else ""
+        suffix = " of the settings" if shape else ""
         raise InputError(f"{path}: not a sheet of {nx} x {ny} nodes{suffix}; {_REDO}")
     names = (*numbers, *words)
     return {name: column.reshape(nx, ny) for name, column in zip(names, values, strict=True)}

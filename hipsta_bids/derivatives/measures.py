@@ -33,7 +33,7 @@ def identify(name: HemisphereName) -> dict[str, str]:
 
 
 def origin(record: Mapping[str, Any]) -> dict[str, str]:
-    """Cells that say where the labels of a quality record come from."""
+    """Cells with the origin of the labels of a quality record."""
     return {f"{_ORIGIN}{name}": cell for name, cell in dataset.provenance_of(record).items()}
 
 

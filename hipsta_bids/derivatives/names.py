@@ -33,7 +33,7 @@ class HemisphereName(Hemisphere):
 
     @property
     def protocol(self) -> str:
-        """Entities that tell results of one hemisphere apart: protocol and region."""
+        """Entities that distinguish results of one hemisphere: protocol and region."""
         label = "" if self.region == "body" else f"_label-{self.region}"
         return f"seg-{self.seg}{label}"
 
@@ -126,7 +126,7 @@ def _sidecars(images: Sequence[Output]) -> tuple[Output, ...]:
             f"{desc or suffix}_sources",
             suffix,
             ".json",
-            "inputs that the images with this ending come from (`Sources`)",
+            "sources of the images with this ending (`Sources`)",
             desc=desc,
             in_standard=rows[0].in_standard,
             images=tuple(rows),
@@ -237,7 +237,7 @@ META, META_REPORT = "meta", "meta.html"
 IGNORED: dict[str, str] = TEXTS["ignored"]
 
 _IGNORE_HEAD = """\
-# For the BIDS validator: what is in this dataset, but has no name in BIDS 1.11."""
+# For the BIDS validator: files of this dataset without a name in BIDS 1.11."""
 
 _RECORD = re.compile(
     r"sub-(?P<subject>[^_]+)(?:_ses-(?P<session>[^_]+))?_hemi-(?P<hemi>[LR])_seg-(?P<seg>[^_]+)"
@@ -326,7 +326,7 @@ def write_shared(root: Path) -> None:
 
 
 def describe(sidecar: Output) -> dict[str, str]:
-    """Say what the images of a sidecar are, from the table of outputs."""
+    """Describe the images of a sidecar, from the table of outputs."""
     about = {
         "Description": _by_name(sidecar, lambda image: image.description),
         "SpatialReference": _by_name(sidecar, lambda image: _SPACES[image.space]),

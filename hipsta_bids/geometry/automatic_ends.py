@@ -78,7 +78,7 @@ def find_ends(
     """Find where each end lies along the axis, between the levels of ends that are known, mm.
 
     As in Diers et al. 2023, section 2.1, the body has CA1 and CA2 or CA3 everywhere. It also has a
-    dentate gyrus, and cross-sections like those in its middle. All this is evidence for or against
+    dentate gyrus, and cross-sections like its middle. All this is evidence for or against
     each level; an end is the mean over all places where the body may end, weighted by evidence.
     """
     if settings.end_rule == "last-slice":
@@ -119,8 +119,8 @@ def find_ends(
 
 def _no_body() -> GeometryError:
     return GeometryError(
-        "no slice across the long axis has both CA1 and CA2/CA3, and there are no head and "
-        "tail labels: label the head and the tail, or check that the protocol fits the labels",
+        "no slice has both CA1 and CA2/CA3, and no head and tail are labeled; label them, "
+        "or check the protocol",
         reason="no-body",
     )
 
@@ -273,8 +273,8 @@ def _mean_ends(
         allowed &= levels == levels[np.abs(levels - high).argmin()]
     if not allowed.any():
         raise GeometryError(
-            f"the labels go on for less than {settings.min_length:g} mm beside the one end that "
-            "has a label or a plane: check it, or label the whole hippocampus",
+            f"the labels extend less than {settings.min_length:g} mm from the one known end; "
+            "check that end, or label the whole hippocampus",
             reason="body-too-short",
         )
     weight = np.where(allowed, weight, -np.inf)

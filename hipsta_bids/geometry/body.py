@@ -41,7 +41,7 @@ class MaskChange:
 
     @property
     def share(self) -> float:
-        """Changed voxels over those of the body as labeled."""
+        """Changed voxels over the voxels of the body as labeled."""
         return (self.added + self.removed) / max(self.before, 1)
 
 
@@ -213,8 +213,8 @@ def _check_ends_reached(points: Float, ends: EndPlanes) -> None:
         gap = float((sign * ends.height(points, end)).min())
         if gap > _LAST_VOXEL:
             raise GeometryError(
-                f"the labels end {gap:.1f} mm before the {end} end plane: check these labels, "
-                "and those of head and tail",
+                f"the labels end {gap:.1f} mm before the {end} end plane; check these "
+                "labels, and the head and tail",
                 reason="body-too-short",
             )
 
@@ -263,8 +263,8 @@ def wrong_side(hemi: str, offset: float) -> GeometryError:
     side = {"L": "left", "R": "right"}
     opposite = side["R" if hemi == "L" else "L"]
     return GeometryError(
-        f"labeled {side[hemi]}, but the subiculum lies {-offset:.1f} mm lateral of CA1 as in "
-        f"a {opposite} hemisphere: check the image's affine and which file is which",
+        f"labeled {side[hemi]}, but the subiculum lies {-offset:.1f} mm lateral of CA1 as "
+        f"in a {opposite} hemisphere; check affine and file",
         reason="left-right-swapped",
     )
 
@@ -341,9 +341,8 @@ def check_reach(
     share = len(np.unique(level)) / count
     if share < settings.min_cortex_reach:
         raise GeometryError(
-            f"region {settings.region}: the cortex is labeled along {share * length:.1f} mm of the "
-            f"{length:.1f} mm between the end planes: measure the body, or label the cortex beside "
-            "all of it",
+            f"region {settings.region}: cortex is labeled along {share * length:.1f} of "
+            f"{length:.1f} mm; label it all along, or measure the body",
             reason="cortex-incomplete",
         )
 
@@ -362,8 +361,8 @@ def _apply_mask(
     retained = inside & (old > 0)
     if not retained.any():
         raise GeometryError(
-            "the edited mask and the sheet's labels have no voxel in common between the end "
-            "planes: check that the mask is of this hemisphere and in the space of the labels",
+            "the edited mask misses the sheet's labels between the end planes; check its "
+            "hemisphere and its space",
             reason="edited-mask-elsewhere",
         )
     new = np.where(retained, old, np.uint8(0))

@@ -91,7 +91,7 @@ def center_curves(
     lines and held at its signs elsewhere: a side that bends more, or reaches farther into a band,
     would pull the line towards itself. Bands fade out, so that a vertex that enters one moves
     nothing by much. Returns the lines and the function before the first band and after each. Lines
-    that meet those of a ``reference`` on their way become these.
+    that meet the lines of a ``reference`` on their way become these.
     """
     curves, steps = end_to_end(wall, values), list[Centered]()
     for width in bands:
@@ -123,8 +123,8 @@ def facing_strips(
 ) -> tuple[Pair, Pair] | None:
     """Weight (V,) the parts of the wall near two curves that face along the sheet, away from it.
 
-    A flat edge is such a part from corner to corner; of a round one, it is the middle. The
-    direction of the sheet at its edge is that of a harmonic function from edge to edge, continued
+    A flat edge is one part from corner to corner; of a round one, it is the middle. The direction
+    of the sheet at its edge is the gradient of a harmonic function from edge to edge, continued
     from inside the sheet, where it does not depend on where exactly the curves lie. The middle
     lines of the strips replace the curves, and the same is done again.
 
@@ -284,7 +284,7 @@ class Boundaries:
 def find_boundaries(
     surface: Surface, laplace: Laplace, body: Body, settings: BoundarySettings
 ) -> Boundaries:
-    """Find the boundary strips, sides and caps of the sheet; the operator is that of its volume.
+    """Find the boundary strips, sides and caps of the sheet; the operator is its volume's.
 
     The zero lines of the first curvature-aware anisotropic Laplace-Beltrami eigenfunction of the
     wall are the medial and lateral boundary (Diers et al. 2023, section 2.1.3), moved to the middle
@@ -312,8 +312,8 @@ def find_boundaries(
         tilt += not lines
     if not lines:
         raise GeometryError(
-            "no line runs along the medial and the lateral edge from end to end: check the labels "
-            "for folds that touch each other",
+            "no line runs along the medial and lateral edge from end to end; check the "
+            "labels for touching folds",
             reason="boundaries",
         )
     distances = [_curve_distance(steps[-1][0], lines[0][-1][0]) for steps in lines]
@@ -405,9 +405,8 @@ def _inseparable(curves: Pair, body: Body) -> GeometryError:
     closest = int(gap.argmin())
     position = name_place(np.stack([curves[0][closest], curves[1][nearest[closest]]]), body)
     return GeometryError(
-        "the medial and lateral boundary do not separate the interior from the exterior side: "
-        f"check the labels for folds that touch each other, first near {position}, where the "
-        f"sheet's medial and lateral edge are only {gap[closest]:.1f} mm apart",
+        "the medial and lateral boundary do not separate interior and exterior; check for "
+        f"touching folds near {position} (gap {gap[closest]:.1f} mm)",
         reason="boundaries",
     )
 

@@ -164,7 +164,7 @@ class SummaryMeasure(Column):
 
 @dataclass(frozen=True)
 class SubfieldMeasure(Column):
-    """One number per subfield, whose name is appended to that of the column."""
+    """One number per subfield, whose name is appended to the column's."""
 
     compute: Callable[[Measured, Tissue], float]
     """Function that returns the number; NaN for a subfield that is absent."""
@@ -198,8 +198,7 @@ def _gaussian_curvature(surface: str, ending: str, level: int | None) -> MapMeas
     return MapMeasure(
         f"gaussian_curvature{ending}",
         "1/mm^2",
-        f"Gaussian curvature of the {surface}: positive in bowls and domes, negative in"
-        " saddles, zero where it could be laid flat",
+        f"Gaussian curvature of the {surface}, positive in bowls and domes, negative in saddles",
         lambda m: m.gaussian_curvature(m.sheet.middle if level is None else level),
         source=DO_CARMO,
         digits=6,
@@ -310,9 +309,7 @@ def _over_body(row: SectionMeasure) -> SummaryMeasure:
 
 def _over_sheet(row: MapMeasure) -> SummaryMeasure:
     """Average a map over the part of the sheet where it is reliable: away from the edges."""
-    qualifier = (
-        "; mean over the mid-surface away from rims and ends, by half of measures.curvature_window"
-    )
+    qualifier = "; mean over the mid-surface without margins of half of measures.curvature_window"
     return _mean(row, qualifier, lambda m: m.mean(row.compute(m), m.away))
 
 
@@ -370,7 +367,7 @@ SUMMARY: tuple[SummaryMeasure, ...] = (
     SummaryMeasure(
         "area_ratio",
         "1",
-        "area of the interior over that of the exterior wall",
+        "area of the interior wall over area of the exterior wall",
         lambda m: m.wall_area(0) / m.wall_area(-1),
         digits=5,
     ),
@@ -448,9 +445,10 @@ def average_profiles(maps: Mapping[str, Float], sheet: Sheet) -> dict[str, dict[
 
 
 def why_impossible(name: str, values: Float) -> str | None:
-    """Say what no hippocampus has in a map of some measure, any shape, or a summary measure.
+    """Return why a map of some measure, any shape, or a summary measure is impossible, or None.
 
-    Those of others may be all. A map has the same value at every point only if it was not measured.
+    Measures of other programs may have any value. A map has the same value at every point only if
+    it was not measured.
     """
     measure = next((row for row in (*MAPS, *SUMMARY) if row.name == name), None)
     measure = measure or next((r for r in PER_SUBFIELD if name.startswith(f"{r.name}_")), None)

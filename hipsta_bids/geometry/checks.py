@@ -88,8 +88,8 @@ def check_label_order(
     swapped = any(b < a for a, b in pairwise(medians))
     if not order >= settings.min_label_order or swapped:
         raise GeometryError(
-            f"the subfields do not follow each other from medial to lateral (rank correlation "
-            f"{order:.2f}): check that the protocol fits the labels",
+            "the subfields are not in order from medial to lateral (rank correlation "
+            f"{order:.2f}); check the protocol",
             reason="label-order",
         )
     return order
@@ -139,7 +139,7 @@ def name_subfields(body: Body) -> Callable[[Float], str]:
 
 
 def find_contacts(body: Body) -> Callable[[Float], bool]:
-    """Make a function that says whether the two ends of the sheet touch at (N, 3) points, RAS mm.
+    """Make a function that checks whether the two ends of the sheet touch at (N, 3) points, RAS mm.
 
     The subiculum and CA2 or CA3 are no neighbors on the sheet: where both are near, two of its
     turns touch.
@@ -235,7 +235,7 @@ def _check_beyond(volume: types.LabelVolume, body: Body) -> list[Finding]:
 
 
 def describe_uncus(body: Body, settings: CheckSettings) -> list[str]:
-    """Say that the uncus was left out of the sheet, and warn if it begins far behind the head."""
+    """Note that the uncus was excluded from the sheet; warn if it begins far behind the head."""
     if not len(body.uncus):
         return []
     points = digital.to_ras(body.uncus, body.affine)
@@ -243,11 +243,11 @@ def describe_uncus(body: Body, settings: CheckSettings) -> list[str]:
     reach = float(-body.ends.height(points, "anterior").min())
     far = f"; it begins {reach:.1f} mm behind the anterior end: does the head begin there?"
     warning = far if reach > settings.uncus_reach else ""
-    return [f"left out the uncus, {volume:.0f} mm3 at {name_place(points, body)}{warning}"]
+    return [f"the uncus was excluded, {volume:.0f} mm3 at {name_place(points, body)}{warning}"]
 
 
 def check_cavities(body: Body, settings: CheckSettings) -> list[Finding]:
-    """Flag large cavities that were too wide to say whose they are."""
+    """Flag large cavities that were too wide to assign to one side."""
     size = max(len(body.inside_points()[0]), 1)
     return [
         Finding(
@@ -255,9 +255,8 @@ def check_cavities(body: Body, settings: CheckSettings) -> list[Finding]:
             value=len(cavity) / size,
             limit=settings.flag_cavity,
             text=f"a cavity of {len(cavity) * body.voxel_volume:.0f} mm3 without a label was "
-            "divided between the sheet and its interior, mean thickness may be off by "
-            f"{len(cavity) / size / 2:.0%}",
-            remedy="label what it is",
+            f"divided, sheet to interior; the mean may be off by {len(cavity) / size / 2:.0%}",
+            remedy="label the cavity",
             points=digital.to_ras(cavity, body.affine),
         )
         for cavity in body.cavities.wide
@@ -323,11 +322,11 @@ def check_cross_sections(
 ) -> list[Finding]:
     """Flag a body of which a part is missing between cross-sections that have it, or added.
 
-    Each cross-section is compared with those at a distance on both sides. What both lack, or where
-    both have interior labels, is compared with the same body's other cross-sections: a bent ribbon
-    moves sideways everywhere, a leak is in one position. ``slice_step`` is the distance of slices,
-    mm; ``cuts`` are nodes of bridges that were cut, whose stumps do not count, nor do cavities
-    that were filled.
+    Each cross-section is compared with two others, at a distance on both sides. What both lack, or
+    where both have interior labels, is compared with the same body's other cross-sections: a bent
+    ribbon moves sideways everywhere, a leak is in one position. ``slice_step`` is the distance of
+    slices, mm; ``cuts`` are nodes of bridges that were cut, whose stumps do not count, nor do
+    cavities that were filled.
     """
     solid = field.values > 0
     interior = np.zeros_like(solid) if field.interior is None else field.interior
@@ -361,8 +360,18 @@ def check_cross_sections(
             usual = contrast * (float(np.median(share)) + least)
             outlier.update(part, share, usual, k + field.beyond)
     rows = (
-        ("section-notch", notch, "lacks what its neighbors have", "complete the labels there"),
-        ("section-bump", bump, "has what its neighbors lack", "look for leaks and bridges there"),
+        (
+            "section-notch",
+            notch,
+            "lacks a part that its neighbors have",
+            "complete the labels there",
+        ),
+        (
+            "section-bump",
+            bump,
+            "has a part that its neighbors lack",
+            "look for leaks and bridges there",
+        ),
         (
             "section-intrusion",
             intrusion,
@@ -394,7 +403,7 @@ class _Outlier:
     """Grid nodes (N, 3) that depart."""
 
     def update(self, part: Bool, share: Float, limit: float, first: int) -> None:
-        """Take over the cross-section that departs most, if more than those before."""
+        """Take over the cross-section that departs most, if more than before."""
         at = int(share.argmax())
         if share[at] / limit > self.share / self.limit:
             self.share, self.limit = float(share[at]), limit
@@ -415,7 +424,7 @@ def raise_flags(
     sheet: Sheet,
     position: Callable[[Float], str],
 ) -> list[Flag]:
-    """Turn what is beyond its limit into flags that say where, and what it means for the map.
+    """Turn findings beyond their limits into flags, with place and consequence for the map.
 
     ``position`` writes the place of (N, 3) points, RAS mm.
     """
@@ -444,10 +453,10 @@ def raise_flags(
 
 
 def add_consequence(finding: Finding, sheet: Sheet) -> Finding:
-    """Add which share of the columns the points of a finding concern, and what that does.
+    """Add the share of the columns that the points of a finding concern, and its consequence.
 
-    The mean thickness, weighted by area, is compared with that of a map in which the columns near
-    these points are as those around them. A share that is known already is left as it is.
+    The mean thickness, weighted by area, is compared with a map in which the columns near these
+    points have values of their neighbors. A share that is known already is left as it is.
     """
     if not len(finding.points) or not np.isnan(finding.share):
         return finding
@@ -456,7 +465,7 @@ def add_consequence(finding: Finding, sheet: Sheet) -> Finding:
 
 
 def change_of_mean(sheet: Sheet, concerned: Bool) -> float:
-    """Compute how much larger the mean thickness is than with columns (Nx, Ny) as those around.
+    """Compute how much larger the mean thickness is than with the neighbors of columns (Nx, Ny).
 
     In mm, weighted by area; NaN if all columns are concerned.
     """
@@ -507,9 +516,9 @@ def consequence_text(finding: Finding) -> str:
     extent = "all columns" if finding.share == 1 else f"{finding.share:.1%} of the columns"
     if np.isnan(finding.change):
         return f"; it concerns {extent}"
-    change = "the same" if abs(finding.change) < _NEGLIGIBLE else f"{abs(finding.change):.2f} mm "
-    if abs(finding.change) >= _NEGLIGIBLE:
-        change += "less" if finding.change > 0 else "more"
+    if abs(finding.change) < _NEGLIGIBLE:
+        return f"; it concerns {extent} and does not change the mean thickness"
+    change = f"{abs(finding.change):.2f} mm {'less' if finding.change > 0 else 'more'}"
     if finding.share == 1:
         return f"; it concerns all columns, the mean thickness may be {change}"
-    return f"; it concerns {extent}: were they as those around them, the mean would be {change}"
+    return f"; it concerns {extent}: with values of the neighbors, the mean would be {change}"

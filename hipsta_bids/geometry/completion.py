@@ -104,8 +104,8 @@ def find_uncus(tissue: Tissues, affine: Float, ends: EndPlanes) -> Index:
     """Find voxels (N, 3) of the uncus, which the head bends back to beside the body.
 
     It shows as a second piece of CA2 or CA3 that reaches the anterior plane far medially of the
-    first. The part of CA1 that is nearer to it than to the rest, on the way through the sheet, goes
-    with it.
+    first. The part of CA1 that is nearer to it than to the rest, on the way through the sheet, is
+    part of it.
     """
     index = digital.positions(tissue > 0)
     points = digital.to_ras(index, affine)
@@ -186,7 +186,7 @@ def hand_over(
 ) -> tuple[LabelVolume, Tissues, int]:
     """Give head and tail voxels up to a distance inside the planes the label of a neighbor.
 
-    No plane separates labels perfectly; left out, these voxels would be holes in the sheet.
+    No plane separates labels perfectly; if excluded, these voxels would be holes in the sheet.
     """
     index = digital.positions(volume.tissue == Tissue.HIPPOCAMPUS)
     depth = ends.depth(digital.to_ras(index, volume.affine))
@@ -205,11 +205,11 @@ def find_cavities(
     *,
     second: bool = False,
 ) -> Cavities:
-    """Find what is unlabeled but enclosed by the sheet, its layer and its interior.
+    """Find unlabeled voxels enclosed by the sheet, its layer and its interior.
 
-    Vessels, cysts and strata that were left out make the inner wall jump across them. A cavity is
+    Vessels, cysts and strata without a label make the inner wall jump across them. A cavity is
     enclosed in three dimensions, or in a slice if little of it is open to the next slices. With
-    ``second``, what is near to a limit is taken for the other kind.
+    ``second``, cavities near to a limit are taken for the other kind.
     """
     solid = _subfields(volume) | np.isin(volume.tissue, (Tissue.HIPPOCAMPUS, Tissue.FISSURE))
     around = digital.box_around(digital.positions(between(solid, volume.affine, ends)[0]))
@@ -264,8 +264,8 @@ def fill_cavities(
 ) -> tuple[LabelVolume, Tissues]:
     """Make narrow cavities a part of the layer, where it is labeled, and divide others.
 
-    What lies between the sheet and its interior is the layer in the first place. What is too wide
-    for that, or has no layer beside it, goes to the nearest label on either side.
+    Cavities between the sheet and its interior belong to the layer. Wider ones, and ones without a
+    layer beside them, get the nearest label on either side.
     """
     donors = _subfields(volume)
     narrow = donors

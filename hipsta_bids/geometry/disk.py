@@ -31,7 +31,7 @@ _SLACK = 1e-6
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Disk:
-    """A triangle mesh with one boundary; what was filled is marked."""
+    """A triangle mesh with one boundary; filled holes are marked."""
 
     vertices: Float
     """(V, 3) RAS mm."""
@@ -204,7 +204,7 @@ class Edges:
 def find_edges(disk: Disk, medial: Float, lateral: Float, height: Float) -> Edges:
     """Divide the boundary by what speaks for (1) and against (-1) an edge at its vertices (B,).
 
-    An edge is the arc with the largest sum, by length; what is left are the ends. ``height`` (B,)
+    An edge is the arc with the largest sum, by length; the rest are the ends. ``height`` (B,)
     rises towards the anterior end.
     """
     points = disk.vertices[disk.loop]
@@ -217,8 +217,8 @@ def find_edges(disk: Disk, medial: Float, lateral: Float, height: Float) -> Edge
     second = _best_arc(np.where(excluded, -length.sum(), lateral * length))
     if not (len(first) and len(second)):
         raise GeometryError(
-            "the sheet has no medial or no lateral edge: check the labels of the subiculum, and of "
-            "CA2 and CA3 beside the dentate gyrus",
+            "the sheet has no medial or lateral edge; check the labels of the subiculum, "
+            "CA2 and CA3",
             reason="whole-topology",
         )
     arcs = [first, second]
@@ -254,10 +254,10 @@ def map_to_rectangle(
 ) -> Float:
     """Two functions (V, 2): x from -1 to 1 between the edges, y between the two values of ``ends``.
 
-    Where ``body`` (V, 2) is a number, beyond ``NEAR`` of edges, ends and holes, both are those of
-    the body; elsewhere they go on as harmonic functions. Such a function changes most beside a
+    Where ``body`` (V, 2) is a number, beyond ``NEAR`` of edges, ends and holes, both are the
+    body's; elsewhere they continue as harmonic functions. A harmonic function changes most beside a
     short end: there its lines would all lie. Beyond plus and minus ``extent``, y is therefore the
-    mean distance along the sheet, from the body, of what lies on a line.
+    mean distance along the sheet, from the body, of the points of a line.
     """
     matrix = disk.stiffness
     inside = (disk.from_edges > NEAR) & np.isfinite(body).all(axis=1)

@@ -176,9 +176,8 @@ def _check_inside(user_end: GivenEnd, points: Float) -> None:
     distance = float(np.linalg.norm(points - user_end.point, axis=1).min())
     if distance > _FAR:
         raise GeometryError(
-            f"the given {user_end.end} end at {position_text(np.array(user_end.point))} lies "
-            f"{distance:.0f} mm from the labels: give a point in the hippocampus, in scanner "
-            "coordinates (RAS, mm)",
+            f"the given {user_end.end} end at {position_text(np.array(user_end.point))} is "
+            f"{distance:.0f} mm from the labels; give scanner coordinates (RAS, mm)",
             reason="given-end-outside",
         )
 
@@ -218,8 +217,8 @@ def _checked(planes: dict[End, EndPlane], axis: Float, half_slice: float) -> End
         if tilt > 50:  # noqa: PLR2004 -- beyond this the labels do not end across the long axis
             if rule == "user":
                 raise GeometryError(
-                    f"the given {end} end plane at {at} is tilted by {tilt:.0f} degrees against "
-                    "the long axis: correct its normal in the table of ends",
+                    f"the given {end} end plane at {at} is tilted by {tilt:.0f} degrees; "
+                    "correct its normal in the table of ends",
                     reason="end-plane-tilted",
                 )
             lacking = [
@@ -227,14 +226,13 @@ def _checked(planes: dict[End, EndPlane], axis: Float, half_slice: float) -> End
             ]
             if lacking:
                 raise GeometryError(
-                    f"what is labeled does not run from the {end} end near {at} to the "
-                    f"{lacking[0]} one, which has no label: the body may be cut short there; label "
-                    "the whole hippocampus",
+                    f"labels from the {end} end near {at} do not reach the {lacking[0]} end, "
+                    "which has none; label the whole hippocampus",
                     reason="labels-end",
                 )
             raise GeometryError(
-                f"the {end} end plane near {at} is tilted by {tilt:.0f} degrees against the "
-                "long axis: check the head and tail labels there",
+                f"the {end} end plane near {at} is tilted by {tilt:.0f} degrees; check the "
+                "head and tail labels there",
                 reason="end-plane-tilted",
             )
     posterior, anterior = planes["posterior"], planes["anterior"]
@@ -252,7 +250,7 @@ def long_axis(points: Float, parts: NDArray[np.uint8]) -> Float:
 
     It joins the centers of the labeled head and tail. Otherwise it is the first principal axis,
     directed anteriorly (+y in RAS), unless one end is labeled and lies in quite another direction
-    from the rest: what is cut short may be wider than long.
+    from the rest: a body cut short may be wider than long.
     """
     head, tail = points[parts == Part.HEAD], points[parts == Part.TAIL]
     if len(head) and len(tail):

@@ -80,7 +80,7 @@ class Faces:
 def whole_tissue(volume: LabelVolume, body: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """(I, J, K) the largest piece of the sheet's subfields, cavities filled; 0 elsewhere.
 
-    What has no label but a tissue in the ``body``, where gaps are mended, has it here, too.
+    Voxels without label that have a tissue in the ``body``, as mended gaps, have it here, too.
     """
     mended = (volume.tissue == Tissue.BACKGROUND) & (body > 0)
     sheet = np.isin(volume.tissue, volume.protocol.sheet)
@@ -281,7 +281,7 @@ def find_touching_banks(surface: Surface, faces: Faces) -> list[TouchingBanks]:
 def find_ridges(sheet: Sheet, among: Bool) -> list[tuple[Bool, float]]:
     """Find narrow places where the sheet is thick: columns (Nx, Ny), and area without slopes, mm2.
 
-    Only columns ``among`` (Nx, Ny) belong to them; all that have a value are what is round them.
+    Only columns ``among`` (Nx, Ny) belong to them; all that have a value are their surroundings.
     """
     thickness, middle = measure_thickness(sheet), sheet.points[:, :, sheet.middle][sheet.valid]
     values = thickness[sheet.valid]

@@ -33,9 +33,8 @@ class Laplace:
 
     LaPy (Reuter et al. 2006, Computer-Aided Design 38:342-366) makes them. With the solver
     ``lapy`` it also solves its own equations. ``two-level`` takes less time: it iterates where most
-    vertices of a large volume are free, factorizes symmetric matrices as such, and asks ARPACK for
-    no more vectors than it needs, none of which can be told to ``Solver.poisson`` or
-    ``Solver.eigs``.
+    vertices of a large volume are free, uses the symmetry of matrices, and asks ARPACK for no more
+    vectors than it needs, which ``Solver.poisson`` and ``Solver.eigs`` have no options for.
     """
 
     def __init__(
@@ -58,7 +57,7 @@ class Laplace:
     ) -> Float:
         """Harmonic function (V,) with given values at some vertices and no flux elsewhere.
 
-        Where it is iterated, what is left over is at most ``residual`` of the right-hand side.
+        Where it is iterated, the residual is at most ``residual`` of the right-hand side.
         """
         result, free = np.zeros(len(self.points)), np.ones(len(self.points), dtype=bool)
         result[fixed], free[fixed] = values, False
@@ -131,7 +130,7 @@ class Laplace:
         return values[order], functions[:, order]
 
     def first_near(self, values: Float, similar: "Laplace") -> Float:
-        """Compute the first eigenfunction (V,), roughly, from that of a similar operator.
+        """Compute the first eigenfunction (V,), roughly, from a similar operator's.
 
         The other one's factors take the place of its own (LOBPCG: Knyazev 2001, SIAM J Sci Comput
         23:517-541).

@@ -129,7 +129,7 @@ class Field:
 def resample_body(body: Body, hemi: str, settings: GridSettings, slices: SliceSettings) -> Field:
     """Sample the body's mask on a wedge grid and smooth it.
 
-    Beyond its end planes the body goes on as it is there.
+    Beyond its end planes the body is continued unchanged.
     """
     grid = _fit_grid(body, hemi, settings)
     separated = None
@@ -169,9 +169,9 @@ def cut_across(body: Body) -> bool:
 def continued_nodes(grid: WedgeGrid, body: Body, depth: float) -> Float:
     """Where to read the labels of all nodes, (A, B, W, 3), RAS mm.
 
-    Nodes less than ``depth``, mm, inside an end plane, and those beyond it, are moved to that depth
-    along the body: there it goes on as it does behind the plane. Its cross-sections move, and
-    change linearly: walls that lean against its direction would be read too thick without that.
+    Nodes less than ``depth``, mm, inside an end plane, and nodes beyond it, are moved to that depth
+    along the body: it is continued there as behind the plane. Its cross-sections move, and change
+    linearly: walls that lean against its direction would be read too thick without that.
     """
     points = grid.node_points()
     for end, outward in body.outward.items():
@@ -302,21 +302,20 @@ def in_plane_voxel(affine: Float) -> float:
 
 
 def check_voxel(volume: LabelVolume, settings: CheckSettings) -> None:
-    """Refuse labels that are too coarse for any sheet, before anything goes wrong in them."""
+    """Refuse labels that are too coarse for any sheet, before anything is computed from them."""
     voxel = in_plane_voxel(volume.affine)
     if voxel > settings.max_voxel:
         raise GeometryError(
-            f"voxels of {voxel:.2f} mm in plane are too coarse for a sheet of one to two "
-            f"millimeters, {settings.max_voxel:g} mm is the limit: use a finer segmentation "
-            "(HippUnfold's file in space-crop*, FreeSurfer's without .FSvoxelSpace)",
+            f"voxels of {voxel:.2f} mm are too coarse (limit {settings.max_voxel:g} mm); use "
+            "finer labels (HippUnfold: space-crop*, FreeSurfer: without .FSvoxelSpace)",
             reason="sheet-too-thin",
         )
     steps = np.array([_repeats(np.moveaxis(volume.tissue, axis, 0)) for axis in range(3)])
     if np.sum(steps > _MAX_REPEATS) > 1:
         larger = np.max(np.linalg.norm(volume.affine[:3, :3], axis=0) * steps)
         raise GeometryError(
-            f"voxels of {voxel:.2f} mm in plane repeat their neighbors, as if larger ones of about "
-            f"{larger:.2f} mm had been resampled: use the labels before that",
+            f"voxels of {voxel:.2f} mm were resampled from about {larger:.2f} mm; use the "
+            "labels before resampling",
             reason="sheet-too-thin",
         )
 

@@ -92,8 +92,8 @@ def _check_tissues(volume: LabelVolume) -> None:
         needed.append(" or ".join(tissue.name for tissue in LATERAL_END if tissue in lateral))
     if needed and len(absent) < len(sheet):  # without any there is a message of its own
         raise GeometryError(
-            f"the label image has no {', no '.join(needed)}, which the sheet of the protocol "
-            f"{volume.protocol.name} needs: check the labels, or name another protocol (--scheme)",
+            f"no label of {', '.join(needed)}, needed by the protocol "
+            f"{volume.protocol.name}; check the labels, or name another protocol (--scheme)",
             reason="tissue-missing",
         )
 
@@ -127,16 +127,16 @@ def _check_axes(volume: LabelVolume, hemi: str) -> list[Finding]:
     check = "check the directions of the axes in the image's header"
     if whole and behind > _CLEAR_BULGE:
         raise GeometryError(
-            f"the posterior part of the hippocampus is {np.exp(behind):.1f} times as large as the "
-            f"anterior one, as if its head lay posterior: {check}",
+            f"the posterior hippocampus is {np.exp(behind):.1f} times the anterior one: the "
+            f"head seems posterior; {check}",
             reason="axis-flipped",
         )
     if position.winding < -_CLEAR_WINDING and _is_ordered(volume.tissue):
         if position.offset < 0:
             raise wrong_side(hemi, position.offset)
         raise GeometryError(
-            "seen from the tail, subiculum, CA1 and CA3 follow each other as in a mirror image: "
-            f"{check}, and which labels are head and tail",
+            f"the order of subiculum, CA1 and CA3 is a mirror image; {check}, and the labels "
+            "of head and tail",
             reason="axis-flipped",
         )
     return [

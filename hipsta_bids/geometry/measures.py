@@ -27,8 +27,8 @@ _POINTS = 4
 def differentiate(values: Float, window: int, degree: int, times: int, axis: int) -> Float:
     """Differentiate along one axis with polynomials fitted to windows of nodes.
 
-    The derivative at a node is that of the polynomial fitted to the window around it; within half
-    a window of either end, to the first or last window.
+    The derivative at a node is the slope of the polynomial fitted to the window around it; within
+    half a window of either end, to the first or last window.
 
     Savitzky & Golay 1964, Anal Chem 36:1627-1639. The same as SciPy's ``savgol_filter``, to which
     a test compares it; importing that takes longer than measuring half a hemisphere, and 36 MB.
@@ -289,8 +289,9 @@ def section_area(whole: Sheet) -> Float:
     """Area of each cross-section, (Ny,), mm2.
 
     Half the length of the sum of the cells' diagonals' cross products: in a plane the area of the
-    polygon round the section, whatever its cells do next to rounded rims. What chords cut off goes
-    with the square of their length; it is extrapolated from every second one (Richardson 1911).
+    polygon round the section, whatever its cells do next to rounded rims. The area that chords cut
+    off is proportional to the square of their length; it is extrapolated from every second one
+    (Richardson 1911).
     """
     area = _polygon_area(whole.points)
     if whole.points.shape[0] % 2 == 0:  # the last line would be left out
@@ -305,7 +306,7 @@ def _polygon_area(points: Float) -> Float:
 
 
 def labels_at(points: Float, body: Body) -> NDArray[np.uint8]:
-    """Tissue (N,) at points (N, 3), RAS mm: that of the body's voxel there, or else the nearest."""
+    """Tissue (N,) at points (N, 3), RAS mm: of the body's voxel there, or else of the nearest."""
     voxel = np.rint(body.to_voxels(points)).astype(np.intp)
     last = np.array(body.inside.shape) - 1
     index = tuple(np.clip(voxel, 0, last).T)

@@ -201,7 +201,7 @@ def fill_surface(
 def tetrahedralize(
     surface: Surface, settings: TetraSettings, frame: Float | None = None
 ) -> TetMesh:
-    """Fill a surface with tetrahedra; its vertices come first and stay in place.
+    """Fill a surface with tetrahedra; its vertices are first and stay in place.
 
     TetGen: Si 2015, ACM Trans Math Softw 41:11. ``nobisect`` keeps the surface as it is, so that
     boundary sets found on the surface are valid in the volume. TetGen makes other meshes of the

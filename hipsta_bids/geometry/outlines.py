@@ -168,7 +168,8 @@ def cut_rings(outlines: Stack, pixel: float) -> Stack:
     """Open each outline (N, I, J), mm, that closes round a hole; fine pixels of ``pixel`` mm.
 
     The sheet is a ribbon: where it closes to a ring, turns touch. The cut follows the cheapest path
-    from the hole to the outside, through what is thin here and lies outside in the slices beside.
+    from the hole to the outside, through parts that are thin here and lie outside in the slices
+    beside.
     """
     cut = outlines.copy()
     for number in range(len(outlines)):
@@ -222,7 +223,7 @@ def _way_out(outline: Stack, beside: Stack) -> Bool | None:
 def drop_doubles(outline: Stack, rank: Float) -> None:
     """Drop, in place, pieces of a slice (I, J) that have no subfield that the largest one lacks.
 
-    The ribbon has each subfield once: such a piece is the uncus, which passes beside the body.
+    The ribbon has each subfield once: a second piece is the uncus, which passes beside the body.
     """
     pieces, count = ndimage.label(outline > 0)
     if count < 2:  # noqa: PLR2004 -- one piece is the ribbon

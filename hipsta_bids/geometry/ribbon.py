@@ -161,7 +161,7 @@ def _middle(nodes: Float) -> Float:
 
 
 def align_nodes(ribbons: list[Float | None], pixel: float) -> list[Float | None]:
-    """Move nodes (X, Z, 2) along each slice to where those of the slice inside belong.
+    """Move nodes (X, Z, 2) along each slice to match the nodes of the slice inside.
 
     From the middle slice, on which they are at equal distances, outwards.
     """

@@ -14,7 +14,7 @@ from hipsta_bids.types import Bool, Float, Sheet
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ScalarVolume:
-    """One or more numbers per voxel, cropped to what is needed."""
+    """One or more numbers per voxel, cropped to the part needed."""
 
     values: Float
     """(I, J, K, T); not finite where missing."""
@@ -54,7 +54,7 @@ def sample_on_sheet(
     """Read a volume on the mid-surface (``mid``) or averaged over the sheet's ``depth``.
 
     The field of view ends at the outer faces of the outermost voxels; from their centers outward
-    the value is that of the voxel.
+    the value is the voxel's.
     """
     level = sheet.middle
     points = sheet.points if sampling == "depth" else sheet.points[:, :, level : level + 1]

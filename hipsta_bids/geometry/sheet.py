@@ -58,7 +58,7 @@ def sample_sheet(mesh: TetMesh, coordinates: Coordinates, settings: SheetSetting
 def sheet_levels(settings: SheetSettings, region: str = "body") -> tuple[Float, Float, Float]:
     """Coordinates of the grid's nodes along x, y and z.
 
-    The body's rows are those of its own sheet. Where the region has a head, as many again, less
+    The body's rows are the rows of its own sheet. Where the region has a head, as many again, less
     one, lie before them, and with a tail half as many behind them.
     """
     tail, head = rows_beyond(region, settings.y_nodes)
@@ -106,7 +106,7 @@ def is_flipped(sheet: Sheet, hemi: str) -> bool:
     """Whether interior and exterior of a sheet are exchanged for its hemisphere.
 
     The interior side of the cortex is the one that continues the interior side of the hippocampus:
-    its outer (pial) surface. Bending does not tell, since the cortex bends round its white matter
+    its outer (pial) surface. Bending does not decide, since the cortex bends round its white matter
     and the hippocampus round the dentate gyrus. But medial to lateral, posterior to anterior and
     interior to exterior are a right-handed system on the left and a left-handed one on the right,
     all along the sheet and however it bends.
@@ -115,7 +115,7 @@ def is_flipped(sheet: Sheet, hemi: str) -> bool:
 
 
 def check_flipped(sheet: Sheet, hemi: str) -> Finding:
-    """Flag a sheet whose interior side, found by labels, is not that of its hemisphere."""
+    """Flag a sheet whose interior side, found by labels, does not fit its hemisphere."""
     return Finding(
         reason="side-doubtful",
         value=float(is_flipped(sheet, hemi)),
@@ -254,9 +254,9 @@ def solve_coordinates(laplace: Laplace, boundaries: Boundaries) -> Coordinates:
 
 
 def between_planes(mesh: TetMesh, coordinates: Coordinates, ends: EndPlanes) -> Coordinates:
-    """Scale y so that the mid-surface goes from plane to plane between y = -1 and 1.
+    """Scale y so that the mid-surface reaches from plane to plane between y = -1 and 1.
 
-    The mesh goes on beyond the planes. Lines of equal y are those of the harmonic function there,
+    The mesh extends beyond the planes. Lines of equal y follow the harmonic function there,
     at right angles to the walls, however obliquely a plane cuts them.
     """
     x, y = np.linspace(-0.98, 0.98, 41), np.linspace(-0.998, 0.998, 121)
@@ -284,7 +284,7 @@ def straighten_rows(mesh: TetMesh, coordinates: Coordinates, solver: str) -> Coo
     In a thin sheet the volume's harmonic x obeys div(t grad x) = 0 on the mid-surface, t its
     thickness: steps of x are short where the sheet is thin, so that a thin place moves columns of
     whole rows. The new x is a rising function of that one along each row: columns are numbered
-    anew, and none of them moves. Those beside a notch are squeezed; the others keep their number.
+    anew, and none of them moves. Columns beside a notch are squeezed; the others keep their number.
     """
     x, y = np.linspace(-X_OUTERMOST, X_OUTERMOST, X_LINES), np.linspace(-0.998, 0.998, Y_LINES)
     middle = middle_surface(mesh, coordinates, x, y)
@@ -380,7 +380,7 @@ def check_layers(folded: Bool, sheet: Sheet) -> Finding:
         text=f"layers fold in {folded.sum()} of {folded.size} columns"
         + "".join(f", the first at x {x}, y {y}" for x, y in first)
         + ", their layers are at equal distances instead",
-        remedy="set sheet.depths to distance, or leave these points out",
+        remedy="set sheet.depths to distance, or exclude these points",
         points=sheet.points[folded][:, sheet.middle],
         placed=True,
     )

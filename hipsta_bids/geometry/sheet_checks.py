@@ -61,7 +61,7 @@ def check_edges(whole: Sheet, settings: CheckSettings) -> list[Finding]:
     """Flag a sheet whose medial or lateral edge recedes between parts that do not.
 
     Notches, slits and tips without their label are too small to show in the width of the sheet, but
-    move the columns of their rows. ``whole`` goes from edge to edge.
+    move the columns of their rows. ``whole`` reaches from edge to edge.
     """
     middle = whole.points[:, :, whole.middle]
     step, count = _step(middle, axis=1), middle.shape[1]
@@ -204,8 +204,8 @@ def check_rival(thickness: Float, choice: str, rival: Float, settings: CheckSett
         reason="second-choice",
         value=rms,
         limit=settings.flag_rival,
-        text=f"another {choice} is as likely and moves the map by {rms:.2f} mm (RMS), "
-        f"{moved.mean():.0%} of the columns by more than {RIVAL_OFF:g} mm",
+        text=f"another {choice} is as likely and moves {moved.mean():.0%} of the columns by over "
+        f"{RIVAL_OFF:g} mm (RMS {rms:.2f} mm)",
         remedy="look at the labels there",
         share=float(moved.mean()),
         change=float(np.nanmean(difference)),

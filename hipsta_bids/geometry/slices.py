@@ -143,7 +143,7 @@ class _SliceStack:
     def blend(self, level: Stack, pixels: Stack) -> Stack:
         """Signed distance, mm, within the plane of the slices, from the outline at any level.
 
-        Slits are left out of what is farther outside than the setting ``edge``.
+        Slits are excluded from pixels farther outside than the setting ``edge``.
 
         ``level`` (N,) counts slices, ``pixels`` (2, N) fine pixels.
         """

@@ -78,7 +78,7 @@ def surrogate_profiles(
 ) -> tuple[SurrogateProfile, SurrogateProfile]:
     """Measure thickness in one slice at points proportional and equidistant along its axis.
 
-    Proportional points are those at which the sheet has its nodes along x.
+    Proportional points are the places of the sheet's nodes along x.
     """
     cut = draw_slice(body, position)
     axis = _from_medial(body, cut, _medial_axis(cut, position))

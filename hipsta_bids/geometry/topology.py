@@ -69,7 +69,7 @@ class Repair:
             "fill": "filled a hole",
             "island": "removed a separate piece",
             "cavity": "filled a cavity",
-            "uncus": "left out the uncus, a piece",
+            "uncus": "excluded the uncus, a piece",
         }[self.kind]
         return (
             f"{noun} of {self.voxels} grid nodes at {position_text(self.position, self.subfield)}"
@@ -106,7 +106,7 @@ def repair_topology(
 
     Solid plates beyond both ends make an ordinary tunnel of several cap pieces. Growing from inside
     by simple points stops at the membranes that cut every tunnel; shrinking from outside stops at
-    those that fill it. The cheaper membrane of each tunnel is applied. (The two-sided use of
+    membranes that fill it. The cheaper membrane of each tunnel is applied. (The two-sided use of
     homotopic growing follows Kriegeskorte & Goebel 2001, NeuroImage 14:329-346.)
     """
     values = field.values
@@ -251,8 +251,8 @@ def _refuse_strips(state: Bool, field: Field, settings: TopologySettings, locate
     names = locate(field.grid.to_ras(np.vstack([facing, opposite]).astype(float)))
     at = position_text(field.grid.to_ras(center[None])[0], names)
     raise GeometryError(
-        f"a gap divides the sheet into {len(through)} strips from end to end, at {at}: "
-        "fill it in the labels, or check that the protocol fits them",
+        f"a gap divides the sheet into {len(through)} strips, at {at}; fill it in the "
+        "labels, or check the protocol",
         reason="body-split",
     )
 
@@ -266,9 +266,9 @@ def _unrepaired(
     point = field.grid.to_ras((nodes - membranes.FIRST).mean(axis=0, keepdims=True))
     at = position_text(point[0], locate(point))
     return GeometryError(
-        "the labels have holes or bridges that could not be repaired (Euler number "
-        f"{membranes.euler(state)}, with closed ends {membranes.euler(state, plates=True)}, "
-        f"instead of 1), the largest near {at}: correct the labels there by hand",
+        "holes or bridges of the labels cannot be repaired (Euler number "
+        f"{membranes.euler(state)}, closed {membranes.euler(state, plates=True)}), near "
+        f"{at}; correct them there",
         reason="topology",
     )
 
@@ -281,9 +281,8 @@ def _interrupted(pieces: digital.Index, field: Field, locate: Locate) -> Geometr
     point = field.grid.to_ras(nodes[nodes[:, 2] == level].astype(float))
     at = position_text(point.mean(axis=0), locate(point))
     return GeometryError(
-        f"the body is interrupted at {at}: no connected path of its labels leads from the "
-        "posterior to the anterior end plane; fill in missing slices, correct head and tail labels "
-        "inside the body, or use a finer segmentation of a thin sheet",
+        f"the body is interrupted at {at}; fill in missing slices, correct head and tail "
+        "labels, or use finer labels",
         reason="body-interrupted",
     )
 
@@ -398,8 +397,8 @@ def repaired_columns(sheet: Sheet, solid: SolidField) -> Bool:
     """Mark the columns (Nx, Ny) of the sheet that a repair of the topology touched.
 
     A column represents the sheet up to halfway to its neighbors, so that a repair between two
-    columns is not lost. A cut bridge leaves two stumps: what is nearest to either face of the cut
-    is marked, too. Pieces that were removed leave no mark.
+    columns is not lost. A cut bridge leaves two stumps: the columns nearest to either face of the
+    cut are marked, too. Pieces that were removed leave no mark.
     """
     marked = np.zeros(sheet.valid.shape, dtype=bool)
     if not solid.touched.any():

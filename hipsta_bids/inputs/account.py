@@ -33,7 +33,7 @@ _DEPTH, _MOST_ENTRIES = 5, 3000
 
 
 def selection_table(items: Iterable[HemisphereInput]) -> list[dict[str, str]]:
-    """Describe what was found and why, one row per hemisphere and protocol."""
+    """Describe the segmentations found and the reasons, one row per hemisphere and protocol."""
     return [
         {
             "subject": item.subject,
@@ -52,7 +52,7 @@ def selection_table(items: Iterable[HemisphereInput]) -> list[dict[str, str]]:
 
 
 def ignored_table(ignored: Iterable[tree.Ignored]) -> list[dict[str, str]]:
-    """Describe what was not used, one row per folder."""
+    """Describe the entries not used, one row per folder."""
     return [
         {"not used": " hemi-".join(filter(None, (str(e.path), e.hemi))), "why": e.reason}
         for e in ignored
@@ -60,7 +60,7 @@ def ignored_table(ignored: Iterable[tree.Ignored]) -> list[dict[str, str]]:
 
 
 def other_entries_table(other_entries: Iterable[tree.Ignored]) -> list[dict[str, str]]:
-    """Describe what is no segmentation, one row per entry; those inside of subjects' are counted.
+    """Describe the entries without a segmentation, one row each; inside of subjects, a count.
 
     All have a row of their own in ``inputs.tsv``.
     """
@@ -109,7 +109,7 @@ def count_inputs(rows: Iterable[Mapping[str, str]]) -> str:
 
 
 def looked_into(entry: tree.Ignored) -> tree.Ignored:
-    """Look for labels in an entry that seems to be nobody's."""
+    """Look for labels in an entry that seems to be of no participant."""
     if entry.reason != tree.NO_SUBJECT:
         return entry
     name = _first_labels(entry.path)
@@ -117,7 +117,7 @@ def looked_into(entry: tree.Ignored) -> tree.Ignored:
         return entry
     reason = f"labels in it ({name}), but it is no subject's by its name"
     reason = reason if name else "labels, but in no subject's folder"
-    reason += "; --participants-map FILE says whose folders are"
+    reason += "; name the participants of the folders with --participants-map FILE"
     return replace(entry, reason=reason, status=tree.NOT_USED, quiet=False)
 
 
@@ -192,11 +192,14 @@ def _why_not(path: Path, context: Context) -> tuple[str, bool]:
     if layout.kind not in context.source.layouts:
         return f"{layout.title}'s, which the option of its folder does not read", True
     if not layout.distinct:
-        return "labels of unknown meaning; --scheme or dataset_description.json says which", True
+        return (
+            "labels of unknown meaning; name them with --scheme or in dataset_description.json",
+            True,
+        )
     if layout.beside:
         return f"no {' or '.join(sorted(layout.beside))} beside it", False
     if find_table(path, context.source.path) is None:
-        return "no _dseg.tsv says what its labels are; -d NAME=PATH names its dataset", False
+        return "no _dseg.tsv defines the labels; -d NAME=PATH names the dataset", False
     return "its table names no subiculum and CA1", True
 
 

@@ -45,10 +45,10 @@ def choose_atlas(request: scan.InputRequest) -> Protocol | None:
 class AtlasFinder:
     """Identifies the atlas of each segmentation of one dataset.
 
-    In this order: the option; a label table beside or above the file; the values, if only one
-    atlas has such values; as one dataset is made with one atlas, the values of a sample of the
-    dataset's files, if all of them that fit one atlas only fit the same one; and the first of
-    several atlases by name, if the body is the same with all of them.
+    In this order: the option; a label table beside or above the file; the values, if only one atlas
+    has them; as one dataset is made with one atlas, the values of a sample of the dataset's files,
+    if all of them that fit one atlas only fit the same one; and the first of several atlases by
+    name, if the body is the same with all of them.
     """
 
     def __init__(
@@ -59,16 +59,15 @@ class AtlasFinder:
         self._tables: dict[Path, Protocol] = {}
 
     def identify(self, file: LabelFile, hemi: str) -> Verdict:
-        """Identify one file's atlas; a file of both hemispheres takes one that tells them apart."""
+        """Identify one file's atlas; a file of both hemispheres needs one with both sides."""
         image = (file.path, hemi, file.hemi is None)
         problem: HipstaError | None = None
         try:
             protocol, explanation = self._atlas_of(image)
             if file.hemi is None and not protocol.offset:
                 problem = InputError(
-                    f"{file.path}: neither left nor right is in its name, and the protocol "
-                    f"{protocol.name} does not say how the hemispheres differ; set right_offset in "
-                    "its TOML file",
+                    f"{file.path}: the name has no side, and labels of {protocol.name} have "
+                    "none; set right_offset in its TOML file",
                     reason="unknown-hemisphere",
                 )
         except (ProtocolError, InputError) as error:
@@ -105,18 +104,18 @@ class AtlasFinder:
             return _first(shared, f"atlas from the labels of {rest_text}")
         fitting = self._fitting(image)
         if len(fitting) == 1:
-            return fitting[0], "only this atlas has such labels"
+            return fitting[0], "only this atlas has labels like these"
         left = [protocol for protocol in shared if protocol in fitting]
         if left and len(left) < len(fitting):
             choice = "this one" if len(left) == 1 else _names(left)
             return _first(
-                left, f"its labels fit {_names(fitting)}, those of {rest_text} only {choice}"
+                left, f"its labels fit {_names(fitting)}; labels of {rest_text} fit only {choice}"
             )
         if _one_body(fitting):
             return _first(fitting, f"its labels fit {_names(fitting)}")
         values = ", ".join(map(str, sorted(self._read(image))))
         text = (
-            f"{_names(fitting)}; say which atlas was used with --ashs-atlas"
+            f"{_names(fitting)}; name the atlas with --ashs-atlas"
             if fitting
             else (
                 f"no bundled ASHS atlas ({_names(_protocols())}); "

@@ -99,7 +99,7 @@ def each_once(edited: Iterable[EditedFile]) -> list[EditedFile]:
 def attach_edits(
     items: Iterable[scan.HemisphereInput], edited: Iterable[EditedFile], selection: Selection
 ) -> tuple[tuple[scan.HemisphereInput, ...], tuple[str, ...]]:
-    """Attach the files that correct each hemisphere, and note those that correct none."""
+    """Attach the files that correct each hemisphere, and note files that correct none."""
     corrected = list(items)
     corrections: dict[int, list[EditedFile]] = {}
     notes = []
@@ -115,8 +115,8 @@ def attach_edits(
         elif len(matching) > 1:
             names = " and ".join(corrected[n].protocol.name for n in matching)
             problem = InputError(
-                f"{file.edit.path}: corrects the labels of {names}; say in its name which ones, "
-                f"as in _seg-{corrected[matching[0]].protocol.name}_desc-edited_",
+                f"{file.edit.path}: corrects the labels of {names}; name one, as in "
+                f"_seg-{corrected[matching[0]].protocol.name}_desc-edited_",
                 reason="edit-ambiguous",
             )
             for n in matching:
@@ -143,7 +143,7 @@ def _misnamed(file: EditedFile) -> str | None:
         return "its name has no hemi-L or hemi-R"
     for key, folder_label in (("sub", file.subject), ("ses", file.session)):
         if names.get(key, folder_label) != folder_label:
-            return f"its name says {key}-{names[key]}, but its folder is another one's"
+            return f"its name has {key}-{names[key]}, but its folder is another one's"
     return None
 
 
@@ -164,8 +164,8 @@ def _why_not(file: EditedFile, items: list[scan.HemisphereInput]) -> str:
     protocols = {item.protocol.name for item in rivals}
     if file.names.get("seg", rivals[0].protocol.name) not in protocols:
         return (
-            f"its name says seg-{file.names['seg']}, but {hemisphere} has"
-            f" seg-{', seg-'.join(protocols)}"
+            f"its name has seg-{file.names['seg']}, but {hemisphere} has "
+            f"seg-{', seg-'.join(protocols)}"
         )
     return (
         f"it does not lie beside the labels of {hemisphere} ({rivals[0].files[0].parent}); move it "
@@ -224,7 +224,7 @@ class EndRow(Visit):
     """The plane, or what is wrong with the row."""
 
     def is_of(self, item: scan.HemisphereInput) -> bool:
-        """Say whether a hemisphere is meant; a row without a session means any."""
+        """Check whether a hemisphere is meant; a row without a session means any."""
         return (self.subject, self.hemi) == (item.subject, item.hemi) and (
             self.session in (None, item.session)
         )

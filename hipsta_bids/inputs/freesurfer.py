@@ -38,7 +38,7 @@ _UNNAMED = "unnamed"
 
 @dataclass(frozen=True, kw_only=True)
 class Run:
-    """One run of FreeSurfer's subfield segmentation, as its files' suffix says, and its files."""
+    """One run of FreeSurfer's subfield segmentation, by the suffix of its files, and its files."""
 
     scans: tuple[str, ...]
     """``("T1",)``, ``("T1", "T2")``, or nothing."""
@@ -144,9 +144,9 @@ def _version(run: Run) -> str | None:
 
 
 def is_longitudinal(files: Iterable[LabelFile]) -> bool:
-    """Choose between the kinds of runs of a visit: both sides come from one, cross-sectional first.
+    """Choose between the kinds of runs of a visit: both sides are of one, cross-sectional first.
 
-    The longitudinal run comes first only if it alone has more sides.
+    The longitudinal run is first only if it alone has more sides.
     """
     sides: dict[bool, set[str | None]] = {False: set(), True: set()}
     for file in files:
@@ -173,7 +173,7 @@ def _runs(files: Iterable[LabelFile]) -> list[Run]:
 
 
 def each_once(folders: tuple[tree.Folder, ...]) -> tuple[tree.Folder, ...]:
-    """Leave out longitudinal folders that are links to others here, as FastSurfer's tools make."""
+    """Exclude longitudinal folders that are links to others here, as FastSurfer's tools make."""
     if not any(folder.longitudinal for folder in folders):
         return folders
     paths = {os.path.realpath(folder.path) for folder in folders if not folder.longitudinal}
@@ -193,11 +193,11 @@ def _passed_over(runs: list[Run], best: Run, used_paths: list[Path]) -> Iterator
     for run in runs:
         name = run.name
         for hierarchy, path in run.files.items():
-            reason = f"analysis {name} comes later by default; --fs-analysis {name} selects it"
+            reason = f"analysis {name} is later by default; --fs-analysis {name} selects it"
             if run.coarse and not best.coarse:
                 reason = "resampled to 1 mm; a finer file exists"
             elif run is best:
-                reason = f"{hierarchy} hierarchy: less detail than what was taken"
+                reason = f"{hierarchy} hierarchy: less detail than the one taken"
             if path not in used_paths:
                 yield path, reason
 

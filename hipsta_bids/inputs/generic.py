@@ -132,7 +132,7 @@ _OWN_SPACE = re.compile(r"|T1w|T2w|orig|scanner|individual|crop\w*")
 
 
 def is_edited(name: str) -> bool:
-    """Check whether a file name is that of edited labels or an edited mask."""
+    """Check whether a file name is of edited labels or an edited mask."""
     if "desc-edited" not in name:
         return False
     pairs = entities(name)
@@ -146,9 +146,9 @@ def is_edited(name: str) -> bool:
 def choose_described(
     files: Sequence[LabelFile], context: Context, hemi: str
 ) -> Iterator[scan.HemisphereInput]:
-    """Choose one hemisphere's files among those that a table or the user's protocol describes.
+    """Choose one hemisphere's files among the files that a table or the user's protocol describes.
 
-    Files whose table names no subiculum and CA1 are of something else, and are left out; so are
+    Files whose table names no subiculum and CA1 are of something else, and are excluded; so are
     files without any table in datasets that the user did not name.
     """
     described = [(file, verdict) for file in files if (verdict := _describe(file, context))]
@@ -201,7 +201,7 @@ def _choose(
             reason="template-space",
         )
     tool = next(iter(context.source.generators), "")
-    order = "the subject's own space, the finest grid and the shortest name come first"
+    order = "the subject's own space, the finest grid and the shortest name are preferred"
     mismatches = [
         f"{key}-{best.traits[key]}"
         for key, label in {"sub": visit.subject, "ses": visit.session}.items()
@@ -210,7 +210,7 @@ def _choose(
     verdict = replace(
         verdict,
         problem=problem,
-        notes=(f"the file's name says {'_'.join(mismatches)}",) if mismatches else (),
+        notes=(f"the file's name has {'_'.join(mismatches)}",) if mismatches else (),
         provenance={"atlas": verdict.protocol.name},
     )
     files = [file for file, _ in group]
@@ -224,8 +224,7 @@ def _describe(file: LabelFile, context: Context) -> Verdict | None:
     # A tool's protocol, which the user chose for the files of that tool, replaces no table.
     table = find_table(path, root) if users is None or users.tool else None
     problem: HipstaError = ProtocolError(
-        f"{path}: no _dseg.tsv says what its labels are; add one, "
-        "or describe them in a TOML file and pass it with --scheme",
+        f"{path}: no _dseg.tsv defines its labels; add one, or pass a TOML file with --scheme",
         reason="undescribed-labels",
     )
     try:

@@ -40,17 +40,16 @@ def read_label_volume(item: HemisphereInput, region: str = "body") -> LabelVolum
     """Read one hemisphere's segmentation.
 
     The volume is cropped to the hippocampal labels, and the cortical ones of the region, plus 5 mm
-    on each side, as far as the image goes. The affine is the image's own, moved by the crop:
+    on each side, as far as the image extends. The affine is the image's own, moved by the crop:
     scanner RAS for MGZ, sform before qform for NIfTI. A NIfTI without either has no known left and
-    right, and is refused. Labels and mask that a person edited come from their own files, on any
-    grid.
+    right, and is refused. Labels and mask edited by hand have their own files, on any grid.
 
     Parameters
     ----------
     item : HemisphereInput
         Which files, and the protocol of their codes.
     region : str
-        What is going to be measured (``body.region`` of the settings).
+        The region to measure (``body.region`` of the settings).
 
     Returns
     -------
@@ -108,7 +107,7 @@ def label_volume(
 ) -> LabelVolume:
     """Translate and crop an image, as :func:`read_label_volume` does a hemisphere of a dataset.
 
-    Where codes of the side that the protocol shifts occur, the other side is left out. ``path`` is
+    Where codes of the side that the protocol shifts occur, the other side is excluded. ``path`` is
     what messages call the image.
     """
     whole = _integers(image.data, path)
@@ -170,8 +169,8 @@ def _beside(added_path: Path, path: Path, image: LabelImage, *, edited: bool) ->
         )
         return sampled
     raise InputError(
-        f"{added_path}: its grid differs from that of {path.name}, with which it is combined; "
-        "use files of the same run",
+        f"{added_path}: its grid is not the grid of {path.name}, with which it is combined; "
+        "use files of one run",
         reason="grid-mismatch",
     )
 
@@ -188,8 +187,8 @@ def _check_same_place(hippocampal: Bool, affine: Float, item: HemisphereInput, p
     share = float(((index >= 0) & (index < image.data.shape)).all(axis=1).mean())
     if image.data.size and share < _SAME_PLACE:
         raise InputError(
-            f"{path}: {1 - share:.0%} of the edited labels lie elsewhere than those of "
-            f"{original.name}; keep the orientation and position of the image that was edited",
+            f"{path}: {1 - share:.0%} of the edited labels lie outside the labels of "
+            f"{original.name}; keep the image's position",
             reason="edited-elsewhere",
         )
 

@@ -32,7 +32,7 @@ def _named_protocol(layout: "Layout", file: LabelFile, context: Context, _: str)
         protocol=scan.unknown_protocol(layout.name, f"{layout.title}, mode not given"),
         explanation=f"{layout.title}{file.remark}, mode not given",
         problem=ProtocolError(
-            f"{file.path}: {layout.choice}; say which: {choices}", reason="ambiguous-scheme"
+            f"{file.path}: {layout.choice}; name one: {choices}", reason="ambiguous-scheme"
         ),
     )
 
@@ -43,7 +43,7 @@ def _t2_first(file: LabelFile, _: Context) -> tuple[Any, ...]:
 
 
 def _t2_reason(file: LabelFile, _: LabelFile) -> str:
-    return "T2w comes first" if file.rank[0] else "as good as the first one"
+    return "T2w is preferred" if file.rank[0] else "as good as the first one"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,7 +83,7 @@ class Layout:
     """Name of the table of volumes beside a file."""
 
     def reads(self, name: str, source: scan.Source) -> dict[str, str | None] | None:
-        """Return what a file's name says, if it is one of this program's."""
+        """Return the entities of a file's name, if it is one of this program's."""
         match = self.pattern.fullmatch(name)
         is_foreign = self.generators and source.generators and not self.made(source)
         if match is None or is_foreign:
@@ -179,7 +179,7 @@ def _unfold_reason(file: LabelFile, best: LabelFile) -> str:
         return f"space {_space(file)} may be scaled, which changes thickness"
     if file.traits.get("atlas") != best.traits.get("atlas"):
         atlas = best.traits.get("atlas")
-        return f"atlas {atlas} comes first; a --bids-filter-file selects another one"
+        return f"atlas {atlas} is preferred; a --bids-filter-file selects another one"
     if _cropped(best) and not _cropped(file):
         return f"coarser grid than space {_space(best)}"
     return "as good as the first one"
@@ -227,12 +227,12 @@ def _ashs_rank(file: LabelFile, context: Context) -> tuple[Any, ...]:
 
 def _ashs_reason(file: LabelFile, best: LabelFile) -> str:
     if file.hemi is None and best.hemi is not None:
-        return "both hemispheres in one file; one file per hemisphere comes first"
+        return "both hemispheres in one file; one file per hemisphere is preferred"
     if file.rank[1] != best.rank[1]:
-        return f"{best.traits['kind']} comes before {file.traits['kind']}"
+        return f"{best.traits['kind']} is preferred to {file.traits['kind']}"
     if file.rank == best.rank:
         return "as good as the first one"
-    return "files in final/ and with the subject's label come first"
+    return "files in final/ and with the subject's label are preferred"
 
 
 def _ashs_protocol(_: Layout, file: LabelFile, context: Context, hemi: str) -> Verdict:
@@ -281,7 +281,7 @@ _MARKS = re.compile("|".join(re.escape(layout.mark) for layout in LAYOUTS))
 
 
 def layout_of(name: str) -> Layout | None:
-    """Find the layout whose files have such a name."""
+    """Find the layout whose files have a name like this."""
     if not _MARKS.search(name):
         return None
     return next((layout for layout in LAYOUTS if layout.pattern.fullmatch(name)), None)

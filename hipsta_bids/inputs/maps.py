@@ -91,7 +91,7 @@ def _nodes(
 
 @dataclass(frozen=True, kw_only=True)
 class Found(Visit):
-    """A file, and whose it is as far as its path says."""
+    """A file, and its participant as far as the path has it."""
 
     path: Path
     hemi: str | None

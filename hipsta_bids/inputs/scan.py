@@ -81,7 +81,7 @@ def unknown_protocol(name: str, title: str) -> Protocol:
 
 @dataclass(frozen=True, kw_only=True)
 class Edit:
-    """A file that a person corrected."""
+    """A file corrected by hand."""
 
     kind: str
     """``labels`` (it replaces the label image) or ``mask`` (of the body)."""
@@ -93,7 +93,7 @@ class Edit:
 
 @dataclass(frozen=True, kw_only=True)
 class MapSource:
-    """Another volume of the same person, to be sampled on the sheet."""
+    """Another volume of the same participant, to be sampled on the sheet."""
 
     name: str
     """What its outputs are called."""
@@ -155,14 +155,14 @@ class HemisphereInput(Hemisphere):
 
     @property
     def origin(self) -> dict[str, str]:
-        """Where the labels come from, as far as is known before they are read."""
+        """Origin of the labels, as far as is known before they are read."""
         return {**dict.fromkeys(PROVENANCE, MISSING), **self.provenance} | {
             "edited": "+".join(self.edited) or MISSING
         }
 
     @property
     def code_offset(self) -> int:
-        """What is to be subtracted from the codes of this hemisphere."""
+        """Number to subtract from the codes of this hemisphere."""
         return self.protocol.shift(self.hemi) if self.bilateral else 0
 
     @property
@@ -216,11 +216,11 @@ def list_sources(
 ) -> tuple[Source, ...]:
     """List the datasets to search; earlier ones take precedence.
 
-    What the user names comes first (``-d``, then ``--freesurfer-dir``, ``--ashs-dir`` and
+    Datasets that the user names are first (``-d``, then ``--freesurfer-dir``, ``--ashs-dir`` and
     ``--hippunfold-dir``), then ``BIDS_DIR/derivatives``, ``BIDS_DIR/sourcedata``, and ``BIDS_DIR``
     itself where it is a derivative dataset. Folders of these that hold no ``sub-*`` are searched
     two levels down, and ``sourcedata`` inside of derivatives too (fMRIPrep keeps FreeSurfer's
-    folder there). Our own outputs are left out. What cannot be listed, unless the user named it,
+    folder there). Our own outputs are excluded. What cannot be listed, unless the user named it,
     and what looks like a subject outside of these datasets is added to ``ignored``.
     """
     sources: dict[Path, Source] = {}

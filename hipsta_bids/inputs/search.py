@@ -75,9 +75,9 @@ class Findings:
 def find_hemispheres(request: InputRequest) -> tuple[HemisphereInput, ...]:
     """Find all segmentations that are asked for.
 
-    Different protocols of one hemisphere (say, FreeSurfer's and ASHS's) are separate inputs. Where
+    Different protocols of one hemisphere (as FreeSurfer's and ASHS's) are separate inputs. Where
     two datasets offer the same protocol, the one that the user named takes precedence, then
-    ``derivatives`` over ``sourcedata``; usable comes before unusable.
+    ``derivatives`` over ``sourcedata``; usable before unusable.
 
     Parameters
     ----------
@@ -98,7 +98,7 @@ def find_hemispheres(request: InputRequest) -> tuple[HemisphereInput, ...]:
 
 
 def find_inputs(request: InputRequest) -> Findings:
-    """Find all segmentations that are asked for, and what is like them but not used."""
+    """Find all segmentations that are asked for, and files like them that are not used."""
     selection = make_selection(request)
     option = choose_atlas(request)
     forget_tables()
@@ -143,7 +143,7 @@ def find_inputs(request: InputRequest) -> Findings:
     if sides := [f"{e.inside.name} {e.hemi}" for e in ignored if e.hemi and e.inside]:
         notes += (f"no labels of one hemisphere: {_count(sides, 'visit')}",)
     if text := _unused(ignored):
-        notes += (f"not used: {text}; --dry-run and the log say why",)
+        notes += (f"not used: {text}; see --dry-run and the log for the reasons",)
     unmissed += missing.values()
     return Findings(items=items, notes=notes, ignored=ignored, other_entries=tuple(unmissed))
 
@@ -232,7 +232,7 @@ def dataset_notes(request: InputRequest, items: Iterable[HemisphereInput]) -> tu
         kinds = Counter(item.origin[name] for item in usable if name != "voxel_size")
         if len(kinds) > 1:
             notes.append(
-                f"labels differ in {name}: {counts_text(kinds)}; group refuses such a mix"
+                f"labels differ in {name}: {counts_text(kinds)}; group refuses this mix"
                 f" unless --mixed {name} allows it"
             )
     return tuple(notes)
@@ -294,7 +294,7 @@ def _without_clashes(
     ):
         first = items.setdefault(item.key, item)
         if first is not item:
-            reason = f"same hemisphere and protocol as in {first.source}, which comes first"
+            reason = f"same hemisphere and protocol as in {first.source}, which is preferred"
             problem = first.problem
             if item.problem is not None and first.problem is None:
                 reason = f"not usable ({item.problem.reason})"

@@ -93,7 +93,7 @@ class Selection:
 
 @dataclass(frozen=True, kw_only=True)
 class LabelFile:
-    """A file with labels, as its name says."""
+    """A file with labels, by its name."""
 
     path: Path
     hemi: str | None
@@ -185,7 +185,7 @@ class Context:
         return self.input(hemi, verdict, [best.path], passed_over, bilateral=best.hemi is None)
 
     def provenance(self, tool: str, file: LabelFile) -> dict[str, str | None]:
-        """Tell where a file comes from by its name and place."""
+        """Determine the origin of a file by its name and place."""
         versions = [text for name, text in self.source.generators.items() if tool in name]
         parts, image = file.path.parts, re.search(r"(?<![A-Za-z])(?:crop)?(T[12]w)", file.path.name)
         analysis = file.traits.get("kind") or (image and image[1])

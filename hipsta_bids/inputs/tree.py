@@ -89,12 +89,12 @@ class Ignored:
 
     @property
     def template(self) -> bool:
-        """Whether nobody misses it."""
+        """Whether it is expected to hold no participant."""
         return self.status == NO_SEGMENTATION
 
     @property
     def name(self) -> str:
-        """Its name, with that of the subject's folder."""
+        """Its name, with the name of the subject's folder."""
         return str(self.path.relative_to(self.inside.parent)) if self.inside else self.path.name
 
 
@@ -103,7 +103,7 @@ NO_SUBJECT = "no subject's folder"
 
 
 def no_segmentation(path: Path, reason: str) -> Ignored:
-    """Account for an entry that nobody misses."""
+    """Account for an entry that holds no participant."""
     return Ignored(path=path, reason=reason, status=NO_SEGMENTATION, quiet=True)
 
 
@@ -138,7 +138,7 @@ def list_folder(path: Path) -> tuple[list[str], list[str]]:
                 if not entry.name.startswith("."):
                     (folders if _is_folder(entry) else files).append(entry.name)
     except FileNotFoundError as error:
-        raise MissingFileError(f"{path}: no such folder; check the path") from error
+        raise MissingFileError(f"{path}: folder not found; check the path") from error
     except NotADirectoryError as error:
         raise InputError(f"{path}: is a file, but a folder is needed") from error
     except OSError as error:
@@ -163,7 +163,7 @@ People = Mapping[str, tuple[str, str | None]]
 def plain_label(name: str) -> str:
     """Make a BIDS label of a name: ``AD_05`` becomes ``AD05``, ``sub-Müller`` ``Muller``.
 
-    It is empty where letters have no counterpart among those of labels.
+    It is empty where letters have no counterpart among letters of labels.
     """
     text = unicodedata.normalize("NFKD", name.removeprefix("sub-"))
     if any(letter.isalnum() and not letter.isascii() for letter in text):
@@ -172,8 +172,8 @@ def plain_label(name: str) -> str:
 
 
 UNSURE = (
-    "its folder may be a participant with sessions as well as a dataset; name the dataset itself, "
-    "or all folders with --participants-map"
+    "its folder may be a participant or a dataset; name the dataset itself, or all folders "
+    "with --participants-map"
 )
 _NOT_NAMED = "not named in --participants-map, which names others of this dataset"
 
@@ -183,8 +183,8 @@ def sort_folders(
 ) -> tuple[list[SubjectFolder], list[Ignored]]:
     """List the subjects' folders of a dataset, and all other entries, each sorted by name.
 
-    Folders of the program ``any_name`` need not be called ``sub-*``. If ``people`` names folders
-    of this dataset, it alone says whose folders are.
+    Folders of the program ``any_name`` need not be called ``sub-*``. If ``people`` names
+    folders of this dataset, it alone decides.
     """
     names, files = list_folder(root)
     entries = read_names(root, names, any_name=any_name).values()
@@ -224,7 +224,7 @@ def sort_folders(
 def read_names(
     root: Path, names: Sequence[str], *, any_name: str
 ) -> dict[str, SubjectFolder | Ignored]:
-    """Tell by their names whose folders they are, or why nobody's."""
+    """Determine the participants of folders by their names, or why they have none."""
     stems = {name: name.partition(".long.")[0] for name in names}
     base_of = {stem: name.partition(".long.")[2] for name, stem in stems.items() if stem != name}
     inside = {
@@ -270,7 +270,7 @@ def _renamed(
         session = stem.removeprefix(spelling).strip("-_.").removeprefix("ses-") or None
     label, visit = plain_label(spelling), plain_label(session or "") or None
     if _TEMPLATE.fullmatch(path.name):
-        reason = "comes with FreeSurfer, and is no subject"
+        reason = "part of FreeSurfer, and no subject"
         return Ignored(path=path, reason=reason, subject=label, status=NO_SEGMENTATION)
     reason = ""
     if not label or bool(session) != bool(visit):
@@ -349,8 +349,9 @@ def same_labels(folders: Iterable[SubjectFolder]) -> dict[str, InputError]:
             renamed.add(folder.subject)
     return {
         label: InputError(
-            f"{' and '.join(sorted(names))} would all be sub-{label}"
-            f"{f'_ses-{session}' if session else ''}; say whose they are with --participants-map",
+            f"{' and '.join(sorted(names))} would all be "
+            f"sub-{label}{f'_ses-{session}' if session else ''}; name their participants "
+            "with --participants-map",
             reason="same-label",
         )
         for (label, session), names in reversed(spellings.items())
@@ -410,7 +411,7 @@ def _inner_folders(
 def try_to_list(
     path: Path, ignored: list[Ignored], folder: SubjectFolder | None = None
 ) -> tuple[list[str], list[str]] | None:
-    """List a folder, or add it to what is ignored."""
+    """List a folder, or add it to the ignored ones."""
     try:
         return list_folder(path)
     except InputError as error:

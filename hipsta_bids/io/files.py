@@ -105,7 +105,7 @@ def check_writable(folder: Path) -> None:
 
 
 def scratch_folder(kind: str) -> Path:
-    """Make a temporary folder of this process; its name says whose it is."""
+    """Make a temporary folder of this process; its name has the process in it."""
     return Path(tempfile.mkdtemp(prefix=f"{_scratch_prefix()}{os.getpid()}-{kind}-"))
 
 
@@ -183,13 +183,13 @@ def _write_through(path: Path, content: bytes) -> None:
 
 
 def hide_home(text: str) -> str:
-    """Write the home folder, which names a person, as ``~``."""
+    """Write the home folder, which names the user, as ``~``."""
     home = os.path.expanduser("~")  # noqa: PTH111  (Path.home() fails where there is none)
     return text.replace(f"{home}/", "~/") if len(home) > 1 else text
 
 
 def remove(paths: Iterable[Path]) -> None:
-    """Remove files; those that do not exist are fine."""
+    """Remove files; missing files are fine."""
     for path in paths:
         try:
             path.unlink(missing_ok=True)
@@ -245,7 +245,7 @@ def read_json(path: Path, limit: float = opening.TABLE) -> dict[str, Any]:
             json.dumps(value, ensure_ascii=False).encode()
     except FileNotFoundError as error:
         raise MissingFileError(
-            f"{path}: no such file; check its name", reason="bad-json"
+            f"{path}: file not found; check its name", reason="bad-json"
         ) from error
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(
@@ -284,7 +284,7 @@ def read_tsv(path: Path) -> list[dict[str, str]]:
     try:
         text = opening.read_text(path, encoding="utf-8-sig")
     except FileNotFoundError as error:
-        raise MissingFileError(f"{path}: no such file; check its name") from error
+        raise MissingFileError(f"{path}: file not found; check its name") from error
     except UnicodeDecodeError as error:
         raise InputError(
             f"{path}: not readable as a table: no UTF-8 text; save it as that (not as Excel's"
@@ -368,9 +368,9 @@ _LONGEST = 300
 
 
 def read_foreign(path: Path, kind: type[Table], *, max_bytes: float) -> Table:
-    """Read a JSON file of other people, which may hold anything; nothing in it is run.
+    """Read a JSON file of another site, which may hold anything; nothing in it is run.
 
-    What is wrong in it, or that it has more than ``max_bytes``, is a ValueError of one line.
+    A mistake in it, or more than ``max_bytes``, is a ValueError of one line.
     """
     if path.is_file() and path.stat().st_size > max_bytes:
         raise ValueError(f"larger than {max_bytes / 1e6:g} MB")
@@ -378,7 +378,7 @@ def read_foreign(path: Path, kind: type[Table], *, max_bytes: float) -> Table:
 
 
 def checked_foreign(content: object, kind: type[Table]) -> Table:
-    """Check what a file of other people holds; ValueError of one line if something is wrong."""
+    """Check the content of a file of another site; ValueError of one line if something is wrong."""
     try:
         return kind.model_validate(content)
     except RecursionError as error:

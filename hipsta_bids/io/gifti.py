@@ -308,7 +308,7 @@ def checked_mesh(path: Path, points: ArrayLike, triangles: ArrayLike) -> Mesh:
 
 
 def structure_side(path: Path) -> str | None:
-    """Tell the side of a GIFTI file by the structure that it or one of its arrays names."""
+    """Determine the side of a GIFTI file by the structure that it or one of its arrays names."""
     image = _load(path, GiftiImage)
     named = [str(one.meta.get(_PRIMARY, "")) for one in (image, *image.darrays)]
     sides = {side[0] for name in named for side in ("Left", "Right") if name.endswith(side)}

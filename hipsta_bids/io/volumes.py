@@ -75,7 +75,7 @@ _memory: ContextVar[float] = ContextVar("memory", default=math.inf)
 
 
 def limit_memory(gigabytes: float | None) -> None:
-    """Say what memory (GB) this process may use from here on; ``None`` is no limit."""
+    """Set the memory (GB) that this process may use from here on; ``None`` is no limit."""
     _memory.set(math.inf if gigabytes is None else 1e9 * gigabytes)
 
 
@@ -92,10 +92,8 @@ def _check_fits(
     need, share = voxels * _voxel_bytes(image, beside), READ_SHARE * _memory.get()
     if need > share:
         raise InputError(
-            f"{path}: reading {content} ({voxels / 1e6:.1f} million voxels) takes"
-            f" {need / 1e6:.0f} MB,"
-            f" but {READ_SHARE:.0%} of a process' part of --mem is {share / 1e6:.0f} MB;"
-            f" raise --mem, lower --n-procs, or {remedy}",
+            f"{path}: {content} ({voxels / 1e6:.1f} million voxels) needs {need / 1e6:.0f} "
+            f"of {share / 1e6:.0f} MB; raise --mem, lower --n-procs, or {remedy}",
             reason="image-too-large",
         )
 
@@ -139,12 +137,12 @@ def moved(affine: Float, start: tuple[int, int, int]) -> Float:
 
 
 def read_labels(path: Path, margin: float = 0.0, part: Box | None = None) -> LabelImage:
-    """Read what is not zero in an image of labels or a mask, or a given part of it.
+    """Read the voxels that are not zero in an image of labels or a mask, or a given part.
 
     Shape and type are checked before any voxel is read, and no more than a slab is read at once:
-    what a header declares does not decide how much memory is needed. Voxels up to ``margin`` (mm,
-    along the image's axes) are kept around what is not zero; ``part`` is read instead of that, as
-    far as the image goes.
+    the size that a header declares does not decide how much memory is needed. Voxels up to
+    ``margin`` (mm, along the image's axes) are kept around voxels that are not zero; ``part`` is
+    read instead of that, as far as the image extends.
     """
     with _opened(path) as image:
         shape = _label_shape(image, path)
@@ -188,8 +186,8 @@ def _label_shape(image: Any, path: Path) -> tuple[int, int, int]:  # noqa: ANN40
     if math.prod(shape) > MOST_VOXELS or shape[0] * shape[1] > _MOST_IN_SLICE:
         text = " x ".join(map(str, image.shape))
         raise InputError(
-            f"{path}: its header declares {text} voxels, {MOST_VOXELS / 1e9:.0f} billion are the "
-            "limit; make the file again, or crop it to the hippocampus",
+            f"{path}: its header declares {text} voxels, above the limit of "
+            f"{MOST_VOXELS / 1e9:.0f} billion; make it again, or crop it",
             reason="image-too-large",
         )
     _check_fits(image, path, shape[0] * shape[1], "one slice")
@@ -255,7 +253,7 @@ def _labeled_part(
 
 
 def box_with_margin(hits: Sequence[NDArray[np.bool_]], margin: float, affine: Float) -> Box:
-    """Range of true positions along each axis, with a margin (mm) as far as the image goes."""
+    """Range of true positions along each axis, with a margin (mm) as far as the image extends."""
     # Headers keep single precision: 0.4999999 mm voxels are 0.5 mm voxels.
     extra = np.ceil(margin / np.linalg.norm(affine[:3, :3], axis=0) - 1e-4).astype(int)
     ends = np.array([np.flatnonzero(hit)[[0, -1]] for hit in hits]).T
@@ -311,7 +309,7 @@ def _opened(path: Path) -> Iterator[Any]:
             yield image
     except FileNotFoundError as error:
         raise MissingFileError(
-            f"{path}: no such file; check its name", reason="unreadable-image"
+            f"{path}: file not found; check its name", reason="unreadable-image"
         ) from error
     except _READ_ERRORS as error:
         message = " ".join(str(error).split()) or type(error).__name__
@@ -354,8 +352,8 @@ def _check_scalar(image: Any, path: Path) -> None:  # noqa: ANN401 (nibabel's cl
     shape = _axes(image)
     if not _SPACE <= len(shape) <= _SPACE + 1:
         raise InputError(
-            f"{path}: has shape {' x '.join(map(str, shape))}; a map has three axes, or four with "
-            "one volume per column: extract what is meant"
+            f"{path}: has shape {' x '.join(map(str, shape))}; extract a map of three axes, "
+            "or four with one volume per column"
         )
     if 0 in shape:
         raise InputError(f"{path}: has no voxels; make the file again", reason="empty-image")
@@ -382,8 +380,8 @@ def _checked_affine(image: Any, path: Path, limits: tuple[float, float]) -> Floa
     )
     if no_orientation:
         raise InputError(
-            f"{path}: the header has neither an sform nor a qform, so left and right are unknown; "
-            "copy the orientation from the image that was segmented",
+            f"{path}: no sform and no qform, left and right are unknown; copy the "
+            "orientation of the segmented image",
             reason="bad-affine",
         )
     if not np.isfinite(affine).all():
@@ -410,8 +408,8 @@ def _checked_affine(image: Any, path: Path, limits: tuple[float, float]) -> Floa
         stated = spacing.min() > 0 and np.any(spacing != 1)  # some programs leave it as it was
         if stated and np.abs(sizes / spacing - 1).max() > _SAME_SIZE:
             raise InputError(
-                f"{path}: voxels are {_times(sizes)} mm by the sform, but {_times(spacing)} mm by"
-                " pixdim, and all lengths follow from them; set right the one that is wrong",
+                f"{path}: voxels are {_times(sizes)} mm by the sform, but {_times(spacing)} "
+                "mm by pixdim; correct the wrong one",
                 reason="bad-affine",
             )
     return affine

@@ -31,7 +31,7 @@ def make_dataset(
 def read_later(
     outer: tuple[int, ...], inner: tuple[int, ...], kind: type[np.generic], read: Read
 ) -> Any:  # noqa: ANN401  (what xarray takes as the values of a variable)
-    """Make an array of shape ``(*outer, *inner)`` that reads only what is asked for.
+    """Make an array of shape ``(*outer, *inner)`` that reads only the parts used.
 
     Missing is NaN, False or an empty word.
     """

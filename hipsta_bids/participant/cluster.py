@@ -223,7 +223,7 @@ class Shard:
         return f"{self.index}of{self.count}"
 
     def take(self, subjects: Iterable[str]) -> tuple[str, ...]:
-        """Choose this part of some subjects, in whatever order they come."""
+        """Choose this part of some subjects, in whatever order."""
         return tuple(sorted(set(subjects))[self.index - 1 :: self.count])
 
 

@@ -139,7 +139,7 @@ def finished(job: Job) -> Outcome | None:
 
 
 def base_record(job: Job) -> dict[str, Any]:
-    """Begin the quality record with what is known before any input is read."""
+    """Begin the quality record with the facts known before any input is read."""
     item = job.item
     sources = dict(job.sources)
     given_ends = [
@@ -206,7 +206,7 @@ def hash_inputs(job: Job, record: Mapping[str, Any]) -> tuple[str, dict[str, Any
 
 
 class CostClock:
-    """Times stages, and measures what they cost in this process since the clock was made."""
+    """Times stages, and measures their cost in this process since the clock was made."""
 
     def __init__(self) -> None:
         self._stages: dict[str, float] = {}
@@ -225,7 +225,7 @@ class CostClock:
             self._stages[stage] = self._stages.get(stage, 0.0) + spent
 
     def spent(self) -> dict[str, Any]:
-        """Return what was spent so far: seconds per stage and in all, and peak memory in MB."""
+        """Return the cost so far: seconds per stage and in all, and peak memory in MB."""
         return {
             "stages": dict(self._stages),
             "seconds": time.perf_counter() - self._start,
@@ -276,7 +276,7 @@ def warm_up() -> None:
 
 
 def check_item(item: HemisphereInput, settings: Settings) -> list[str]:
-    """Read and check the labels of a hemisphere without measuring it; list what is wrong."""
+    """Read and check the labels of a hemisphere without measuring it; list the problems."""
     from hipsta_bids.geometry.label_checks import check_label_image  # noqa: PLC0415  (heavy)
     from hipsta_bids.inputs.labels import read_label_volume  # noqa: PLC0415  (heavy)
 
@@ -405,7 +405,7 @@ def fail(
     body: BodyMask | None = None,
     **spent: Any,  # noqa: ANN401  (fields of Outcome)
 ) -> Outcome:
-    """Record that a hemisphere failed, and remove what it had."""
+    """Record that a hemisphere failed, and remove its files."""
     record = base_record(job) if record is None else record
     try:
         hemisphere.write_failure(job.result, error, record, body)

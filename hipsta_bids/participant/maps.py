@@ -123,7 +123,7 @@ def add_signals(
 ) -> tuple[HemisphereMaps, list[Mapped], sampling.Regions | None, dict[str, Any]]:
     """Sample a hemisphere's volumes on its sheet, and read the regions.
 
-    Returns maps with flags, what was sampled, the regions, and what the quality record gets.
+    Returns maps with flags, the samples, the regions, and entries of the quality record.
     """
     mapped = []
     flags = []
@@ -192,7 +192,7 @@ def write_signals(
     mapped: Sequence[Mapped],
     regions: sampling.Regions | None,
 ) -> None:
-    """Write the tables and GIFTI files of what was sampled."""
+    """Write the tables and GIFTI files of the samples."""
     numbers: dict[str, Float] = {name: maps.maps[name] for name in _SHAPE_UNITS}
     labels: dict[str, Float] = {}
     for source, entry, sampled in mapped:

@@ -94,7 +94,7 @@ _PARTS = {
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Evidence(Measured):
-    """One hemisphere's sheet, and what the stages found out on their way to it."""
+    """One hemisphere's sheet, and the evidence of the stages before it."""
 
     coordinates: Coordinates
     image: tuple[Finding, ...]
@@ -243,7 +243,7 @@ def _whole(row: tuple[str, float, float, str, str, Float | float]) -> Finding:
 
 
 def quality_metrics(evidence: Evidence) -> dict[str, Any]:
-    """Numbers and words that say whether to trust the map, JSON-serializable."""
+    """Numbers and words by which to judge the map, JSON-serializable."""
     solid, boundaries, surface = evidence.solid, evidence.boundaries, evidence.surface
     body, ends, valid = evidence.body, evidence.body.ends, evidence.sheet.valid
     quality, inside = tetra_quality(evidence.mesh), body.inside_points()[1]
@@ -505,7 +505,7 @@ def _flags(evidence: Evidence, findings: list[Finding]) -> tuple[Flag, ...]:
 
 
 def find_body(volume: LabelVolume, settings: Settings) -> BodyMask | None:
-    """Find the body of a hemisphere that cannot be measured, for a person to correct."""
+    """Find the body of a hemisphere that cannot be measured, for a correction by hand."""
     try:
         body = extract_body(volume, settings.body)
     except GeometryError:

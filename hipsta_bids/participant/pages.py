@@ -70,7 +70,7 @@ def visits_of(root: Path) -> list[VisitKey]:
 
 
 def write_reports(plan: PagePlan, visits: Iterable[VisitKey]) -> Iterator[HipstaError]:
-    """Make the pages of some visits, and that of the cohort; yields why pages are missing or old.
+    """Make the pages of some visits and of the cohort; yields why pages are missing or old.
 
     An error of output ends it: the others would fail likewise.
     """

@@ -133,7 +133,7 @@ class _Slot:
             self.connection.send(job)
 
     def lose(self, *, timed_out: bool) -> WorkerLost:
-        """End a worker that died or took too long, and say how it ended."""
+        """End a worker that died or took too long, and return how it ended."""
         if not timed_out:
             # The pipe breaks a moment before the process ends; its exit code tells more than ours.
             wait([self.process.sentinel], _GRACE)

@@ -67,8 +67,8 @@ _LOGGER = logging.getLogger(__name__)
 class StatusTable:
     """``status.tsv`` as a view of the quality records, right at any moment of a run.
 
-    It adds what records do not have: what a run has not come to, and times and memory, which would
-    make records differ from run to run. A row that agrees with its record is kept for these.
+    It adds hemispheres that a run has not reached, and times and memory, which would make records
+    differ from run to run. A row that agrees with its record is kept for these.
     """
 
     def __init__(self, root: Path, shard: str | None = None) -> None:
@@ -111,7 +111,7 @@ class StatusTable:
         return median([float(cell) for cell in cells if cell != files.MISSING] or [USUAL_SECONDS])
 
     def close(self) -> None:
-        """Write what has not been written yet."""
+        """Write the rows that are not written yet."""
         if not self._pending:
             return
         start = time.monotonic()
@@ -304,7 +304,7 @@ def run_participants(
     options : RunOptions
         What does not.
     report : callable
-        Called in this process with each outcome as it comes.
+        Called in this process with each outcome at once.
 
     Returns
     -------
@@ -326,10 +326,10 @@ def run_participants(
 def collect(
     items: Sequence[HemisphereInput], out_dir: Path, settings: Settings, options: RunOptions
 ) -> RunResult:
-    """Bring together what runs of parts of a dataset have done; measures nothing.
+    """Collect the results of runs of parts of a dataset; measures nothing.
 
     ``status.tsv`` gets a row for each hemisphere, from its quality record, with times from the
-    tables of the runs. Pages that are missing are made, and that of all hemispheres.
+    tables of the runs. Pages that are missing are made, and the page of all hemispheres.
     """
     options = replace(options, stop_on_first_crash=False)
     return _run(items, out_dir, settings, options, report=lambda _: None, outcomes_of=_collected)

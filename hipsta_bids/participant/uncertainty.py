@@ -92,7 +92,7 @@ class Uncertainty:
 
     @property
     def notes(self) -> list[str]:
-        """What a person should know, one line each."""
+        """Notes for the user, one line each."""
         if self.known:
             return []
         failed = f"{self.failed} of {self.copies} perturbed copies could not be measured"

@@ -81,8 +81,8 @@ def resample(
     Maps are tables (``column`` holds the map) or GIFTI files of the whole sheet, or GIFTI or CIFTI
     files of HippUnfold; ``out`` is GIFTI, CIFTI or, of one side of the sheet, a table, by its
     ending. ``surfaces`` are HippUnfold's unfolded ones, one for both sides or one for each;
-    ``settings`` those that the sheets were measured with; ``sheets`` their ``desc-proximodistal``
-    maps, one for each side. Returns what was done, in one line.
+    ``settings`` are the settings of the sheets; ``sheets`` their ``desc-proximodistal`` maps, one
+    for each side. Returns one line about the result.
     """
     if not out.name.endswith((TABLE, *METRICS, DENSE_SCALARS)):
         ends = ", ".join((*METRICS, DENSE_SCALARS))
@@ -110,16 +110,16 @@ def resample(
             places.size != nodes[0] * nodes[1] or np.nanmax(np.abs(places)) > _LARGEST
         ):
             raise InputError(
-                f"--sheet: has to have {nodes[0]} x {nodes[1]} points from -1 to 1; give the"
-                " sheet's desc-proximodistal map, or the --settings of the results"
+                f"--sheet: {nodes[0]} x {nodes[1]} points are needed; give the sheet's "
+                "desc-proximodistal map, or the results' --settings"
             )
         between = Correspondence(flat, settings, None if places is None else places.reshape(nodes))
         on_nodes = len(side.values) == nodes[0] * nodes[1] and side.nodes in (None, nodes)
         if not on_nodes and len(side.values) != len(flat.points):
             raise InputError(
-                f"{path}: has {len(side.values)} points, the whole sheet {nodes[0]} x"
-                f" {nodes[1]}, and the surface {len(flat.points)}; give the surface of its density,"
-                " or the --settings of the results"
+                f"{path}: {len(side.values)} points fit neither the sheet ({nodes[0]} x "
+                f"{nodes[1]}) nor the surface ({len(flat.points)}); give its surface, or "
+                "--settings"
             )
         if moved and on_nodes != vertices:
             raise _several(f"{path}: is not on the same points as {paths[0]}")
@@ -169,7 +169,7 @@ def _read(path: Path, column: str) -> Iterator[tuple[str, PointMap]]:
         hemis = [hemi] if (hemi := _hemi(path)) else []
     if not hemis:
         raise InputError(
-            f"{path}: does not say of which side it is; put hemi-L or hemi-R in its name",
+            f"{path}: its side is unknown; put hemi-L or hemi-R in its name",
             reason="unknown-hemisphere",
         )
     units = {row.name: row.unit for row in MAPS}
@@ -185,7 +185,7 @@ def _hemi(path: Path) -> str | None:
     inside = gifti.structure_side(path) if path.suffix == ".gii" else None
     if named and inside and named != inside:
         raise InputError(
-            f"{path}: its name says side {named}, its structure {inside}; correct one of them",
+            f"{path}: side {named} in its name, {inside} in its structure; correct one of them",
             reason="unknown-hemisphere",
         )
     return named or inside
@@ -199,8 +199,8 @@ def _unfolded(path: Path) -> Mesh:
     covers = ((high - low)[:2] >= _COVERED * _SIZE).all()
     if not (inside and covers and flat.flat):
         raise InputError(
-            f"{path}: is no unfolded surface of HippUnfold's (space-unfold, label-hipp): flat, with"
-            " x from -40 to 0 mm and y from -200 to -180 mm"
+            f"{path}: is no unfolded surface of HippUnfold; give space-unfold, label-hipp (x "
+            "-40 to 0, y -200 to -180 mm)"
         )
     return flat
 

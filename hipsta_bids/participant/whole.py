@@ -88,7 +88,7 @@ _RIM = 0.9999
 
 
 class Own(NamedTuple):
-    """The body's own sheet, and what it was found in."""
+    """The body's own sheet, and the labels of the body."""
 
     body: Body
     mesh: types.TetMesh
@@ -101,7 +101,7 @@ def measure_whole(
 ) -> types.HemisphereMaps:
     """Measure head, body and, unless the region is ``headbody``, tail on one sheet.
 
-    ``body_alone`` is the body measured alone. The other arguments, result and errors are those of
+    ``body_alone`` is the body measured alone. The other arguments, result and errors are as in
     `measure_hemisphere`.
     """
     region = settings.body.region
@@ -202,8 +202,8 @@ def check_fine(volume: types.LabelVolume) -> None:
     longest = float(np.linalg.norm(volume.affine[:3, :3], axis=0).max())
     if longest > MAX_VOXEL + _TOLERANCE:
         raise GeometryError(
-            f"voxels of {longest:.2f} mm: head and tail need {MAX_VOXEL:g} mm or less along every "
-            "edge; measure the body, or use a finer segmentation",
+            f"voxels of {longest:.2f} mm: head and tail need {MAX_VOXEL:g} mm or less; "
+            "measure the body, or use finer labels",
             reason="whole-voxels",
         )
 
@@ -211,8 +211,8 @@ def check_fine(volume: types.LabelVolume) -> None:
 def _check_pieces(disk: Disk) -> None:
     if disk.beside > MAX_PIECE:
         raise GeometryError(
-            f"{disk.beside:.0%} of the mid-surface is apart from the rest: the two faces of the "
-            "sheet cannot be told apart; look for missing dentate gyrus or molecular layer",
+            f"the sheet's two faces meet ({disk.beside:.0%} of the mid-surface is separate); "
+            "check for missing dentate gyrus or molecular layer",
             reason="whole-topology",
         )
 
@@ -244,8 +244,8 @@ def _edges(
         length = _length(disk, getattr(edges, name))
         if length < MIN_EDGE:
             raise GeometryError(
-                f"the {name} edge of the sheet is {length:.0f} mm long, {MIN_EDGE:g} mm are "
-                "needed: check the labels of the subiculum, CA2 and CA3",
+                f"the {name} edge of the sheet has {length:.0f} mm, below {MIN_EDGE:g}; "
+                "check the labels of the subiculum, CA2 and CA3",
                 reason="whole-topology",
             )
     return edges

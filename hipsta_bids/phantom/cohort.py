@@ -66,8 +66,8 @@ class CohortPlan:
     """What a cohort looks like.
 
     The thickness of a wall is ``thickness + age_slope * (age - 65) + site + subject + hemisphere``
-    with normal deviates for the last two; the planted thinning comes on top in every group but
-    the first. Width and length grow with the cube root of intracranial volume.
+    with normal deviates for the last two; the planted thinning is added in every group but the
+    first. Width and length grow with the cube root of intracranial volume.
     """
 
     n_subjects: int = 20
@@ -117,7 +117,7 @@ class CohortPlan:
         if self.cortex and KINDS[self.kind].power != 1:
             problem = f"the shape {self.kind} cannot extend into cortex; choose another kind"
         if self.head is not None and (self.shift or self.cortex or self.kind != CohortPlan.kind):
-            problem = "a head has a shape of its own; leave out shift, cortex and kind"
+            problem = "a head has a shape of its own; remove shift, cortex and kind"
         if self.head is not None and not 0 <= self.head <= _MOST_DIGITATIONS:
             problem = f"a head has 0 to {_MOST_DIGITATIONS} digitations, not {self.head}"
         if not (1 <= self.n_subjects <= _MOST_SUBJECTS and self.seed >= 0):
@@ -328,7 +328,7 @@ def _write_effect(out: Path, plan: CohortPlan) -> None:
     )
     differences = {"difference": thinning, "difference_unregistered": observed}
     _write_nodes(out / EFFECT_TABLE, {"in_region": inside.astype(int), **differences})
-    difference = "thickness of the second group minus that of the first, at the same"
+    difference = "thickness of the second group minus the first group's, at the same"
     columns = {
         "in_region": ("1 within the limits of the region; at them, half of the effect", None),
         "difference": (f"{difference} anatomical place", "mm"),
@@ -353,7 +353,7 @@ def _write_head_effect(out: Path, plan: CohortPlan) -> None:
     files.write_tsv(out / EFFECT_TABLE, ["part", "in_region", "difference"], rows)
     columns = {
         "in_region": ("1 where the effect was planted", None),
-        "difference": ("mean thickness of the second group minus that of the first", "mm"),
+        "difference": ("mean thickness of the second group minus the first group's", "mm"),
     }
     dataset.write_sidecar(out / EFFECT_TABLE, columns, Plan=asdict(plan))
 

@@ -107,9 +107,9 @@ def write_dataset(
 ) -> None:
     """Write phantoms as a BIDS dataset with derivatives and a table of the truth.
 
-    ``columns`` describes those of ``participants.tsv`` beside the labels, as a BIDS sidecar does;
-    ``rows`` has their values in this order, by subject label without ``sub-``.
-    The same input gives the same bytes. Existing files of the same name are replaced.
+    ``columns`` describes the columns of ``participants.tsv`` beside the labels, as a BIDS sidecar
+    does; ``rows`` has their values in this order, by subject label without ``sub-``. The same input
+    gives the same bytes. Existing files of the same name are replaced.
     """
     unknown = [name for name in layouts if name not in LAYOUTS]
     if unknown:
@@ -290,7 +290,7 @@ def _write_descriptions(out: Path, layouts: Sequence[str]) -> None:
         readme = f"Segmentations of the phantoms in the dataset above, in the layout of {name}.\n"
         files.write_text(folder / "README", readme)
         inner = Path(LAYOUTS[name].path).parts[1]
-        ignored = f"# Folders and names are those of {name}, not of BIDS.\n/sub-*/{inner}\n"
+        ignored = f"# Folders and names follow {name}, not BIDS.\n/sub-*/{inner}\n"
         files.write_text(folder / ".bidsignore", ignored)
         files.write_json(
             folder / "dataset_description.json",
@@ -309,7 +309,7 @@ _IGNORED = """\
 """
 
 _README = """\
-Synthetic hippocampi: analytic shapes drawn as segmentations, nobody's brain.
+Synthetic hippocampi: analytic shapes drawn as segmentations, of no participant.
 The exact thickness, extents, areas and volume of each are in phantom_truth.tsv.
 The segmentations are in derivatives/. There are no images: the subjects' scans.tsv list none.
 """

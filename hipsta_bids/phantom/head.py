@@ -79,14 +79,14 @@ class HeadSpec:
         if not all(low <= self.thickness - less <= high for less in (0.0, self.thinning)):
             raise SettingsError(
                 f"phantom: a wall of {self.thickness:g} mm, {self.thinning:g} mm thinner in the "
-                f"head, is outside of {low:g} to {high:g} mm; choose others"
+                f"head, exceeds {low:g} to {high:g} mm; choose others"
             )
 
 
 def draw_head(spec: HeadSpec) -> LabelVolume:
     """Draw the labels of a left hemisphere, with the ends of its body; no wall runs along voxels.
 
-    Labels are those of the protocol ``cobralab``; the tail ends bluntly at y = 0.
+    Labels follow the protocol ``cobralab``; the tail ends bluntly at y = 0.
     """
     reach = 2 * spec.bank + 2 * spec.radius
     low = np.array([-reach, -3.0, -reach])
@@ -190,7 +190,7 @@ class HeadPhantom:
         voxel_size: tuple[float, float, float],
         axes: str,
     ) -> LabelVolume:
-        """Draw the phantom as a segmentation; the arguments are those of :class:`Phantom`."""
+        """Draw the phantom as a segmentation; the arguments are as of :class:`Phantom`."""
         rotation, shift = self._placement(hemi, pose)
         outer = [
             (points + wall[..., None] * out).reshape(-1, 3) for points, out, wall in self._parts

@@ -100,7 +100,7 @@ def draw(
     pose: Float | None,
     supersample: int | tuple[int, int, int],
 ) -> NDArray[np.intp]:
-    """Label every voxel of a grid; the affine goes from index to RAS mm."""
+    """Label every voxel of a grid; the affine maps index to RAS mm."""
     counts = np.broadcast_to(np.asarray(supersample, dtype=int), 3)
     if (counts < 1).any():
         raise bad(f"supersample must be 1 or more, not {supersample}")

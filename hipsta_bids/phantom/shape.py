@@ -445,17 +445,15 @@ class Body:
         sharpest = np.abs(self.curve.curvature(s)).max()
         if sharpest * self.thickest / 2.0 >= 1.0:
             raise bad(
-                f"the wall folds: half its thickness of up to {self.thickest:g} mm "
-                f"reaches the smallest radius of curvature, {1.0 / sharpest:.2f} mm; "
-                "make it thinner or bend it less"
+                f"the wall folds: half its thickness ({self.thickest:g} mm) reaches the "
+                f"curvature radius {1.0 / sharpest:.2f} mm; make it thinner or straighter"
             )
         inward = np.max(-np.sign(spec.bend) * self.curve.position(s)[:, 0]) + self.thickest / 2.0
         turned = abs(spec.bend) * (spec.length + 2.0 * spec.end_length)
         if abs(spec.bend) * inward >= 1.0 or turned >= np.pi:
             raise bad(
-                f"the long axis bends too sharply ({spec.bend:g} 1/mm) for a cross-"
-                f"section that reaches {inward:.1f} mm towards its center and a length of "
-                f"{spec.length + 2.0 * spec.end_length:g} mm with head and tail; bend it less"
+                f"the axis bends too sharply ({spec.bend:g} 1/mm) for {inward:.1f} mm inward "
+                f"and a length of {spec.length + 2.0 * spec.end_length:g} mm; reduce the bend"
             )
 
     def _refuse_overlap(self) -> None:
@@ -494,7 +492,7 @@ def placement(hemi: str, pose: Float | None) -> tuple[Float, Float]:
 
 
 def check_rotation(matrix: Float) -> None:
-    """Refuse what is not a proper rotation (3, 3) with a SettingsError."""
+    """Refuse a matrix that is no proper rotation (3, 3) with a SettingsError."""
     error = np.abs(matrix @ matrix.T - np.eye(3)).max()
     if not error < _RIGID_TOLERANCE or np.linalg.det(matrix) < 0.0:
         raise bad(

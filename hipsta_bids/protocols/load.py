@@ -225,8 +225,8 @@ def protocol_from_names(rows: Iterable[NamedCode], *, name: str, origin: str) ->
     tissues = {label.tissue for label in labels}
     if not tissues >= {Tissue.SUBICULUM, Tissue.CA1}:
         raise ProtocolError(
-            f"{origin}: its names do not include a subiculum and a CA1; "
-            "describe the labels in a TOML file and pass it with --scheme",
+            f"{origin}: no names of subiculum and CA1; describe the labels in a TOML file "
+            "and pass it with --scheme",
             reason="unclear-names",
         )
     inside = (*CORE, Tissue.MOLECULAR_LAYER)
@@ -245,10 +245,11 @@ def protocol_from_names(rows: Iterable[NamedCode], *, name: str, origin: str) ->
 
 
 def agrees(protocol: Protocol, rows: Iterable[NamedCode]) -> bool:
-    """Say whether a label table describes a given protocol.
+    """Check whether a label table describes a given protocol.
 
     The table has to list every label of the sheet and its interior, and each code that it lists
-    has to mean the same tissue in the protocol. Codes whose names say nothing may be missing there.
+    has to mean the same tissue in the protocol. Codes with names without meaning may be missing
+    there.
     """
     table = {row.code: _label(row, 0).tissue for row in rows if row.code > 0}
     tissue_of = {label.code: label.tissue for label in protocol.labels}
@@ -299,9 +300,8 @@ def for_region(protocol: Protocol, region: str) -> Protocol:
     if not protocol.neighbors:
         able = [name for name in protocol_names() if load_protocol(name).neighbors]
         raise ProtocolError(
-            f"region {region}: the protocol {protocol.name} has no labels of neighboring cortex; "
-            f"{', '.join(able)} have; measure the body, or list them as neighbors in a protocol "
-            "file for --scheme",
+            f"region {region}: the protocol {protocol.name} has no neighboring cortex; "
+            f"{', '.join(able)} have; measure the body, or pass --scheme",
             reason="no-cortex-labels",
         )
     hippocampal = protocol.sheet if region == "extended" else ()

@@ -39,7 +39,7 @@ class Tissue(IntEnum):
 
 
 class Part(IntEnum):
-    """Where along the long axis a voxel lies, as far as its label says."""
+    """Where along the long axis a voxel lies, as far as its label has it."""
 
     UNKNOWN = 0
     HEAD = 1
@@ -153,15 +153,15 @@ class Protocol(TomlTable):
 
     @property
     def offset(self) -> int:
-        """What tells the hemispheres apart in files that carry both; 0 if nothing does."""
+        """The difference of the hemispheres' codes in files that carry both; 0 if there is none."""
         return max(self.left_offset, self.right_offset)
 
     def shift(self, hemi: str) -> int:
-        """Return what is added to the codes of a hemisphere in files that carry both."""
+        """Return the number added to the codes of a hemisphere in files that carry both."""
         return self.left_offset if hemi == "L" else self.right_offset
 
     def same_body(self, protocol: "Protocol") -> bool:
-        """Say whether codes that both protocols list give the same body."""
+        """Check whether codes that both protocols list give the same body."""
         first, second = ({label.code: label for label in p.labels} for p in (self, protocol))
         return (self.sheet, self.layer, self.interior) == (
             protocol.sheet,
@@ -173,10 +173,10 @@ class Protocol(TomlTable):
         )
 
     def fits(self, values: frozenset[int]) -> bool:
-        """Say whether the values found in one hemisphere can come from this protocol.
+        """Check whether the values of one hemisphere can be of this protocol.
 
-        Every value has to be listed, and each tissue of the sheet, at least one of its interior
-        and those that the protocol is recognized by have to occur.
+        Every value has to be listed, and each tissue of the sheet, at least one of its interior and
+        the ones that the protocol is recognized by have to occur.
         """
         if not self.sheet or not values <= self.codes:
             return False
@@ -204,8 +204,8 @@ def translate(
     if protocol.unlisted == "error" and (occurs & ~listed).any():
         unknown = np.unique(codes[~listed[rows]])
         raise ProtocolError(
-            f"labels {_some(unknown)} are not in the protocol {protocol.name}; if the protocol is "
-            "right, copy its TOML file, add the labels, and pass it with --scheme",
+            f"labels {_some(unknown)} are not in the protocol {protocol.name}; add them to a "
+            "TOML copy and pass it with --scheme",
             reason="unknown-labels",
         )
     absent = [t.name for t in protocol.sheet if not (occurs & (tissues == t)).any()]

@@ -95,7 +95,7 @@ def did_you_mean(name: str, names: Iterable[str]) -> str:
 
 
 def first_mistake(error: ValidationError, kind: type[BaseModel]) -> str:
-    """Return what is wrong first, unknown keys before all else."""
+    """Return the first mistake, unknown keys before all else."""
     # A mistyped key is also a missing one, but says more.
     mistake = min(error.errors(), key=lambda fault: fault["type"] != "extra_forbidden")
     position, value, words = mistake["loc"], mistake["input"], mistake["type"]
@@ -133,7 +133,7 @@ def _table_at(kind: type[BaseModel], position: Iterable[str | int]) -> type[Base
 
 
 def read_settings(path: Path | None, kind: type[Table]) -> Table:
-    """Read a TOML file as settings of some kind; what it leaves out keeps its default."""
+    """Read a TOML file as settings of some kind; settings that it omits keep their defaults."""
     if path is None:
         return kind()
     try:
@@ -151,7 +151,7 @@ def read_settings(path: Path | None, kind: type[Table]) -> Table:
 
 
 def settings_from(values: Mapping[str, Any], kind: type[Table], *, origin: str) -> Table:
-    """Make settings of nested tables, or say what is wrong in them."""
+    """Make settings of nested tables, or name the first mistake in them."""
     try:
         return kind.model_validate(values)
     except ValidationError as error:

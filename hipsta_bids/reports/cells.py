@@ -71,7 +71,7 @@ def card(text: str, *parts: str) -> str:
 
 
 def statistic_text(row: Mapping[str, Any]) -> str:
-    """Write a statistic with its degrees of freedom; of F, those of the error."""
+    """Write a statistic with its degrees of freedom; of F, the error's."""
     value = number_text(row["statistic"])
     if row["test"] == "z":
         return f"z {value}"

@@ -96,12 +96,12 @@ class Cohort:
 
     @cached_property
     def verdicts(self) -> Mapping[str, Verdict]:
-        """What each hemisphere's page says first, by title of the hemisphere."""
+        """Verdicts of the hemispheres' pages, by title of the hemisphere."""
         return {h.result.name.title: verdict_of(h) for h in self.hemispheres}
 
     @cached_property
     def ranking(self) -> list[Hemisphere]:
-        """All hemispheres: failed ones, then those to look at, the largest consequence first."""
+        """All hemispheres: failed ones, then ones to look at, the largest consequence first."""
         return sorted(self.hemispheres, key=lambda h: self.verdicts[h.result.name.title].rank)
 
     def profiles(self, name: HemisphereName, column: str) -> Float:
@@ -169,7 +169,7 @@ def robust_scores(values: Float) -> Float:
 
 
 def distances(cohort: Cohort, thickness: Mapping[str, Float]) -> dict[str, tuple[float, str]]:
-    """Compute how far each hemisphere is from those of the same side, protocol and region.
+    """Compute how far each hemisphere is from others of its side, protocol and region.
 
     Returns its largest robust z-score and the title of that number; nothing of few hemispheres.
     """
@@ -343,7 +343,7 @@ _NIFTI = (".nii", ".nii.gz")
 
 
 def card_of(hemisphere: Hemisphere, cohort: Cohort, views: Views | None) -> Mapping[str, Any]:
-    """Collect what the page says first about a hemisphere, and what leads on from there."""
+    """Collect the head of a hemisphere's page, and its links."""
     key, record = hemisphere.result.name.title, hemisphere.record
     order = [other.result.name.title for other in cohort.ranking]
     n = order.index(key) if key in order else None
@@ -425,7 +425,7 @@ def _from(root: Path, path: Path) -> str:
 
 
 def correction_of(hemispheres: Sequence[Hemisphere]) -> Mapping[str, Any]:
-    """Name the files to correct, where they go, and the command that measures them again."""
+    """Name the files to correct, their folder, and the command that measures them again."""
     first = hemispheres[0].result.name
     choices = []
     for hemisphere in hemispheres:

@@ -111,7 +111,7 @@ _CHANGE = MapKind(
 def kind_of(measure: str, *, change: bool = False) -> MapKind:
     """Choose how a measure of the group level is shown: as on the pages of participants.
 
-    Limits are those of thickness and of mean curvature; other measures have other units.
+    Limits are for thickness and mean curvature; other measures have other units.
     """
     if change:
         return _CHANGE
@@ -145,7 +145,7 @@ def span_of(kind: MapKind, values: Sequence[Float]) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class Effects:
-    """A map of effect sizes, with what it takes to tell large from small."""
+    """A map of effect sizes, with its scale."""
 
     kind: str
     """Of the test, ``t`` or ``F``."""
@@ -181,7 +181,7 @@ def effect_reach(maps: Sequence[Effects]) -> float:
 
 
 def effect_colors(kind: str) -> tuple[float, str, str]:
-    """Where colors begin, as a share of their reach, and those of effects and of significance.
+    """Where colors begin, as a share of their reach, and the colors of effects and significance.
 
     Differences (``t``) may be negative, shares of the variance (``F``) may not.
     """

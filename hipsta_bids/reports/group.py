@@ -60,8 +60,8 @@ def _what(comparison: Mapping[str, Any]) -> str:
     """Describe what a row of the model is."""
     if comparison.get("longitudinal"):
         return (
-            "A row is a visit; a mixed model gives each participant an intercept, or a slope too"
-            " (see the methods paragraph)."
+            "A row is a visit; the mixed model has a random intercept, perhaps a slope (see "
+            "the methods paragraph)."
         )
     if comparison.get("pair"):
         first, second = comparison["pair"]
@@ -96,7 +96,7 @@ def _matrix_picture(table: pd.DataFrame, columns: list[str]) -> dict[str, Any]:
 
 
 def origin(results: GroupResults) -> Mapping[str, Any]:
-    """List what is needed to repeat the analysis."""
+    """List the facts needed to repeat the analysis."""
     record = results.record
     inputs = record.get("inputs") or {}
     settings = record.get("settings") or {}
@@ -115,7 +115,7 @@ def origin(results: GroupResults) -> Mapping[str, Any]:
 
 
 def heading(record: Mapping[str, Any]) -> dict[str, Any]:
-    """List what the head of the page says of an analysis, or of several together."""
+    """List the facts in the head of the page, of an analysis or of several together."""
     region = (record.get("inputs") or {}).get("region")
     return {
         "formula": record.get("formula"),

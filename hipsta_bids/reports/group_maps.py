@@ -275,7 +275,7 @@ def power(results: GroupResults) -> Mapping[str, Any] | None:
 
 
 def norms(results: GroupResults) -> Mapping[str, Any] | None:
-    """Describe norms and how well they hold, or people against them."""
+    """Describe norms and how well they hold, or participants against them."""
     about = results.record.get("norms")
     if not about:
         return None

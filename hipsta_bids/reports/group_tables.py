@@ -68,7 +68,7 @@ class GroupResults:
         return self._tables[name]
 
     def everywhere(self, name: str) -> pd.DataFrame:
-        """Join a table of the sheets and those of other programs' maps."""
+        """Join a table of the sheets and tables of other programs' maps."""
         prefixes = [*((self.record.get("inputs") or {}).get("maps") or {}), cells.JOINT]
         parts = [self.table(name), *(self.table(f"{other}_{name}") for other in prefixes)]
         return pd.concat([part for part in parts if len(part)] or parts[:1], ignore_index=True)

@@ -109,7 +109,7 @@ class Picture:
 
     @property
     def address(self) -> str:
-        """Data address; in a dark page, what is white is dark and what is black is light."""
+        """Data address; in a dark page, white is dark and black is light."""
         content = _SVG_TAG.sub(rb"\g<0>" + _DARK, self.content, count=1)
         return "data:image/svg+xml;base64," + base64.b64encode(content).decode()
 
@@ -342,7 +342,7 @@ def _draw_borders(axis: "Axes", names: NDArray[np.str_], x: Float, y: Float) -> 
 
 
 def usual_subfields(rows: Sequence[Sequence[str]]) -> list[str]:
-    """Find the most frequent name of each row; of several as frequent, the one that comes first.
+    """Find the most frequent name of each row; of several as frequent, the first one.
 
     A set would give another of these in another process, as its order does.
     """

@@ -395,9 +395,9 @@ def _uncertainty(hemisphere: Hemisphere) -> str:
     metrics = hemisphere.metrics
     copies = metrics["uncertainty_copies"] - metrics["uncertainty_failed"]
     return (
-        f"{hemisphere.side}: SD of thickness over {copies} perturbed copies of the labels"
-        f" {metrics['uncertainty_thickness_mm']:.2f} mm at a point (median), and"
-        f" {metrics['uncertainty_mean_mm']:.3f} mm of the mean thickness"
+        f"{hemisphere.side}: SD of thickness over {copies} perturbed copies: "
+        f"{metrics['uncertainty_thickness_mm']:.2f} mm at a point (median), "
+        f"{metrics['uncertainty_mean_mm']:.3f} mm of the mean"
     )
 
 

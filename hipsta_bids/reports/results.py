@@ -59,7 +59,7 @@ _MOST_VOXELS = 25_000_000
 
 @dataclass(frozen=True, kw_only=True)
 class Finding:
-    """One thing that a person should know or look at."""
+    """One fact that the user should know or look at."""
 
     kind: str
     """``failure``, ``flag`` or ``repair``."""
@@ -129,7 +129,7 @@ class Hemisphere:
 
     @property
     def decision(self) -> Decision:
-        """What is to be done with it."""
+        """The decision on it."""
         return Decision(self.record["decision"])
 
     @property
@@ -164,7 +164,7 @@ class Hemisphere:
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """What stopped it, or what is doubtful about it, and what was repaired."""
+        """The problem that stopped it, or its doubtful places, and its repairs."""
         if not self.measured:
             return (_finding("failure", self.message or "no message"),)
         flags = [
@@ -293,7 +293,7 @@ def anatomy_of(path: Path, volume: ScalarVolume) -> Anatomy | None:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Views:
-    """Labels and mask of one hemisphere, cropped to what is of interest."""
+    """Labels and mask of one hemisphere, cropped to the part of interest."""
 
     labels: NDArray[np.int32] | None
     """(I, J, K) codes; ``None`` if the input is no longer available."""

@@ -33,7 +33,7 @@ _ORDER = (Decision.FAILED, Decision.LOOK, Decision.USE)
 
 @dataclass(frozen=True, kw_only=True)
 class Verdict:
-    """What a person is told about a hemisphere first."""
+    """The first lines about a hemisphere."""
 
     decision: Decision
     reason: str
@@ -47,7 +47,7 @@ class Verdict:
 
     @property
     def title(self) -> str:
-        """The decision, for people."""
+        """The decision, in words."""
         return _TITLES[self.decision]
 
     @property
@@ -58,7 +58,7 @@ class Verdict:
 
 
 def verdict_of(hemisphere: Hemisphere) -> Verdict:
-    """Take the decision from the quality record, and write what it rests on."""
+    """Take the decision from the quality record, and write its reasons."""
     decision = hemisphere.decision
     if decision == Decision.FAILED:
         return Verdict(
@@ -73,7 +73,7 @@ def verdict_of(hemisphere: Hemisphere) -> Verdict:
             decision=decision,
             reason=_sentence(finding.message.split("; it concerns")[0]),
             consequence=_of_flag(hemisphere, finding),
-            advice="Look at the numbered places; then use it, correct the labels, or leave it out.",
+            advice="Look at the numbered places; then use it, correct the labels, or exclude it.",
             change=finding.change,
             share=finding.share,
         )
@@ -95,8 +95,8 @@ def _of_repairs(hemisphere: Hemisphere) -> str:
     )
     mean = hemisphere.summary.get("thickness_mean", np.nan) - change
     return (
-        f"{count} repair{'s' if count > 1 else ''} of the labels, {share:.1%} of the map; were the"
-        f" repaired columns like their neighbors, the mean would be {mean:.2f} mm."
+        f"{count} repair{'s' if count > 1 else ''} of the labels, {share:.1%} of the map; "
+        f"with values of the neighbors, the mean would be {mean:.2f} mm."
     )
 
 
@@ -110,16 +110,16 @@ def _of_flag(hemisphere: Hemisphere, finding: Finding) -> str:
 def _consequence(hemisphere: Hemisphere, share: float, change: float) -> str:
     """Write which share of the map could be wrong, and what the mean could be off by, mm."""
     if np.isnan(share):
-        return "What it does to the mean thickness is not known."
+        return "The effect on the mean thickness is unknown."
     mean = hemisphere.summary.get("thickness_mean", np.nan)
     if share == 0:
         return f"No measured column lies there: the mean thickness stays {mean:.2f} mm."
     extent = "the whole map" if share == 1 else f"{share:.1%} of the map"
     if np.isnan(change):
-        return f"It concerns {extent}; what it does to the mean thickness is not known."
+        return f"It concerns {extent}; the effect on the mean thickness is unknown."
     if abs(change) < _ROUNDING:
         return f"It concerns {extent}; the mean thickness hardly depends on it: {mean:.2f} mm."
-    compared = "expected" if share == 1 else "with these columns as those around them"
+    compared = "expected" if share == 1 else "with values of the neighbors"
     return (
         f"The mean thickness could be {abs(change):.2f} mm too {'large' if change > 0 else 'small'}"
         f", and {extent} wrong: {mean:.2f} mm as measured, {mean - change:.2f} mm {compared}."

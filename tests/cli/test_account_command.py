@@ -119,7 +119,7 @@ def test_kinds_of_segmentation_are_noted_before_the_group_level_refuses_them(tmp
     arguments = [str(bids), str(tmp_path / "out"), "participant", "--dry-run"]
     assert main.main(arguments) == ExitCode.OK
     notes = [line for line in capsys.readouterr().out.splitlines() if "labels differ" in line]
-    note = "labels differ in analysis: T1 (4), T1-T2 (2); group refuses such a mix unless"
+    note = "labels differ in analysis: T1 (4), T1-T2 (2); group refuses this mix unless"
     assert notes == [f"note: {note} --mixed analysis allows it"]
     assert main.main([*arguments, "--participant-label", "01", "02"]) == ExitCode.OK
     assert "labels differ" not in capsys.readouterr().out

@@ -191,8 +191,7 @@ def test_memory_decides_what_is_read(good, tmp_path, capsys):
     assert main.main(line) == ExitCode.SOME_FAILED
     (said,) = capsys.readouterr().err.splitlines()
     path = label_file(bids_dir, "good", "rh")
-    assert f"{path}: reading one slice (16.0 million voxels) takes 384 MB" in said
-    assert "is 300 MB; raise --mem" in said
+    assert f"{path}: one slice (16.0 million voxels) needs 384 of 300 MB; raise --mem" in said
     rows = {row["hemi"]: row for row in read_status(out)}
     assert rows["R"]["reason"] == "image-too-large"
     assert rows["L"]["decision"] != "failed"
@@ -230,11 +229,11 @@ def a_file(path):
 @pytest.mark.parametrize(
     ("prepare", "options", "expected"),
     [
-        (Path.exists, (), (ExitCode.BAD_DATA, "no such folder")),
+        (Path.exists, (), (ExitCode.BAD_DATA, "folder not found")),
         (a_file, (), (ExitCode.BAD_DATA, "is a file, but a folder is needed")),
         (Path.mkdir, (), (ExitCode.NOTHING_TO_DO, "no hippocampal segmentation")),
-        (Path.mkdir, ("--ashs-dir", "nowhere"), (ExitCode.BAD_DATA, "nowhere: no such folder")),
-        (Path.mkdir, ("-d", "a=nowhere"), (ExitCode.BAD_DATA, "nowhere: no such folder")),
+        (Path.mkdir, ("--ashs-dir", "nowhere"), (ExitCode.BAD_DATA, "nowhere: folder not found")),
+        (Path.mkdir, ("-d", "a=nowhere"), (ExitCode.BAD_DATA, "nowhere: folder not found")),
         (Path.mkdir, ("--protocol", "x" * 3000), (ExitCode.BAD_DATA, "File name too long")),
         (Path.mkdir, ("--scheme", "nowhere.toml"), (ExitCode.BAD_DATA, "nowhere.toml")),
         (Path.mkdir, ("--bids-filter-file", "nowhere.json"), (ExitCode.BAD_DATA, "nowhere.json")),

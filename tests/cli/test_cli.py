@@ -236,7 +236,7 @@ def test_options_without_meaning_are_remembered_with_the_reason():
     given = ["--omp-nthreads", "4", "--notrack", "--notrack"]
     options = build_parser().parse_args(["in", "out", "participant", *given])
     assert dict(options.ignored) == {
-        "--omp-nthreads": "each hemisphere uses one processor; --n-procs says how many at a time",
+        "--omp-nthreads": "each hemisphere uses one processor; --n-procs sets how many at a time",
         "--notrack": "nothing is tracked",
     }
 

@@ -68,12 +68,13 @@ def the_log(out):
 def test_what_was_not_used_is_listed(dataset, tmp_path, capsys):
     bids, out = tmp_path / "bids", tmp_path / "out"
     said = call(capsys, bids, out, "participant", "--dry-run").out
-    note = "note: not used: 3 folders (bert, sub-07/mri, sub-AD_05); --dry-run and the log say why"
+    folders = "3 folders (bert, sub-07/mri, sub-AD_05)"
+    note = f"note: not used: {folders}; see --dry-run and the log for the reasons"
     assert note in said
     for name, reason in (
         ("sub-AD_05", "takes it as sub-AD05"),
         ("bert", "takes it as sub-bert"),
-        ("fsaverage", "comes with FreeSurfer, and is no subject"),
+        ("fsaverage", "part of FreeSurfer, and no subject"),
         ("sub-07/mri", CLOSED),
     ):
         (line,) = (line for line in said.splitlines() if line.startswith(f"{dataset / name} "))
@@ -82,7 +83,7 @@ def test_what_was_not_used_is_listed(dataset, tmp_path, capsys):
     assert note in said
     assert str(dataset / "bert") not in said
     assert f"note: not used: {dataset / 'sub-07' / 'mri'}: {CLOSED}\n" in the_log(out)
-    assert f"note: not used: {dataset / 'fsaverage'}: comes" in the_log(out)
+    assert f"note: not used: {dataset / 'fsaverage'}: part of FreeSurfer" in the_log(out)
     assert [row["subject"] for row in read_status(out)] == ["sub-01", "sub-01"]
 
 

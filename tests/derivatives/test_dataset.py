@@ -69,7 +69,7 @@ def test_a_damaged_description_is_written_anew(tmp_path, damage):
 @pytest.mark.parametrize("damage", [None, "x", [1]])
 def test_damaged_settings_are_other_settings(tmp_path, damage):
     files.write_json(tmp_path / "desc-settings.json", {"hash": "0", "settings": damage})
-    with pytest.raises(SettingsError, match="holds results with other settings"):
+    with pytest.raises(SettingsError, match="results with other settings"):
         dataset.settle_settings(tmp_path, Settings())
 
 
@@ -290,7 +290,7 @@ def test_the_methods_text_says_which_steps_are_as_published():
         body={"end_rule": "last-slice"}, boundaries={"operator": "published", "edges": "zero-lines"}
     )
     published = dataset.citation_text(settings, [])
-    for text in ("lay at the last slices with labels", "of the original method, without a thresh"):
+    for text in ("lay at the last slices with CA1", "of the original method, without a thresh"):
         assert text in published
         assert text not in usual
     assert "moved to the middle of the sheet's edges" in usual

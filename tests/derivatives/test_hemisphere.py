@@ -115,7 +115,7 @@ def test_sidecars_define_every_column(written):
     for key in ("sheet", "summary", "profile", "sections", "layers"):
         columns = place.path(key).read_text().splitlines()[0].split("\t")
         definitions = sidecar(place, key)
-        assert "head and tail are not measured" in definitions.pop("MeasuredRegion")
+        assert "head and tail are in no number" in definitions.pop("MeasuredRegion")
         assert list(definitions) == columns
         assert all(entry["Description"] for entry in definitions.values())
 

@@ -224,5 +224,5 @@ def test_the_published_rule_takes_the_last_slices(voxel, tilt):
 def test_the_published_rule_needs_a_slice_of_the_body():
     volume = drawn()
     volume = replace(volume, tissue=np.where(volume.tissue == Tissue.CA1, 0, volume.tissue))
-    with pytest.raises(GeometryError, match="no slice across the long axis has both"):
+    with pytest.raises(GeometryError, match="no slice has both CA1 and CA2/CA3"):
         ends_of(volume, BodySettings(end_rule="last-slice"))

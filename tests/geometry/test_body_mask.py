@@ -99,7 +99,7 @@ def test_beyond_the_end_planes_the_labels_stay(volume, body):
 def test_a_mask_elsewhere_is_refused(volume, body):
     mask = np.zeros_like(body.inside)
     mask[:2, :2, :2] = True
-    with pytest.raises(GeometryError, match="check that the mask is of this hemisphere") as caught:
+    with pytest.raises(GeometryError, match="check its hemisphere and its space") as caught:
         corrected(volume, mask)
     assert caught.value.reason == "edited-mask-elsewhere"
 

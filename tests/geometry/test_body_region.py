@@ -75,7 +75,7 @@ def test_cortex_has_to_reach_along_nine_tenths(levels, enough):
     if enough:
         check_reach(points, tissue, ENDS, settings)
         return
-    with pytest.raises(GeometryError, match=rf"{levels:.1f} mm of the 10\.0 mm") as caught:
+    with pytest.raises(GeometryError, match=rf"{levels:.1f} of 10\.0 mm") as caught:
         check_reach(points, tissue, ENDS, settings)
     assert caught.value.reason == "cortex-incomplete"
 

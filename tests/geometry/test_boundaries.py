@@ -234,7 +234,9 @@ def test_strips_that_swallow_the_sides_are_refused(arc, monkeypatch):
     monkeypatch.setattr(boundaries, "FIRST_STRIP", 6.0)
     monkeypatch.setattr(boundaries, "LEAST_STRIP", 6.0)
     monkeypatch.setattr(boundaries, "STRIP_REACH", (6.0, 6.0))
-    with pytest.raises(GeometryError, match=r"do not separate the interior.*RAS") as caught:
+    with pytest.raises(
+        GeometryError, match=r"do not separate interior and exterior.*RAS"
+    ) as caught:
         find_boundaries(arc.surface, arc.laplace, arc.body, SETTINGS)
     assert caught.value.reason == "boundaries"
 

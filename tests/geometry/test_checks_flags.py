@@ -55,7 +55,7 @@ def test_a_flag_says_what_it_does_to_the_mean(size, monkeypatch):
     assert flag.change == pytest.approx(mean - 1.7)  # mm, the other columns
     word = "less" if size > 0 else "more"
     assert flag.message == (
-        "odd, near P15: look; it concerns 1.7% of the columns: were they as those around them, "
+        "odd, near P15: look; it concerns 1.7% of the columns: with values of the neighbors, "
         f"the mean would be 0.01 mm {word}"
     )
 

@@ -75,7 +75,7 @@ def test_limits_are_the_settings(arc, limit):
 def test_the_volume_of_the_uncus_is_told(arc):
     uncus = np.tile(np.argwhere(arc.body.tissue)[:1], (400, 1))
     (text,) = describe_uncus(replace(arc.body, uncus=uncus), CHECKS)
-    assert text.startswith(f"left out the uncus, {400 * arc.body.voxel_volume:.0f} mm3 at ")
+    assert text.startswith(f"the uncus was excluded, {400 * arc.body.voxel_volume:.0f} mm3 at ")
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])

@@ -263,7 +263,7 @@ def test_what_decides_comes_before_what_may_be_cut_off(page, label):
 def test_classification_of_few_says_what_cannot_be_judged(page):
     titles, _ = rows_of(page, "Classification")
     assert "Slope" not in titles
-    assert "is judged where both groups have 100 members or more, which none has" in page
+    assert "needs 100 members in both groups; no comparison here has them" in page
 
 
 def change_table(path, column, values):
@@ -391,7 +391,7 @@ def test_no_page_is_made_or_left_if_none_is_wanted(dataset, copy, monkeypatch, c
     assert main([str(data), str(copy), "group", *given, "--no-reports"]) == 0
     assert not (copy / "group" / f"{MODEL}.html").exists()
     methods = copy / "group" / MODEL / "methods.md"
-    assert f"what was done and found: {methods}\n" in capsys.readouterr().out
+    assert f"report: {methods}\n" in capsys.readouterr().out
 
 
 @pytest.fixture

@@ -127,9 +127,9 @@ def test_head_volumes_in_two_units_are_refused(study, capsys, column, n_small, f
     options = [*FAST, "--formula", f"group + {column}"]
     assert main([str(study.data), str(study.out), "group", *options]) == 65
     error = capsys.readouterr().err
-    assert f"{column!r} has {n_small} values up to" in error
-    assert f"and {30 - n_small} from" in error
-    assert "cm^3 and mm^3? write all in one unit" in error
+    assert f"{column!r} has {n_small} values to" in error
+    assert f", {30 - n_small} from" in error
+    assert "(cm^3 and mm^3?); use one unit" in error
     assert error.count("\n") == 1
 
 
@@ -138,7 +138,7 @@ def test_head_volumes_of_the_default_model_are_checked_too(study, capsys):
     call = [str(study.data), str(study.out), "group", "--align", "none", "--no-reports"]
     assert main([*call, "--no-classification"]) == 0
     said = capsys.readouterr().out
-    assert "volumes are not adjusted for TIV: model: column 'TIV' has 9 values up to" in said
+    assert "volumes are not adjusted for TIV: model: 'TIV' has 9 values to" in said
 
 
 def test_head_volumes_that_differ_as_heads_do_pass(study, capsys):

@@ -70,7 +70,7 @@ def test_folders_of_ashs_of_any_name(tmp_path):
             "/new run",
             "labels in it (final/x_left_lfseg_corr_usegray.nii.gz), a place",
         ),
-        (lambda f: touch(f / "anat", "sub-09_hemi-L_dseg.nii.gz"), "/anat", "no _dseg.tsv says"),
+        (lambda f: touch(f / "anat", "sub-09_hemi-L_dseg.nii.gz"), "/anat", "no _dseg.tsv defines"),
     ],
 )
 def test_a_subject_without_labels_has_a_reason(tmp_path, make, place, reason):
@@ -294,7 +294,7 @@ def test_nothing_of_a_tree_is_without_a_row(tmp_path, seed):
         own = next(rows_at[place] for place in places if place in rows_at)
         # A folder that stands for its labels says so: these are missed.
         reason = own[0]["reason"]
-        nobody = reason.startswith(("comes with FreeSurfer", "the base of longitudinal"))
+        nobody = reason.startswith(("part of FreeSurfer", "the base of longitudinal"))
         assert path in rows_at or nobody or own[0]["status"] == "not used", path
     for entry in entries:
         assert any(place.is_relative_to(entry) for place in rows_at), entry

@@ -131,12 +131,12 @@ def test_names_that_are_not_bids_are_listed(tmp_path):
     assert why[f"{at}sub-AD_05"].endswith("takes it as sub-AD05")
     assert why[f"{at}sub-AD_06_ses-1"].endswith("takes it as sub-AD06")
     assert why[f"{at}sub-02"] == "its mri folder holds no hippocampal subfields"
-    assert why[f"{at}fsaverage"] == "comes with FreeSurfer, and is no subject"
+    assert why[f"{at}fsaverage"] == "part of FreeSurfer, and no subject"
     # Templates are everywhere: they are listed, but not counted.
     (note,) = found.notes
     assert note == (
         "not used: 6 folders (bert, sub-, sub-02, sub-AD_05, sub-AD_06_ses-1, sub-A B); "
-        "--dry-run and the log say why"
+        "see --dry-run and the log for the reasons"
     )
 
 

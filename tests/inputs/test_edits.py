@@ -92,8 +92,8 @@ def test_sessions(tmp_path):
     ("name", "reason"),
     [
         ("sub-01_desc-edited_dseg.nii.gz", "its name has no hemi-L or hemi-R"),
-        ("sub-02_hemi-L_desc-edited_dseg.nii.gz", "its name says sub-02, but"),
-        ("sub-01_ses-1_hemi-L_desc-edited_dseg.nii.gz", "its name says ses-1, but"),
+        ("sub-02_hemi-L_desc-edited_dseg.nii.gz", "its name has sub-02, but"),
+        ("sub-01_ses-1_hemi-L_desc-edited_dseg.nii.gz", "its name has ses-1, but"),
         ("sub-01_hemi-L_seg-ashsPMC_desc-edited_mask.nii", "sub-01 hemi-L has seg-freesurfer"),
     ],
 )
@@ -187,7 +187,7 @@ def test_edits_in_the_output_folder_are_found(data, tmp_path):
 
 
 def test_a_missing_folder_is_an_error(data, tmp_path):
-    with pytest.raises(InputError, match="no such folder"):
+    with pytest.raises(InputError, match="folder not found"):
         search(data, edited_dir=tmp_path / "none")
 
 

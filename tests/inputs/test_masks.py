@@ -163,7 +163,7 @@ def test_edited_labels_elsewhere_are_refused(labels):
     moved[0, 3] += 40
     path = save(labels.with_name("e.nii.gz"), block(), moved)
     item = make_item(labels, edits=[("labels", path)])
-    with pytest.raises(HipstaError, match="100% of the edited labels lie elsewhere") as caught:
+    with pytest.raises(HipstaError, match="100% of the edited labels lie outside") as caught:
         read_label_volume(item)
     assert caught.value.reason == "edited-elsewhere"
 

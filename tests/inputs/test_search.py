@@ -432,7 +432,7 @@ def test_the_users_dataset_comes_before_default_places(tmp_path):
             tmp_path / "sourcedata" / "aa",
         )
     ]
-    assert all("which comes first" in reason for _, reason in left.passed_over)
+    assert all("which is preferred" in reason for _, reason in left.passed_over)
 
 
 def test_usable_comes_before_unusable(tmp_path):

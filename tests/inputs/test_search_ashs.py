@@ -68,7 +68,7 @@ def test_the_last_step_of_ashs_comes_first(tmp_path):
     item = found["01", "", "L", "ashsABC3T"]
     assert item.files[0].name == names[2]
     reasons = dict(item.passed_over)
-    assert reasons[names[0]] == "corr_usegray comes before heur"
+    assert reasons[names[0]] == "corr_usegray is preferred to heur"
     assert "both hemispheres in one file" in reasons["x_lfseg_heur.nii.gz"]
 
 
@@ -123,7 +123,7 @@ def test_values_decide_if_one_atlas_only_fits(tmp_path, values, protocol):
     item = only(tmp_path)
     assert item.protocol.name == protocol
     assert item.problem is None
-    assert "only this atlas has such labels" in item.explanation
+    assert "only this atlas has labels like these" in item.explanation
 
 
 def test_ambiguous_values_are_never_guessed(tmp_path):
@@ -132,8 +132,7 @@ def test_ambiguous_values_are_never_guessed(tmp_path):
     assert item.problem is not None
     assert item.problem.reason == "ambiguous-atlas"
     assert str(item.problem) == (
-        f"{path}: labels 1, 2, 3, 4, 8 fit ashsABC3T and ashsPMC; "
-        "say which atlas was used with --ashs-atlas"
+        f"{path}: labels 1, 2, 3, 4, 8 fit ashsABC3T and ashsPMC; name the atlas with --ashs-atlas"
     )
     assert item.protocol.name == "ashs"
 
@@ -152,7 +151,7 @@ def test_one_file_with_a_code_of_its_own_names_the_whole_dataset(tmp_path):
     left(tmp_path, "sub-02", MAGDEBURG)
     first, second = find(tmp_path)
     assert first.protocol.name == second.protocol.name == "ashsMagdeburg7T"
-    assert "fit ashsABC3T and ashsMagdeburg7T, those of 2 other files" in first.explanation
+    assert "fit ashsABC3T and ashsMagdeburg7T; labels of 2 other files" in first.explanation
     # Without it, whichever the others are named by.
     left(tmp_path, "sub-02", [*CORTEX, 20])
     assert {item.protocol.name for item in find(tmp_path)} == {"ashsABC3T"}
@@ -195,7 +194,7 @@ def test_the_atlas_carries_over_within_a_dataset(tmp_path):
     left(tmp_path, "sub-02", BOTH)
     first, second = find(tmp_path)
     assert first.protocol.name == second.protocol.name == "ashsABC3T"
-    assert "1 other file of the dataset only this one" in second.explanation
+    assert "1 other file of the dataset fit only this one" in second.explanation
     # Also when the other one is not asked for: the choice may not depend on the selection.
     alone = only(tmp_path, participant_labels=("02",))
     assert alone == second

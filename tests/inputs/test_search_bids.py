@@ -59,7 +59,7 @@ def test_the_cropped_space_comes_first(tmp_path):
     reasons = [reason for _, reason in item.passed_over]
     assert len(reasons) == 3
     assert any("coarser grid" in reason for reason in reasons)
-    assert any("atlas multihist7 comes first" in reason for reason in reasons)
+    assert any("atlas multihist7 is preferred" in reason for reason in reasons)
     assert any("may be scaled" in reason for reason in reasons)
 
 
@@ -168,7 +168,7 @@ def test_a_side_that_is_misspelled_is_noted(tmp_path):
     assert (item.hemi, item.problem) == ("L", None)
     assert found.notes == (
         "no labels of one hemisphere: 1 visit (sub-01 R)",
-        "not used: 1 file (sub-01_hemi-r_dseg.nii.gz); --dry-run and the log say why",
+        "not used: 1 file (sub-01_hemi-r_dseg.nii.gz); see --dry-run and the log for the reasons",
     )
     assert [entry.reason for entry in found.ignored] == [
         "no labels of this hemisphere, but of the other",
@@ -182,7 +182,7 @@ def test_a_name_of_somebody_else_is_noted(tmp_path):
     own, other = find(tmp_path)
     assert own.notes == ()
     assert (other.subject, other.session) == ("02", "1")
-    assert other.notes == ("the file's name says sub-03_ses-2",)
+    assert other.notes == ("the file's name has sub-03_ses-2",)
 
 
 def test_the_subjects_own_space_comes_first(tmp_path):

@@ -64,7 +64,7 @@ def test_of_several_images_t2_comes_first_and_others_are_not_chosen_between(tmp_
     put(tmp_path, HSF.format("left"), t1)
     (item,) = find(tmp_path, protocol="hsf")
     assert item.files[0].name == HSF.format("left")
-    assert item.passed_over == ((t1, "T2w comes first"),)
+    assert item.passed_over == ((t1, "T2w is preferred"),)
     put(tmp_path, HSF.replace("T2w", "acq-tse_T2w").format("left"))
     (item,) = find(tmp_path, protocol="hsf")
     assert item.problem is not None

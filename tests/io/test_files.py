@@ -135,7 +135,7 @@ def test_broken_table_is_named(tmp_path):
     path.write_text("a\tb\n1\n")
     with pytest.raises(InputError, match="differ in length"):
         files.read_tsv(path)
-    with pytest.raises(InputError, match="no such file"):
+    with pytest.raises(InputError, match="file not found"):
         files.read_tsv(tmp_path / "missing.tsv")
 
 

@@ -112,7 +112,7 @@ def test_a_bad_row_fails_its_hemisphere_alone(data, tmp_path, row, what, capsys)
         (f"{HEADER}\n\tL\tanterior\t0\t0\t0\n", "line 2: it has no participant_id"),
         (f"{HEADER}\n", "has no rows"),
         ("", "has no rows"),
-        (None, "no such file"),
+        (None, "file not found"),
     ],
 )
 def test_a_bad_table_stops_the_run_with_one_line(data, tmp_path, content, what, capsys):

@@ -301,7 +301,7 @@ def test_a_run_with_other_maps_redoes_and_tidies_up(bids_dir, regions, tmp_path,
         ("x\ty\tregion\n1\t1\tn/a\n", "no point belongs to a region"),
         ("", "no point belongs to a region"),
         ("x\ty\tregion\n1\t1\n", "rows and header differ"),
-        (None, "no such file"),
+        (None, "file not found"),
     ],
 )
 def test_bad_regions_are_one_line(content, what, tmp_path):

@@ -224,7 +224,7 @@ def test_voxels_of_a_millimeter_are_refused_whatever_the_sheet():
     thick = Phantom(spiral(kind="arc", thickness=3.0)).label_volume(
         load_protocol("hippunfold"), voxel_size=(1.0, 1.0, 1.0)
     )
-    refused(thick, "sheet-too-thin", "too coarse for a sheet of one to two millimeters")
+    refused(thick, "sheet-too-thin", "too coarse")
 
 
 def test_the_grid_of_hipsta_measures_nine_tenths_of_the_wall(plain):
@@ -327,7 +327,7 @@ def test_missing_slices_are_refused(damage):
 
 def test_a_sheet_in_two_strips_is_refused(damage):
     slit = damage.sheet & (damage.u > 0.45) & (damage.u < 0.55)
-    refused(damage.erase(slit), "body-split", r"2 strips from end to end, at RAS .* \(CA1\)")
+    refused(damage.erase(slit), "body-split", r"2 strips, at RAS .* \(CA1\)")
 
 
 def test_a_body_that_is_too_short_is_refused(damage):
@@ -345,7 +345,7 @@ def test_labels_without_a_sheet_are_refused(damage):
 def test_a_tail_label_across_the_middle_is_refused(damage):
     inside = (damage.v > 0.45) & (damage.v < 0.55) & (damage.volume.tissue > 0)
     volume = damage.relabel(inside, Tissue.HIPPOCAMPUS, Part.TAIL)
-    refused(volume, "body-interrupted", "correct head and tail labels inside the body")
+    refused(volume, "body-interrupted", "correct head and tail labels")
 
 
 def test_the_other_hemisphere_is_refused(plain):
@@ -362,7 +362,7 @@ def test_subfields_in_the_wrong_order_are_refused(damage):
         protocol=volume.protocol,
     )
     # The subiculum borders on CA2/3 as where two turns touch, so that the sheet is parted there.
-    refused(volume, "body-split", "check that the protocol fits")
+    refused(volume, "body-split", "check the protocol")
 
 
 def test_too_few_voxels_across_are_refused(plain):

@@ -71,7 +71,7 @@ def test_an_uncus_is_left_out_and_named(volume, plain):
     maps = measure(with_uncus(cut(volume, 0, "width"), plain))
     assert maps.decision == Decision.USE
     (repair,) = maps.repairs
-    assert repair.startswith("left out the uncus")
+    assert repair.startswith("the uncus was excluded")
     assert np.abs(maps.thickness - plain.thickness).max() < 0.1
     assert maps.qc["changed_fraction"] == 0
 

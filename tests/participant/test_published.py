@@ -53,7 +53,7 @@ def test_a_published_run_says_so_and_no_other_run_joins_it(bids_dir, tmp_path, c
     capsys.readouterr()
     assert run(bids_dir, out) == ExitCode.USAGE
     said = capsys.readouterr().err
-    assert "holds results with other settings (body.end_rule was last-slice, now graded" in said
+    assert "results with other settings (body.end_rule was last-slice, now graded" in said
     assert said.count("\n") == 1
 
 

@@ -72,6 +72,6 @@ def test_labels_of_a_millimeter_are_refused(hemi):
         explanation="",
     )
     volume = read_label_volume(item)
-    with pytest.raises(GeometryError, match=r"voxels of 1\.00 mm in plane are too") as caught:
+    with pytest.raises(GeometryError, match=r"voxels of 1\.00 mm are too") as caught:
         measure(volume, hemi)
     assert caught.value.reason == "sheet-too-thin"

@@ -145,14 +145,14 @@ def test_files_that_do_not_fit_are_refused_in_one_line(flat, tmp_path, capsys):
     out = tmp_path / "out.shape.gii"
     cases = (
         ([body, out], surface, 65, "is of region body"),
-        ([coarse, out], surface, 65, f"has {11 * len(Y)} points, the whole sheet 41 x {len(Y)}"),
+        ([coarse, out], surface, 65, f"{11 * len(Y)} points fit neither the sheet (41 x {len(Y)})"),
         ([unsided, out], surface, 65, "put hemi-L or hemi-R in its name"),
         ([sheet, sheet, out], surface, 65, "both are of side L"),
-        ([sheet, out], folded, 65, "is no unfolded surface of HippUnfold's"),
-        ([sheet, out], turned, 65, "is no unfolded surface of HippUnfold's"),
+        ([sheet, out], folded, 65, "is no unfolded surface of HippUnfold"),
+        ([sheet, out], turned, 65, "is no unfolded surface of HippUnfold"),
         ([sheet, out], right, 65, "no unfolded surface of side L"),
         ([sheet, out], tmp_path / "none.surf.gii", 65, "none.surf.gii"),
-        ([tmp_path / "none_hemi-L_morph.tsv", out], surface, 65, "no such file"),
+        ([tmp_path / "none_hemi-L_morph.tsv", out], surface, 65, "file not found"),
         ([sheet, tmp_path / "out.nii.gz"], surface, 64, "results end with .shape.gii"),
         ([sheet, tmp_path / "out.tsv"], surface, 64, "tables are of sheets"),
         ([sheet, sheet], surface, 64, "is an input"),

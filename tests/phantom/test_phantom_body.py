@@ -103,7 +103,7 @@ def test_thickness_varies_as_asked(axis, low):
         ({"kind": "tight", "thickness": 3.3}, "wall folds"),
         ({"kind": "arc", "width": 26.0}, "turns of the wall overlap"),
         ({"kind": "spiral", "width": 45.0, "thickness": 3.0}, "overlap"),
-        ({"kind": "slab", "bend": 0.1}, "long axis bends too sharply"),
+        ({"kind": "slab", "bend": 0.1}, "axis bends too sharply"),
         ({"kind": "arc", "bend": 0.09, "length": 40.0}, "too sharply"),
     ],
 )

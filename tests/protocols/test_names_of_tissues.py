@@ -79,7 +79,7 @@ def test_abbreviations_and_colors_are_used():
 
 
 def test_tables_without_subfields_and_with_repeated_codes_are_refused():
-    with pytest.raises(ProtocolError, match="do not include a subiculum and a CA1") as caught:
+    with pytest.raises(ProtocolError, match="no names of subiculum and CA1") as caught:
         protocol_from_names(rows("", "thalamus", "CA1"), name="mine", origin="t")
     assert caught.value.reason == "unclear-names"
     with pytest.raises(ProtocolError, match="code 1, 2 is listed twice"):

@@ -74,7 +74,7 @@ def test_backticks_of_messages_become_code_and_tags_in_them_stay_text():
 
 def test_a_finding_has_one_share(copy):
     """That of the headline, where the headline is about it."""
-    concerns = "; it concerns 3.0% of the columns: were they as those around them"
+    concerns = "; it concerns 3.0% of the columns: with values of the neighbors"
     heads = [f"a bump near RAS {x}.0 -20.0 -20.0 mm (CA1): look there" for x in (20, 25)]
     flags = [{"reason": "a", "message": h + concerns, "columns_share": 0.03} for h in heads]
     path = next((copy / "sub-02/anat").glob("*hemi-L*_metrics.json"))

@@ -81,8 +81,8 @@ def test_what_repairs_may_do_is_that_of_the_repaired_columns(out):
     assert verdict.reason == "No check found anything to look at."
     assert found.metrics["repaired_change_mm"] == pytest.approx(mean - other, abs=1e-5)
     assert verdict.consequence == (
-        f"1 repair of the labels, {repaired.mean():.1%} of the map; were the repaired"
-        f" columns like their neighbors, the mean would be {other:.2f} mm."
+        f"1 repair of the labels, {repaired.mean():.1%} of the map; with values"
+        f" of the neighbors, the mean would be {other:.2f} mm."
     )
     assert verdict_of(hemisphere(out, "01", "L")).consequence == "No label was repaired."
 
@@ -99,16 +99,16 @@ def test_a_flag_decides_whatever_was_repaired(out):
     assert verdict.reason == "A notch near RAS 1 2 3 mm: look."
     assert verdict.consequence == (
         "The mean thickness could be 0.05 mm too small, and 20.0% of the map wrong:"
-        f" {mean:.2f} mm as measured, {mean + 0.05:.2f} mm with these columns as those around them."
+        f" {mean:.2f} mm as measured, {mean + 0.05:.2f} mm with values of the neighbors."
     )
 
 
 @pytest.mark.parametrize(
     ("reason", "share", "change", "text"),
     [
-        ("noisy-labels", None, None, "What it does to the mean thickness is not known."),
-        ("folded", 0.03, None, "It concerns 3.0% of the map; what it does to the mean"),
-        ("subfield-missing", 1.0, None, "It concerns the whole map; what it does to the mean"),
+        ("noisy-labels", None, None, "The effect on the mean thickness is unknown."),
+        ("folded", 0.03, None, "It concerns 3.0% of the map; the effect on the mean"),
+        ("subfield-missing", 1.0, None, "It concerns the whole map; the effect on the mean"),
         ("side-doubtful", 1.0, 0.0, "It concerns the whole map; the mean thickness hardly"),
         ("ends-uncertain", 0.0, 0.0, "No measured column lies there"),
         ("map-outside", None, None, "Thickness and shape do not depend on it."),

@@ -92,7 +92,7 @@ def test_pages_show_every_reason_and_setting(site):
     assert 'id="body-split"' in (site / "reasons.html").read_text(encoding="utf-8")
 
 
-@pytest.mark.parametrize("name", RECORDS)
+@pytest.mark.parametrize("name", sorted(RECORDS))
 def test_each_table_of_the_validation_is_on_the_page_of_its_suite(site, name):
     page = (site / "validation" / f"{name}.html").read_text(encoding="utf-8")
     for file in (entry["file"] for entry in RECORDS[name]["tables"]):

@@ -51,7 +51,7 @@ class GroupRequest:
     """Where segmentations are now, if they have moved since they were measured."""
 
     def wants(self, subject: str, session: str | None) -> bool:
-        """Tell whether a visit is asked for, by its labels."""
+        """Check whether a visit is asked for, by its labels."""
         return (
             (not self.subjects or subject in self.subjects)
             and subject not in self.excluded
@@ -76,7 +76,7 @@ class SheetRecord:
 
 @dataclass(frozen=True)
 class Exclusion:
-    """One hemisphere, or visit, that is left out."""
+    """One hemisphere, or visit, that is excluded."""
 
     participant: str
     session: str | None
@@ -86,13 +86,13 @@ class Exclusion:
 
     @classmethod
     def of_sheet(cls, name: HemisphereName, reason: str, message: str) -> "Exclusion":
-        """Leave out one hemisphere."""
+        """Exclude one hemisphere."""
         session = f"ses-{name.session}" if name.session else None
         return cls(f"sub-{name.subject}", session, name.hemi, reason, message)
 
 
 def exclude_visits(table: pd.DataFrame, left_out: Mapping[str, tuple[str, str]]) -> list[Exclusion]:
-    """Leave out visits of a table; the index names them, as it does their reasons and messages."""
+    """Exclude visits of a table; the index names them, as it does their reasons and messages."""
     rows = table.loc[list(left_out), [PARTICIPANT, SESSION]].itertuples(name=None)
     return [
         Exclusion(participant, session, files.MISSING, *left_out[visit])
@@ -102,7 +102,7 @@ def exclude_visits(table: pd.DataFrame, left_out: Mapping[str, tuple[str, str]])
 
 @dataclass(frozen=True, kw_only=True)
 class Collection:
-    """What was found."""
+    """Results found, by hemisphere."""
 
     grid: SheetSettings
     """Of the sheets."""
@@ -126,7 +126,7 @@ def collect_sheets(request: GroupRequest, *, may_lack: bool = False) -> Collecti
     """Find all complete hemispheres of one protocol, made with the same settings."""
     for folder in request.segmentations:
         if not folder.is_dir():
-            raise MissingFileError(f"{folder}: no such folder; check --segmentations")
+            raise MissingFileError(f"{folder}: folder not found; check --segmentations")
     roots = [root for root in request.roots if root.is_dir() or not may_lack]
     results = [result for root in roots for result in _wanted_results(root, request)]
     places = [result for result in results if result.name.region == request.region]
@@ -208,7 +208,7 @@ def _several_versions(records: Sequence[SheetRecord]) -> tuple[str, ...]:
 
 
 def wanted_by(request: GroupRequest) -> Callable[[str, str | None, str], bool]:
-    """Tell whether a hemisphere is asked for, and not in a table of those to leave out."""
+    """Check whether a hemisphere is asked for, and not in a table of exclusions."""
     choices = Choices(request.exclude_table, request.ratings)
 
     def is_wanted(subject: str, session: str | None, hemi: str) -> bool:
@@ -220,7 +220,7 @@ def wanted_by(request: GroupRequest) -> Callable[[str, str | None, str], bool]:
 
 def _wanted_results(root: Path, request: GroupRequest) -> list[hemisphere.ResultPlace]:
     if not root.is_dir():
-        raise MissingFileError(f"{root}: no such folder; run the participant level first")
+        raise MissingFileError(f"{root}: folder not found; run the participant level first")
     return [
         result
         for result in hemisphere.list_results(root)
@@ -335,8 +335,8 @@ def _refuse_unfinished(request: GroupRequest, seg: str, choices: Choices) -> Non
     if pending:
         names = ", ".join(pending[:SHOWN]) + (" ..." if len(pending) > SHOWN else "")
         raise InputError(
-            f"{request.roots[0]}: the participant level has not finished {len(pending)} hemispheres"
-            f" ({names}); complete it by the same command, or list them in --exclude",
+            f"{request.roots[0]}: {len(pending)} hemispheres ({names}) are not finished; run "
+            "the same command again, or list them in --exclude",
             reason=NOT_FINISHED,
         )
 

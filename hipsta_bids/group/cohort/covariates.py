@@ -68,7 +68,7 @@ def read_covariates(
     spelled: Spellings = Counter()
     absent: frozenset[str] = frozenset()
     if not bids_dir.is_dir():
-        raise MissingFileError(f"{bids_dir}: no such folder; check its name")
+        raise MissingFileError(f"{bids_dir}: folder not found; check its name")
     for path in (*tables, *sorted((bids_dir / "phenotype").glob("*.tsv")), *extra):
         table, sidecar = _read(path), _sidecar(path.with_suffix(".json"))
         if path == main:
@@ -99,7 +99,7 @@ def mark_missing(
 ) -> pd.DataFrame:
     """Mark cells that spell a missing value, and count the spellings by column.
 
-    A level that a sidecar lists is not missing, unless it says that it is (``"9": "unknown"``).
+    A level that a sidecar lists is not missing, unless the sidecar marks it (``"9": "unknown"``).
     """
     marked = table.copy()
     for name in table.columns:
@@ -134,7 +134,7 @@ def _without_codes(values: pd.Series, codes: Sequence[float], spelled: Spellings
 
 
 def spelled_note(spelled: Spellings, formula: str, settings: GroupSettings) -> str:
-    """Note what was read as missing, first in columns that a model is likely to have."""
+    """Note the cells read as missing, first in columns that a model is likely to have."""
     names = _known_columns(settings)
     keys = sorted(
         spelled, key=lambda key: (key[0].casefold() not in names and key[0] not in formula, key)

@@ -69,7 +69,7 @@ def hemispheres(cohort: Cohort) -> list[str]:
 
 
 def participants_with(finite: Bool, participants: NDArray[np.object_]) -> Int:
-    """Count those (columns,) of whom any row (rows, columns) is known."""
+    """Count participants (columns,) of whom any row (rows, columns) is known."""
     names, numbers = np.unique(participants.astype(str), return_inverse=True)
     if len(names) == len(participants):
         return np.asarray(finite.sum(axis=0), dtype=np.int64)
@@ -118,9 +118,9 @@ def modeled_table(table: pd.DataFrame, comparison: Comparison) -> pd.DataFrame:
 def compare_sessions(
     cohort: Cohort, comparison: Comparison, covariates: Sequence[str] = ()
 ) -> Cohort:
-    """Take differences of two sessions, if that is what is compared.
+    """Take differences of two sessions, if these are compared.
 
-    Maps that are covariates are those of the first session, as other covariates are.
+    Maps that are covariates are of the first session, as other covariates are.
     """
     if comparison.pair is None:
         sides = {
@@ -164,7 +164,7 @@ def _change(side: SideMaps, rows: Int, first: Int, second: Int) -> SideMaps:
 
 
 def asymmetry_maps(cohort: Cohort, measures: Sequence[str], relative: Sequence[str]) -> SideMaps:
-    """Left minus right at each point, of those who have both."""
+    """Left minus right at each point, of participants who have both."""
     if set(cohort.sides) != set(BOTH):
         raise ModelError(f"asymmetry: hemisphere {', '.join(cohort.sides)} only; both are needed")
     left, right = (cohort.sides[hemi] for hemi in BOTH)
@@ -234,7 +234,7 @@ def layers(
     cohorts : mapping of str to Cohort
         By surface.
     maps : sequence of str
-        Maps of the sheet; those of other surfaces are all taken.
+        Maps of the sheet; maps of other surfaces are all taken.
     summaries : sequence of str or None
         Summary measures of the sheet's cohort; ``None`` for all.
     rows : (rows,) array, optional

@@ -49,7 +49,7 @@ class UserTable:
         return rows_of
 
     def about(self, name: HemisphereName) -> list[Mapping[str, str]]:
-        """List rows that mean a hemisphere; those without a participant mean all."""
+        """List rows that mean a hemisphere; rows without a participant mean all."""
         rows = [*self._by_subject.get(name.subject, ()), *self._by_subject.get("", ())]
         return [row for row in rows if is_listed(name, row)]
 
@@ -60,7 +60,7 @@ class UserTable:
     def notes(self, names: Iterable[tuple[HemisphereName, str | None]]) -> list[str]:
         """Note rows that match no hemisphere, as by a misspelled label, or earlier labels.
 
-        Those ``names`` are of all protocols and regions, as rows of a saved table may be.
+        The ``names`` are of all protocols and regions, as rows of a saved table may be.
         """
         if self.path is None:
             return []
@@ -87,7 +87,7 @@ class UserTable:
 
 
 class Choices:
-    """What a person says about hemispheres: a table of those to leave out, and one of ratings.
+    """The user's choices of hemispheres: a table of exclusions, and one of ratings.
 
     A table of ratings may stand for one of exclusions. InputError if a table lacks a column, or has
     another rating than `RATINGS`.
@@ -103,7 +103,7 @@ class Choices:
     def reason_to_leave_out(
         self, name: HemisphereName, digest: str | None
     ) -> tuple[str, str] | None:
-        """Return reason and message if a hemisphere is left out, given the hash of its input."""
+        """Return reason and message if a hemisphere is excluded, given the hash of its input."""
         for row in self.excluded.applying(name, digest):
             return "listed", row.get("reason") or _note(row, "in the table of --exclude")
         for row in self.rated.applying(name, digest):
@@ -112,7 +112,7 @@ class Choices:
         return None
 
     def approves(self, name: HemisphereName, digest: str | None) -> bool:
-        """Tell whether all ratings of a hemisphere, given the hash of its input, are for use."""
+        """Check whether all ratings of a hemisphere, given the hash of its input, are for use."""
         return {row[_RATING] for row in self.rated.applying(name, digest)} == {RATINGS[0]}
 
     def rating(self, name: HemisphereName, digest: str | None) -> str:

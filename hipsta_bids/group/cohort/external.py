@@ -146,7 +146,7 @@ def read_maps(
         # The curvature of other programs may be huge at single vertices of good maps.
         problems = [why_impossible(name, m.values) if name == THICKNESS else None for m in maps]
         impossible = [(path, text) for path, text in zip(paths, problems, strict=True) if text]
-        notes += [f"{path}: {text}; left out" for path, text in impossible]
+        notes += [f"{path}: {text}; excluded" for path, text in impossible]
         if len(impossible) == len(maps):
             raise InputError(f"--maps {name}: {notes[-1]}, as are all")
         keys = [visit for visit, text in zip(keys, problems, strict=True) if not text]
@@ -156,9 +156,9 @@ def read_maps(
         mesh = None if first.nodes == nodes else _mesh(source, hemi, points)
         if mesh is None and points != nodes[0] * nodes[1]:
             raise InputError(
-                f"--maps {name}, hemisphere {hemi}: no surface of {points} vertices lies beside"
-                f" {paths[0]}, and sheets have {nodes[0]} x {nodes[1]} points; name one by"
-                " --maps-surface"
+                f"--maps {name}, hemisphere {hemi}: {points} values fit neither sheets "
+                f"({nodes[0]} x {nodes[1]}) nor a surface beside {paths[0]}; use "
+                "--maps-surface"
             )
         shape = nodes if mesh is None else (points, 1)
         values = np.stack([one.values.reshape(shape) for one in maps])  # noqa: PD011  (no table)
@@ -246,7 +246,7 @@ def find_all(
 def add_external(
     measured: Measured, sources: Iterable[ExternalFiles], visits: Sequence[VisitKey]
 ) -> tuple[Measured, dict[str, Cohort], list[str]]:
-    """Read other programs' maps, and add those on the grid of the sheets to the sheets.
+    """Read other programs' maps; maps on the grid of the sheets are added to the sheets.
 
     Returns the sheets, cohorts by surface of maps with points of their own, and notes.
 
@@ -423,7 +423,7 @@ def join_volumes(
         except InputError as error:
             if table.name in strict:
                 raise
-            notes.append(f"volumes of {table.visit} are left out: {error}")
+            notes.append(f"volumes of {table.visit} are excluded: {error}")
             continue
         for hemi, structures in volumes.items():
             if table.hemi not in {None, hemi}:

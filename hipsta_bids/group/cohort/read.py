@@ -41,7 +41,7 @@ _ROWS = 1000  # of summaries that are words at once
 def choose_measures(
     requested: Sequence[str], records: Sequence[SheetRecord], further: Sequence[str] = ()
 ) -> Measures:
-    """Tell maps from summary measures."""
+    """Separate maps from summary measures."""
     if not requested:
         return Measures(maps=(*(DEFAULT if records else ()), *further))
     summaries = tuple(hemisphere.read_summary(records[0].result)) if records else ()
@@ -108,8 +108,8 @@ def read_sheets(
 ) -> Measured:
     """Read all sheets and summaries.
 
-    Hemispheres with empty or impossible maps or summaries are left out, as those of which a larger
-    share of the curvature profile than ``max_gap`` has no value.
+    Hemispheres with empty or impossible maps or summaries are excluded, as are maps without a value
+    in more than ``max_gap`` of the curvature profile.
     """
     region = records[0].result.name.region if records else "body"
     x, y = node_coordinates(grid, region)

@@ -58,7 +58,7 @@ class Contrast:
 
 @dataclass(frozen=True)
 class ContrastSpec:
-    """A contrast by the names of what it combines."""
+    """A contrast by the names of columns, levels, terms and products."""
 
     name: str
     conditions: tuple[str, ...]

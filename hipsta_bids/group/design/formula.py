@@ -65,7 +65,7 @@ class ModelSpec:
 
 
 def model_from_shortcut(formula: str, contrasts: Sequence[str], name: str) -> dict[str, Any]:
-    """Write the BIDS Stats Model that says the same as a formula and contrasts."""
+    """Write the BIDS Stats Model of a formula and contrasts."""
     node: dict[str, Any] = {
         "Level": "Dataset",
         "Name": name,
@@ -209,7 +209,7 @@ def level_name(value: object) -> str:
 
 
 def typed(values: pd.Series) -> pd.Series:
-    """Return numbers as floats, text and factors as text, and what is missing as missing."""
+    """Return numbers as floats, text and factors as text, and missing cells as missing."""
     if isinstance(values.dtype, pd.CategoricalDtype):
         return values.astype(object).where(values.notna(), None)
     if pd.api.types.is_bool_dtype(values):
@@ -267,8 +267,8 @@ def columns_of(
     for name, levels_of in levels.items():
         if unknown := sorted(set(variables[name]) - set(levels_of)):
             raise ModelError(
-                f"{source}has no {name!r} {listed(unknown)}, only {listed(levels_of)}; leave these"
-                " participants out, or harmonize anew"
+                f"{source}has no {name!r} {listed(unknown)}, only {listed(levels_of)}; "
+                "exclude these participants, or harmonize anew"
             )
         variables[name] = pd.Categorical(variables[name], categories=list(levels_of))
     if text := [name for name in names if name not in levels and variables[name].dtype == object]:
@@ -305,9 +305,8 @@ def check_numbers(values: pd.Series, settings: DesignSettings) -> None:
         far = codes & (gap > high - low)
         if far.any():
             raise ModelError(
-                f"model: column {values.name!r} has {cells(present[far])} where all other values"
-                f" are {low:g} to {high:g}: a code for missing values? mark them n/a (or change the"
-                " setting design.missing_codes)"
+                f"model: {values.name!r} has {cells(present[far])}, other values are {low:g} "
+                f"to {high:g}; mark missing codes n/a (or design.missing_codes)"
             )
     if not len(present):
         return
@@ -316,8 +315,8 @@ def check_numbers(values: pd.Series, settings: DesignSettings) -> None:
     far = (present - quartiles[1]).abs() > reach
     if reach > 0 and far.any():
         raise ModelError(
-            f"model: column {values.name!r} has {cells(present[far])} where half of the other"
-            f" values are {quartiles[0]:.4g} to {quartiles[2]:.4g}; correct them, or mark them n/a"
+            f"model: {values.name!r} has {cells(present[far])}, half of the others "
+            f"{quartiles[0]:.4g} to {quartiles[2]:.4g}; correct them, or mark them n/a"
         )
 
 
@@ -330,7 +329,7 @@ def cells(values: pd.Series) -> str:
 def check_spelling(levels: Mapping[str, int], name: str) -> None:
     """Refuse levels of a factor that differ in case or blanks only.
 
-    Which of them is meant is for a person to say: merged silently, a typing error would pass.
+    The user has to choose between them: merged silently, a typing error would pass.
     """
     spellings: dict[str, list[str]] = {}
     for level in levels:
@@ -345,14 +344,13 @@ def check_spelling(levels: Mapping[str, int], name: str) -> None:
 
 
 def coding_note(values: pd.Series) -> str | None:
-    """Say that few different numbers are fitted as a line, as perhaps they should not."""
+    """Note that few different numbers are fitted as a line, as perhaps they should not."""
     codes = sorted(values.unique())
     if not _LEAST_LINE <= len(codes) <= FEW_VALUES:
         return None
     return (
-        f"{values.name} has {len(codes)} different values ({', '.join(f'{x:g}' for x in codes)})"
-        f" and is fitted as a line; if these are codes, write C({values.name}) in --formula, or"
-        " give their Levels in participants.json"
+        f"{values.name} has {len(codes)} values ({', '.join(f'{x:g}' for x in codes)}), "
+        f"fitted as a line; for codes write C({values.name}), or Levels in participants.json"
     )
 
 
@@ -369,7 +367,7 @@ def rows_by_lack(
 
 
 def check_left(variables: pd.DataFrame, dropped: Mapping[str, tuple[str, ...]]) -> None:
-    """Refuse a model that leaves no row; says what the rows lack."""
+    """Refuse a model that leaves no row, with the missing variables."""
     if not len(variables):
         lack = ", ".join(f"{name} ({len(rows)})" for name, rows in dropped.items())
         reason = f"; missing are {lack}" if lack else ""
@@ -388,8 +386,8 @@ def set_levels(
             numbers = variables[name].to_numpy(dtype=np.float64)
             if numbers.min() == numbers.max():
                 raise ModelError(
-                    f"model: {name!r} is {numbers[0]:g} in all {len(numbers)} complete rows; leave"
-                    " it out"
+                    f"model: {name!r} is {numbers[0]:g} in all {len(numbers)} complete rows; "
+                    "remove it"
                 )
         else:
             levels[name] = _levels(variables[name], name, references.get(name), settings)
@@ -422,9 +420,7 @@ def _levels(
             f"model: {name!r} has no level {first!r} in the complete rows, only {listed(levels)}"
         )
     if len(levels) == 1:
-        raise ModelError(
-            f"model: all {len(values)} complete rows have {name!r} {first}; leave it out"
-        )
+        raise ModelError(f"model: all {len(values)} complete rows have {name!r} {first}; remove it")
     small = [f"{level} ({counts[level]})" for level in levels if counts[level] < settings.min_level]
     if small:
         raise ModelError(

@@ -57,7 +57,7 @@ _Token = tuple[str, str]
 
 @dataclass(frozen=True)
 class ClosedFormula:
-    """The right-hand side of a formula that holds nothing but what is allowed."""
+    """The right-hand side of a formula of allowed terms only."""
 
     text: str
     """The formula, put together from its checked parts."""
@@ -70,7 +70,7 @@ class ClosedFormula:
 
 
 def closed_formula(text: str) -> ClosedFormula:
-    """Check the right-hand side of a formula; UsageError names what is not allowed, and what is."""
+    """Check the right-hand side of a formula; UsageError names unknown and allowed terms."""
     names: dict[str, None] = {}
     plain: set[str] = set()
     numbers: set[str] = set()

@@ -51,7 +51,7 @@ class Terms:
         self._grids: dict[tuple[tuple[str, object], ...], Float] = {}
 
     def contrast(self, spec: ContrastSpec) -> Contrast:
-        """Return the weights of a contrast; ModelError names what is unknown."""
+        """Return the weights of a contrast; ModelError lists unknown names."""
         variable = re.fullmatch(rf"{NONLINEAR}\(`?([^`]+)`?\)", spec.conditions[0])
         if variable and len(spec.conditions) == 1:
             return Contrast(spec.name, self._nonlinear(variable[1], spec.name))

@@ -40,7 +40,7 @@ BOTH = "LR"
 
 @dataclass(frozen=True)
 class Groups:
-    """The column that tells groups, and their order."""
+    """The column of the groups, and their order."""
 
     column: str
     levels: tuple[str, ...]
@@ -167,7 +167,7 @@ class Comparison:
 
     @property
     def suffix(self) -> str:
-        """What tells folders of results of the same formula apart."""
+        """The part of names that distinguishes folders of results of one formula."""
         if self.pair:
             return f"_change-{'-'.join(one.removeprefix('ses-') for one in self.pair)}"
         return "_longitudinal" if self.longitudinal else ""
@@ -177,8 +177,7 @@ class Comparison:
             raise UsageError("give --longitudinal (all sessions) or --paired (two), not both")
         if self.longitudinal and self.normative:
             raise UsageError(
-                "w-scores need one visit per participant, as other visits of the same participant"
-                " would be in the reference; leave --longitudinal out, or use --paired"
+                "w-scores need one visit per participant; remove --longitudinal, or use --paired"
             )
 
 
@@ -279,8 +278,8 @@ def model_document(
             else "no participants.tsv of BIDS_DIR has further columns"
         )
         raise ModelError(
-            f"no column tells groups ({', '.join(settings.model.group_columns)}) with two levels;"
-            f' {available}; or give a model by --formula "age + sex" --contrast age'
+            f"no column has two groups ({', '.join(settings.model.group_columns)}); "
+            f'{available}; or give --formula "age + sex" --contrast age'
         )
     time = visits.column if visits else None
     if comparison.longitudinal and time is None:
@@ -342,7 +341,7 @@ def build_design(
     settings: DesignSettings,
     references: Mapping[str, str],
 ) -> Design:
-    """Make the design matrix of a model, or say what keeps it from being fitted."""
+    """Make the design matrix of a model, or raise the reason why it cannot be fitted."""
     closed = closed_formula(model.formula)
     try:
         formula = Formula(closed.text)
@@ -415,8 +414,8 @@ def _doubts(numeric: pd.DataFrame, n_columns: int, n_people: int) -> dict[str, s
         r = numeric[a].corr(numeric[b])
         if abs(r) > _NEARLY_SAME:
             notes[f"{a}, {b}"] = (
-                f"{a} and {b} are nearly the same (r = {r:.4f}); keep one of them, as their effects"
-                " cannot be told apart"
+                f"{a} and {b} are nearly the same (r = {r:.4f}), and their effects "
+                "inseparable; keep one of them"
             )
     if n_columns * _PEOPLE_PER_COLUMN > n_people:
         notes["columns"] = (
@@ -439,8 +438,8 @@ def _check_possible(values: pd.Series, name: str) -> None:
     if bad.any():
         rows_text = formulas.listed(f"{row} ({value:g})" for row, value in values[bad].items())
         raise ModelError(
-            f"model: column {values.name!r} has {rows_text}, which nobody has; correct them, or"
-            " mark them n/a"
+            f"model: column {values.name!r} has {rows_text}, which is impossible; correct "
+            "them, or mark them n/a"
         )
     if name in _AGES or first <= 0:
         return
@@ -450,9 +449,9 @@ def _check_possible(values: pd.Series, name: str) -> None:
     if ratios[split - 1] > _UNITS:
         parts = ordered.iloc[:split], ordered.iloc[split:]
         raise ModelError(
-            f"model: column {values.name!r} has {len(parts[0])} values up to {parts[0].iloc[-1]:g}"
-            f" and {len(parts[1])} from {parts[1].iloc[0]:g}: cm^3 and mm^3? write all in one unit;"
-            f" fewer are {formulas.cells(min(parts, key=len))}"
+            f"model: {values.name!r} has {len(parts[0])} values to {parts[0].iloc[-1]:g}, "
+            f"{len(parts[1])} from {parts[1].iloc[0]:g} (cm^3 and mm^3?); use one unit: "
+            f"{formulas.cells(min(parts, key=len))}"
         )
 
 
@@ -469,7 +468,7 @@ def _check_matrix(
     lengths = np.linalg.norm(matrix, axis=0)
     if (lengths == 0).any():
         raise ModelError(
-            f"model: no row has {columns[int(np.argmin(lengths))]!r}; leave it out of the formula"
+            f"model: no row has {columns[int(np.argmin(lengths))]!r}; remove it from the formula"
         )
     unit = matrix / lengths
     # What is left of each unit column beside those before it.
@@ -479,8 +478,8 @@ def _check_matrix(
         weights = np.linalg.lstsq(unit[:, :last], unit[:, last], rcond=None)[0]
         involved = [columns[i] for i in np.flatnonzero(np.abs(weights) > DEPENDENCE)]
         raise ModelError(
-            f"model: column {columns[last]!r} is a combination of {formulas.listed(involved)};"
-            " leave one of them out"
+            f"model: column {columns[last]!r} is a combination of "
+            f"{formulas.listed(involved)}; remove one of them"
         )
 
 

@@ -30,15 +30,15 @@ CORRECTIONS: tuple[str, ...] = get_args(Correction)
 class RegistrationSettings(toml.SettingsTable):
     """Registration of curvature profiles along x.
 
-    The numbers of splines, components and iterations are those of the paper (Diers et al. 2023,
+    The numbers of splines, components and iterations follow the paper (Diers et al. 2023,
     appendix B) and of R's ``registr``.
     """
 
     align: Literal["registr", "none"] = "registr"
     """``registr`` (Wrobel et al. 2018) or ``none``."""
     standardize: bool = True
-    """Subtract each profile's mean and divide it by its own standard deviation, so that curvature
-    that is larger everywhere is not taken for a displacement; R's ``registr`` does not."""
+    """Subtract each profile's mean and divide it by its own standard deviation. Curvature that is
+    larger everywhere is then not taken for a displacement; R's ``registr`` does not do this."""
     template_splines: Splines = 8
     """Cubic B-splines of the template (Kt)."""
     warp_splines: Splines = 4
@@ -73,15 +73,14 @@ class DesignSettings(toml.SettingsTable):
         *("sex", "gender", "ethnicity", "race"),
         *("site", "site_id", "scanner", "scanner_id", "center", "center_id", "vendor"),
     )
-    """Columns whose values are names, in any case of letters, even if they are written as numbers;
-    others are if the ``Levels`` of the table's sidecar have all their values."""
+    """Columns of names, in any case of letters, even if they are written as numbers. Other columns
+    are too if the table's sidecar has ``Levels`` for all their values."""
     missing_codes: Codes = (
         *(-9.0, -99.0, -999.0, -9999.0, -99999.0),
         *(99.0, 999.0, 9999.0, 99999.0, 777.0, 7777.0, 888.0, 8888.0),
     )
     """Numbers that often stand for missing ones. Negative ones are missing out of the range of all
-    other values; positive ones, which are farther from these than they from each other, are
-    refused."""
+    other values. Positive ones far from all other values are refused."""
     farthest: PositiveFloat = 1e4
     """Numbers farther than this from the median, in ranges between quartiles, are refused."""
     mixed: Annotated[tuple[Provenance, ...], Strict(strict=False)] = ()
@@ -89,18 +88,18 @@ class DesignSettings(toml.SettingsTable):
 
 
 class DefaultModelSettings(toml.SettingsTable):
-    """What is fitted when no model is given."""
+    """The model when none is given."""
 
     group_columns: toml.Texts = ("group", "diagnosis", "dx", "diagnostic_group")
-    """The first of these columns, in any case of letters, tells the groups."""
+    """The first of these columns, in any case of letters, has the groups."""
     reference_levels: toml.Texts = ("CN", "CU", "HC", "NC", "CTRL", "control", "healthy")
-    """The first of these, in any case and singular or plural, is the reference level of the
-    groups; else the most frequent one is."""
+    """The reference level of the groups: the first of these, in any case and number; else the
+    most frequent level."""
     covariates: toml.Texts = ("age", "sex", "site")
     """Further columns of the model, where the table has them and they vary."""
     age: Literal["linear", "quadratic", "spline"] = "linear"
-    """How age stands in the model: as a line, with its square, or as a natural cubic spline of
-    three columns."""
+    """Age in the model: as a line, with its square, or as a natural cubic spline of three
+    columns."""
     icv_columns: toml.Texts = ("icv", "etiv", "tiv", "intracranial_volume")
     """The first of these columns is the covariate of volumes; else what FreeSurfer or ASHS
     estimated."""
@@ -115,21 +114,21 @@ class GlmSettings(toml.SettingsTable):
     confidence: toml.OpenFraction = 0.95
     """Coverage of two-sided confidence limits, fraction."""
     min_residual_df: PositiveInt = 3
-    """Points with fewer residual degrees of freedom are left out."""
+    """Points with fewer residual degrees of freedom are excluded."""
 
 
 class LongitudinalSettings(toml.SettingsTable):
     """Repeated sessions of the same participants."""
 
     random: Literal["auto", "intercept", "slope"] = "auto"
-    """What participants have of their own: an ``intercept``, or also a ``slope`` over time;
-    ``auto`` takes slopes where ``slope_participants`` have three visits. Without them tests of
-    changes take differences between participants for noise, and find too much."""
+    """Random effects of participants: an ``intercept``, or also a ``slope`` over time. ``auto``
+    takes slopes where ``slope_participants`` have three visits. Without them tests of changes take
+    differences between participants for noise, and find too much."""
     slope_participants: PositiveInt = 10
     """Participants with three visits or more that ``auto`` wants for slopes."""
     time_columns: toml.Texts = ("time", "years", "months", "days")
-    """The first of these columns, in any case, that varies between sessions is the time; else it
-    is made, in years since the first session, from ``acq_time`` or age."""
+    """The time is the first of these columns, in any case, that varies between sessions. Else it is
+    the years since the first session, from ``acq_time`` or age."""
     confidence: toml.OpenFraction = 0.95
     """Coverage of two-sided confidence limits, fraction."""
 
@@ -138,11 +137,12 @@ class MultiplicitySettings(toml.SettingsTable):
     """How many tests are allowed for."""
 
     method: Correction = "fdr2"
-    """``fdr2`` (two-stage false discovery rate, Benjamini, Krieger and Yekutieli 2006; the
-    paper's), ``bh`` (Benjamini and Hochberg 1995), or family-wise error by permutation:
-    ``permutation-tfce`` (threshold-free cluster enhancement) or ``permutation-max`` (largest t)."""
+    """False discovery rate: ``fdr2`` (two-stage, Benjamini, Krieger and Yekutieli 2006; the
+    paper's), or ``bh`` (Benjamini and Hochberg 1995). Family-wise error by permutation:
+    ``permutation-tfce`` (threshold-free cluster enhancement), or ``permutation-max`` (largest
+    t)."""
     scope: Literal["map", "hemispheres", "all"] = "map"
-    """What is one family: each ``map`` (measure, contrast and hemisphere), both ``hemispheres``
+    """One family of tests: each ``map`` (measure, contrast and hemisphere), both ``hemispheres``
     together, or ``all`` maps of a contrast."""
     alpha: toml.OpenFraction = 0.05
     """False discovery rate, or family-wise error rate of permutation tests."""
@@ -153,9 +153,9 @@ class MultiplicitySettings(toml.SettingsTable):
     blocks: str = ""
     """Column whose levels participants are permuted within, as of sites; empty is all."""
     visits: Literal["auto", "whole", "within", "flip"] = "auto"
-    """What is permuted of repeated visits: ``whole`` participants with all their visits, where they
-    have as many; visits ``within`` participants; or signs that ``flip``, of all visits of a
-    participant together. ``auto`` chooses by the contrast."""
+    """Exchange of repeated visits: ``whole`` participants with all their visits, if they have
+    equally many; visits ``within`` participants. Or ``flip``: signs of all visits of a participant
+    together. ``auto`` chooses by the contrast."""
     neighbors: Literal[4, 8] = 8
     """Neighbors of a point on the sheet, 4 or 8."""
 
@@ -164,7 +164,7 @@ class JointSettings(toml.SettingsTable):
     """Tests of several measures together, by permutation (non-parametric combination)."""
 
     measures: toml.Texts = ()
-    """Maps that are tested together at each point; empty is no such test."""
+    """Maps that are tested together at each point; empty for no joint test."""
     combine: Literal["fisher", "tippett"] = "fisher"
     """``fisher`` adds up the evidence of all measures, ``tippett`` takes the strongest (Winkler et
     al. 2016)."""
@@ -190,8 +190,8 @@ class AsymmetrySettings(toml.SettingsTable):
     """Differences between left and right."""
 
     relative: toml.Texts = ("thickness",)
-    """Maps, of positive measures, whose difference is taken over the mean of both sides; that of
-    others is in their own unit."""
+    """Maps of positive measures: their difference is divided by the mean of both sides. Differences
+    of other maps keep their unit."""
 
 
 class ShapeSettings(toml.SettingsTable):
@@ -202,7 +202,7 @@ class ShapeSettings(toml.SettingsTable):
 
 
 class ClassificationSettings(toml.SettingsTable):
-    """Logistic models and how well they tell groups apart."""
+    """Logistic models and how well they discriminate groups."""
 
     base: toml.Texts = ("volume",)
     """Summary measures and covariates of the base model."""
@@ -228,8 +228,8 @@ class ClassificationSettings(toml.SettingsTable):
     seed: NonNegativeInt = 0
     """Of the cross-validation."""
     least_calibrated: AtLeastTwo = 100
-    """Calibration is judged where both groups have this many: a rule of thumb, below which its
-    curve and slope are too uncertain (Snell et al. 2021)."""
+    """Calibration is judged where both groups have this many, a rule of thumb. Below it, curve and
+    slope are too uncertain (Snell et al. 2021)."""
 
 
 class RetestSettings(toml.SettingsTable):
@@ -247,8 +247,8 @@ class PowerSettings(toml.SettingsTable):
     power: toml.OpenFraction = 0.8
     """Chance to find the effect."""
     dropout: Annotated[float, Field(ge=0, lt=1)] = 0.0
-    """Share of those enrolled that has left before the last visit, at a constant hazard; the visits
-    before are in the mixed model of several visits."""
+    """Share of the enrolled participants lost before the last visit, at a constant hazard. Their
+    visits before that are in the mixed model of several visits."""
     alpha: toml.OpenFraction = 0.05
     """Two-sided level of the test of a summary measure, one of which is the end point. Maps hold
     the false discovery rate ``multiplicity.alpha``."""
@@ -259,7 +259,7 @@ class PowerSettings(toml.SettingsTable):
 
 
 class NormSettings(toml.SettingsTable):
-    """Norms of a reference cohort, and scores of new people."""
+    """Norms of a reference cohort, and scores of new participants."""
 
     age: str = "age"
     """Column of age, in years."""
@@ -270,8 +270,8 @@ class NormSettings(toml.SettingsTable):
     knots: Annotated[int, Field(ge=3)] = 5
     """Knots of the natural cubic spline of age, at equal shares of the participants."""
     edge: Annotated[int, Field(ge=3)] = 5
-    """Norms reach from the age that has this place from below to that from above, rounded to years
-    outward, so that they tell the age of no single person."""
+    """Norms reach from the age with this rank from below to the age with this rank from above. They
+    are rounded to years outward, so that they reveal no single participant's age."""
     least_participants: Annotated[int, Field(ge=50)] = 100
     """Smaller reference cohorts are refused."""
     least_site: Annotated[int, Field(ge=10)] = 15
@@ -285,27 +285,27 @@ class NormSettings(toml.SettingsTable):
 
 
 class ExchangeSettings(toml.SettingsTable):
-    """What a summary for other sites may say."""
+    """The content of a summary for other sites."""
 
     min_cell: Annotated[int, Field(ge=5)] = 5
     """Fewest participants in a cell of all factors of the model, and behind a sum."""
     min_residual_df: PositiveInt = 10
     """Fewest participants beyond the columns of the model."""
     max_leverage: toml.OpenFraction = 0.5
-    """Largest share of a fitted value that comes from one participant's own value."""
+    """Largest share of a fitted value due to one participant's own value."""
 
 
 class MetaSettings(toml.SettingsTable):
     """Summaries of several sites become one result."""
 
     model: Literal["joint", "two-stage"] = "joint"
-    """``joint``: the model of all participants with a constant per site, from the sites'
-    coefficients and their covariances (Becker and Wu 2007); ``two-stage``: the mean of the sites'
-    estimates, each with its own residual variance and slopes of covariates."""
+    """``joint``: the model of all participants with a constant per site, from coefficients and
+    covariances (Becker and Wu 2007). ``two-stage``: the mean of the sites' estimates. Each site
+    then has its own residual variance and slopes of covariates."""
     random: Literal["reml", "dl"] = "reml"
-    """Variance between sites: ``reml`` (restricted maximum likelihood, with t tests; in two stages
-    those of Knapp and Hartung 2003, with no standard error below that without their correction) or
-    ``dl`` (DerSimonian and Laird 1986, in two stages with normal tests)."""
+    """Variance between sites: ``reml`` (restricted maximum likelihood, t tests), or ``dl``
+    (DerSimonian and Laird 1986, normal tests in two stages). ``reml`` in two stages: t tests of
+    Knapp and Hartung 2003, with no standard error below the uncorrected one."""
     min_sites: Annotated[int, Field(ge=2)] = 2
     """Fewest sites with an estimate at a point."""
     confidence: toml.OpenFraction = 0.95

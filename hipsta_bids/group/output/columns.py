@@ -38,7 +38,7 @@ class Frame:
         return {**self.number, **self.position, "subfield": self.subfield}
 
     def at(self, point: int) -> dict[str, Any]:
-        """Say where a point is, in tables of peaks; a node of the sheet by its coordinates."""
+        """Locate a point, in tables of peaks; a node of the sheet by its coordinates."""
         number = self.number if "vertex" in self.number else {}
         position = {**number, **self.position, "subfield": self.subfield}
         return {name: values[point] for name, values in position.items()}
@@ -106,7 +106,7 @@ def point_columns(
 
 
 def overview_row(name: str, key: "MapKey", discoveries: "Discoveries") -> dict[str, object]:
-    """Say of a map in the file ``name`` how many points survive, and at which p."""
+    """Count the points of a map in the file ``name`` that survive, with their p."""
     return {
         "measure": key.measure,
         "contrast": key.contrast,

@@ -46,7 +46,7 @@ _LOW = -1.645
 
 
 def mark_medial(axis: "Axes", x: Float) -> None:
-    """Say on the x axis which end is medial."""
+    """Mark the medial end on the x axis."""
     axis.set_xticks([x[0], x[-1]], X_ENDS)
     left, right = axis.get_xticklabels()
     left.set_horizontalalignment("left")
@@ -55,7 +55,7 @@ def mark_medial(axis: "Axes", x: Float) -> None:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Curve:
-    """A curve of a classifier, with what its legend says."""
+    """A curve of a classifier, with the text of its legend."""
 
     hemi: str
     pair: tuple[str, str]
@@ -85,7 +85,7 @@ def read_roc(results: GroupResults) -> list[Curve]:
                 added=added,
                 full=name == "full",
                 points=(points["false_positives"].to_numpy(), points["true_positives"].to_numpy()),
-                text=f"{area:.2f} ({low:.2f} to {high:.2f}),\n   left out {left_out:.2f}",
+                text=f"{area:.2f} ({low:.2f} to {high:.2f}),\n   cross-validated {left_out:.2f}",
                 separated=bool(row["separated"]),
             )
         )
@@ -347,7 +347,7 @@ def draw_sites(cohort: Cohort, analysis: Analysis) -> "list[Figure]":
                     _spread(axis, values[harmonization.plan.sites.index(site)], row, number, name)
         for axis, label, ideal in (
             (axes[0, j], f"mean, {display_name(measure)} [{unit}]", 0.0),
-            (axes[1, j], "SD, over that of all", 1.0),
+            (axes[1, j], "SD, over the SD of all", 1.0),
         ):
             axis.axvline(ideal, color="black", linewidth=0.5)
             axis.set_yticks(
@@ -374,7 +374,7 @@ def _spread(axis: "Axes", values: Float, row: int, number: int, name: str) -> No
 
 
 def draw_norms(lines: pd.DataFrame, dots: pd.DataFrame) -> "list[Figure]":
-    """Draw centiles over age, a row for each sex and a column for each side; and people on it.
+    """Draw centiles over age, a row for each sex, a column for each side, and participants.
 
     Controls that a site was adapted to are open circles.
     """
@@ -438,7 +438,7 @@ def norm_rows(
 
 
 def deviation_rows(scored: Mapping[str, ScoredMaps], measure: str) -> Iterator[panels.Row]:
-    """Show mean deviations, and shares of low ones, of those whom no site was adapted to."""
+    """Show mean deviations, and shares of low ones, of participants whom no site was adapted to."""
     z = {
         hemi: side.scores[measure].w[~side.reference]
         for hemi, side in scored.items()

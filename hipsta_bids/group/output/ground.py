@@ -45,7 +45,7 @@ class Ground:
 
     @property
     def unfolded(self) -> bool:
-        """Whether maps lie on a plane: the sheet's, or that of other programs."""
+        """Whether maps lie on a plane: of the sheet, or of other programs."""
         return self.mesh is None or self.mesh.flat
 
     @property

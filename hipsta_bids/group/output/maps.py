@@ -136,7 +136,7 @@ def contrasts(
 ) -> Iterator[list[Row]]:
     """Show effect sizes and corrected p-values of each contrast of a measure.
 
-    The tests are those of all measures, which share their colors; ``like`` names contrasts that
+    Tests of all measures share their colors; ``like`` names contrasts that
     have the colors of others.
     """
     tests = {hemi: own[measure] for hemi, own in every_test.items() if measure in own}

@@ -101,7 +101,7 @@ def methods_text(
     region: str = "body",
     ratings: Mapping[str, int] | None = None,
 ) -> str:
-    """Return what was done and what was found, as a paper prints it."""
+    """Return methods and results, as a paper prints them."""
     cite = Citations()
     paragraphs = [_sample(cohort, analysis, n_out, cite, surfaces)]
     if ratings is not None:
@@ -254,7 +254,7 @@ def _harmonization(
         )
     if plan.visits.participant is not None:
         text += (
-            " Random intercepts of participants were preserved; the scale is that of variation"
+            " Random intercepts of participants were preserved; the scale describes variation"
             f" within participants {cite('beer')}."
         )
     if plan.saved is not None:

@@ -103,7 +103,7 @@ def draw_pages(
     width: float | None = None,
     dpi: float = DOTS_PER_INCH,
 ) -> "list[Figure]":
-    """Draw rows, of which those of a block are on the same figure.
+    """Draw rows; the rows of a block are on one figure.
 
     ``views`` keeps views of surfaces for the next call; ``width`` is in mm; pictures of surfaces
     have ``dpi`` dots per inch.

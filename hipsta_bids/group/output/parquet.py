@@ -34,7 +34,7 @@ def write_maps(
 ) -> None:
     """Write all analyzed maps as one Parquet file: a row per visit, hemisphere and point.
 
-    The states of the sheets are those before and after each step; none without sheets.
+    The states of the sheets are before and after each step; none without sheets.
     """
     fields = [pa.field(name, _WORD) for name in (PARTICIPANT, SESSION, "hemi")]
     about = {"description": f"{_SHEET_NAME}, or the name of maps with points of their own"}
@@ -54,8 +54,8 @@ def write_maps(
         _number(name, one, name, "as given") for name, one in cohorts.items() if name != SHEET
     ]
     about = {
-        "description": "one row per visit, hemisphere and point; x from medial to lateral, y"
-        " from posterior to anterior; a column is empty where the surface lacks the measure"
+        "description": "one row per visit, hemisphere and point; x medial to lateral, "
+        "y posterior to anterior; empty without the measure"
     }
     rows = _map_blocks(cohorts, states)
     _write(path, pa.schema(fields, metadata=about), rows)
@@ -165,8 +165,8 @@ def write_scores(
     fields += [pa.field(name, pa.int16()) for name in ("node_x", "node_y")]
     fields += [pa.field(f"{name}_{letter}", pa.float32(), metadata=about) for name in measures]
     about = {
-        "description": f"{letter}-scores, one row per participant, hemisphere and node of the"
-        " registered sheet; nodes along x from medial to lateral, y from posterior to anterior"
+        "description": f"{letter}-scores, one row per participant, hemisphere and registered "
+        "node; nodes from medial to lateral, posterior to anterior"
     }
     rows = (
         {

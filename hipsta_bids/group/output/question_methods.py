@@ -25,7 +25,7 @@ def norms_text(
 ) -> str:
     """Return how norms were estimated, or how participants were scored by them.
 
-    ``coverage`` is the calibration of norms that were estimated; ``new`` sites come last.
+    ``coverage`` is the calibration of norms that were estimated; ``new`` sites are last.
     """
     cite = Citations()
     ages = f"{file.knots[0]:g} to {file.knots[-1]:g} years"

@@ -32,7 +32,7 @@ ALL = "all"
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SitePlan:
-    """What is taken out, and what is kept."""
+    """Effects to remove, and effects to keep."""
 
     column: str
     sites: tuple[str, ...]
@@ -73,10 +73,10 @@ class Harmonization:
     """What to know, one line each."""
 
     def leaks(self, groups: str) -> bool:
-        """Tell whether values of participants depend on their groups.
+        """Check whether values of participants depend on their groups.
 
-        A classifier has to tell the groups of people whose groups are not known, so that it
-        cannot have them among what is kept, nor sites that were estimated with them.
+        A classifier predicts groups of participants with unknown groups: it cannot have them among
+        the effects kept, nor sites that were estimated with them.
         """
         return bool(self.plan.estimated) or groups in closed_formula(self.plan.formula).names
 
@@ -164,7 +164,7 @@ def rows_of(analysis: Analysis, fitted: FittedMaps) -> pd.DataFrame:
 
 
 def members_of(analysis: Analysis, table: pd.DataFrame) -> Mapping[str, NDArray[np.bool_]]:
-    """Tell which rows belong to each group; all to one where there are no groups."""
+    """Determine the rows of each group; all to one where there are no groups."""
     if analysis.groups is None:
         return {ALL: np.ones(len(table), dtype=bool)}
     names = table[analysis.groups.column]
@@ -190,7 +190,7 @@ def digests(registrations: Mapping[str, alignment.Registration]) -> dict[str, st
 
 
 def harmonization_record(harmonization: Harmonization, groups: Groups | None) -> dict[str, Any]:
-    """Record what was taken out and kept."""
+    """Record the effects removed and kept."""
     plan = harmonization.plan
     return {
         "column": plan.column,
@@ -206,7 +206,7 @@ def harmonization_record(harmonization: Harmonization, groups: Groups | None) ->
 
 
 def effects_of(parts: Sequence[Harmonization], templates: Mapping[str, str]) -> SavedEffects | None:
-    """Collect parameters for other people; ``None`` if they have no meaning there."""
+    """Collect parameters for other participants; ``None`` if they have no meaning there."""
     plan = parts[0].plan
     if not plan.portable:
         return None

@@ -27,7 +27,7 @@ _FLAT = frozenset({"mean", "sd", "ratio"})
 
 
 class SavedEffects(TomlTable):
-    """Parameters of an analysis as a file, for other people of the same sites, or of new ones."""
+    """Parameters of an analysis as a file, for other participants of the same or new sites."""
 
     model_config = ConfigDict(alias_generator=str.capitalize, validate_by_name=True)
 
@@ -110,7 +110,7 @@ def load_effects(path: Path) -> SavedEffects:
 
 
 def damaged(source: str, problem: str) -> ModelError:
-    """Say that a file cannot be used."""
+    """Make the error of a file that cannot be used."""
     return ModelError(
         f"{source}: not a file of harmonization ({problem}); use the harmonization.json of another"
         " analysis"
@@ -136,7 +136,7 @@ class NormArrays(TomlTable):
 
 
 class NormsFile(TomlTable):
-    """Norms of a reference cohort, and what new people have to agree with; sums only."""
+    """Norms of a reference cohort, and the facts that new participants have to match; sums only."""
 
     description: files.Text
     format: Literal[1]
@@ -175,7 +175,7 @@ class NormsFile(TomlTable):
 
     @property
     def middle(self) -> People:
-        """Somebody of the age of the middle knot, halfway between the sexes."""
+        """A participant of the age of the middle knot, halfway between the sexes."""
         age, n = self.knots[len(self.knots) // 2], max(len(self.sexes), 1)
         sex = np.full((1, n - 1), 1 / n)
         return People(age=np.array([age]), sex=sex, site=np.zeros(1, dtype=np.int64))
@@ -252,7 +252,7 @@ _Rising = Annotated[list[Fraction], Field(max_length=1000), AfterValidator(_risi
 def templates_to_json(templates: Mapping[str, Template]) -> dict[str, Any]:
     """Write templates by hemisphere as a JSON object.
 
-    ``align`` and ``warp_variance`` are left of a method that is gone: earlier files have them.
+    ``align`` and ``warp_variance`` are left of an earlier method: earlier files have them.
     """
     entries = {
         hemi: {
@@ -292,7 +292,7 @@ class _SavedTemplate(TomlTable):
         if len(sizes) > 1 or len(rows) != 1 or not 0 < rows.pop() <= len(self.mean):
             raise ValueError("knots, mean and components do not fit each other")
         if not np.allclose([self.center[0], 1 - self.center[-1]], 0):
-            raise ValueError("center does not go from 0 to 1")
+            raise ValueError("center does not run from 0 to 1")
         return self
 
 

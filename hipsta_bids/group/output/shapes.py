@@ -63,7 +63,7 @@ def average_shape(
 
     Each middle surface is rotated and moved to the mean of all, iteratively (Gower 1975), and the
     walls with it; nothing is scaled or mirrored. ``layers`` (sheets, 3, x, y, 3) are the surfaces
-    in mm, NaN where missing; ``visible`` (sheets, x, y) tells which registered nodes have a value.
+    in mm, NaN where missing; ``visible`` (sheets, x, y) marks registered nodes with a value.
     """
     n, _, nx, ny, _ = layers.shape
     # Along x, so that all other axes count as one.

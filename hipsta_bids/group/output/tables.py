@@ -377,7 +377,7 @@ class JointMap:
 
     @property
     def fitted(self) -> FittedMaps:
-        """What tells where the points are."""
+        """The columns that locate the points."""
         return next(iter(self.parts.values()))[0]
 
     @property

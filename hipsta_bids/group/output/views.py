@@ -246,7 +246,7 @@ def laid_out(mesh: Mesh) -> tuple[Float, Int, tuple[str, str]]:
     """Positions of a flat surface in the plane, triangles, and what the axes are.
 
     HippUnfold's runs from anterior to posterior along x and from the subiculum to the dentate
-    gyrus along y, so that x goes down and y to the right, as on a sheet.
+    gyrus along y, so that x points down and y to the right, as on a sheet.
     """
     reach = np.ptp(mesh.points, axis=0)
     names = ("x of the surface", "y of the surface")

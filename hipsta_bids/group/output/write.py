@@ -43,7 +43,7 @@ _ROWS = 10_000  # of tables that are spelled at once
 
 @contextlib.contextmanager
 def whole_folder(path: Path) -> Iterator[Path]:
-    """Make a folder to write into, which is renamed to its final name if all went well."""
+    """Make a folder to write into, which is renamed to its final name if all succeeds."""
     parent, name = path.parent, path.name
     scratch = parent / f".{name}.{os.getpid()}.tmp"
     files.make_folder(parent)
@@ -144,7 +144,7 @@ def draw(
     *,
     prints: bool,
 ) -> list[str]:
-    """Draw the figures of an analysis that was written, and say what is wrong with them."""
+    """Draw the figures of an analysis that was written, and return their problems."""
     drawings = draw_figures(saved, cohorts, analyses, shapes, prints)
     return write_figures(saved.folder, drawings, prints=prints)
 
@@ -152,7 +152,7 @@ def draw(
 def write_figures(
     folder: Path, drawings: Iterable[tuple[str, Drawing]], *, prints: bool = False
 ) -> list[str]:
-    """Draw figures by name, and say which are missing or lack letters; one line each.
+    """Draw figures by name; return missing figures and missing letters, one line each.
 
     The page shows SVG; ``prints`` asks for PDF and PNG, too.
     """
@@ -252,7 +252,7 @@ def stats_of(
 
 
 def write_stats(folder: Path, maps: Mapping[MapKey, _Stats]) -> None:
-    """Write maps of statistics as GIFTI, and those of both sides as one CIFTI file."""
+    """Write maps of statistics as GIFTI, and maps of both sides as one CIFTI file."""
     grouped: dict[str, dict[str, _Stats]] = {}
     for key, stats in maps.items():
         for stat, values in stats.items():
@@ -324,7 +324,7 @@ def write_scores(
     letter: str,
     sheets: bool,
 ) -> None:
-    """Write each participant's scores as maps; those of the sheet also as one Parquet file."""
+    """Write each participant's scores as maps; maps of the sheet also as one Parquet file."""
     for hemi, side in sides.items():
         names = [str(name) for name in table.index[side.rows]]
         for measure, scored in side.scores.items():

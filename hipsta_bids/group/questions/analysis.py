@@ -348,7 +348,7 @@ def _register_maps(side: arrays.SideMaps, warps: arrays.Float, rims: bool) -> ar
 
 
 def unequal_spread(analysis: results.Analysis, settings: GlmSettings) -> Iterator[str]:
-    """Say which pairs of groups differ in size and SD so that ordinary tests find too much.
+    """List pairs of groups that differ in size and SD so that ordinary tests find too much.
 
     One line per group, about the map in which it differs most from the first.
     """
@@ -373,10 +373,8 @@ def unequal_spread(analysis: results.Analysis, settings: GlmSettings) -> Iterato
     for ratio, place_text in worst.values():
         share = 2 * special.ndtr(special.ndtri(0.025) / np.sqrt(ratio))
         yield (
-            f"{place_text}: the smaller group varies more, so that about {share:.0%} of tests of"
-            " nothing"
-            ' have p below 0.05; glm.covariance = "hc3" in --settings allows for that if each group'
-            " has 20 or more"
+            f"{place_text}: the smaller group varies more, {share:.0%} of null tests have p "
+            '< 0.05; set glm.covariance = "hc3" from 20 per group'
         )
 
 
@@ -395,7 +393,7 @@ def check_joint(
     elif names and cells.JOINT in available:
         problem = f"a map is called {cells.JOINT}, as its results would be; give it another name"
     elif len(set(names)) < len(names):
-        problem = "a measure is named twice; leave it out"
+        problem = "a measure is named twice; remove it"
     elif len(names) < 1 + (not sides) and (names or sides):
         problem = "name two measures, or one and --joint-sides"
     if problem is not None:
@@ -441,7 +439,7 @@ def combine_maps(
             )
             groups[key], contrasts[test.contrast.name] = parts, test.contrast
     if not groups:
-        raise ModelError(f"--joint {' '.join(names)}: no side has them all; leave one out")
+        raise ModelError(f"--joint {' '.join(names)}: no side has them all; remove one")
     model = analyses[0].row_model
     tests_found = inference.correct_joint(
         groups,

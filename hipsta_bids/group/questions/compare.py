@@ -132,7 +132,7 @@ def _analyze(options: studies.GroupOptions, settings: GroupSettings) -> studies.
             write_summary(folder / SUMMARY, summary)
         write_shapes(folder, shapes)
         if analysis.registered and study.collection.records and not shapes:
-            notes.append("no average surfaces: those of the participant level are missing")
+            notes.append("no average surfaces: the surfaces of the participant level are missing")
         record = _record(analysis, study.collection.ratings)
         saved = GroupResults(
             folder=folder,
@@ -182,8 +182,8 @@ def _notes(study: studies.Study, analysis: Analysis) -> list[str]:
     notes += [note for name, note in analysis.design.notes.items() if name != time]
     if options.model.formula is None and options.model.file is None:
         notes += [
-            f"{name} is n/a for all, and not in the model; fill it in, or do not read much into"
-            f" differences that {name} might explain"
+            f"{name} is n/a for all, and not in the model; fill it in: {name} may explain "
+            "differences"
             for name in designs.empty_covariates(study.cohort.table, settings)
         ]
     if n_later := sum(one.reason == "later-session" for one in study.exclusions):
@@ -192,8 +192,8 @@ def _notes(study: studies.Study, analysis: Analysis) -> list[str]:
         )
     if doubtful := sum(record.doubtful for record in study.collection.records):
         notes.append(
-            f"{doubtful} hemispheres are in it that a person should look at first, and has not"
-            " rated for use; --exclude-look leaves them out"
+            f"{doubtful} hemispheres to look at first are included without a rating; exclude "
+            "them with --exclude-look"
         )
     if separated := sum(one.columns["separated"] for *_, one in analysis.pairs):
         notes.append(

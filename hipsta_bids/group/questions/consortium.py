@@ -40,15 +40,13 @@ def run_meta(
     *,
     figures: bool = False,
 ) -> tuple[Path, list[str]]:
-    """Combine the summaries of sites, perhaps with other names than those in them.
+    """Combine the summaries of sites, perhaps renamed; returns the page and notes.
 
     ``figures`` asks for figures for print, too.
-
-    Returns the page and what should be known.
     """
     if settings.multiplicity.method in PERMUTATIONS:
         raise UsageError(
-            "meta: there is nobody to permute in summaries; use --correction fdr2 or bh"
+            "meta: summaries have no participants to permute; use --correction fdr2 or bh"
         )
     sites = _read(paths)
     notes = check_agreement(sites)
@@ -229,26 +227,26 @@ def _methods(meta: Meta) -> str:
     if joint:
         fixed = (
             "The fixed effect was estimated in the model of all participants with a constant per"
-            f" site, from the sites' coefficients and their covariances {cite('join')}."
+            f" site {cite('join')}. This needs only the sites' coefficients and their covariances."
         )
         if any(item.contrast == MEAN for item in meta.items):
             fixed += " Means, which include the constant, were combined by inverse variances."
     if rules.random == "dl":
         random = (
             f"estimated by the moments of DerSimonian and Laird {cite('dl')}. Tests used the normal"
-            " distribution."
+            " distribution"
         )
     elif joint:
         random = (
             f"estimated by restricted maximum likelihood {cite('reml')} in the same model with a"
             " random slope of the site. Tests and limits used t, with one degree of freedom less"
-            " than the number of sites."
+            " than the number of sites"
         )
     else:
         random = (
-            f"estimated by restricted maximum likelihood {cite('reml')}. Tests and limits were"
-            f" those of Knapp and Hartung {cite('knapp-hartung')}, with standard errors not smaller"
-            f" than without their correction {cite('modified')}."
+            f"estimated by restricted maximum likelihood {cite('reml')}. Tests and limits followed"
+            f" Knapp and Hartung {cite('knapp-hartung')}, with standard errors not smaller"
+            f" than without their correction {cite('modified')}"
         )
     measure_text = (
         f"Measures of the hippocampal body {method_text} of {meta.people} participants{groups} at"
@@ -259,7 +257,7 @@ def _methods(meta: Meta) -> str:
     )
     effects = (
         f"{fixed} In the random-effects model, true effects differ between sites. Their variance"
-        f" (tau²) was {random} Heterogeneity was described by Cochran's Q, by I² {cite('i2')}, and"
+        f" (tau²) was {random}. Heterogeneity was described by Cochran's Q, by I² {cite('i2')}, and"
         f" by limits of the effect at a further site {cite('prediction')}."
     )
     if meta.items[0].result.without:

@@ -95,8 +95,8 @@ def _check_columns(
     # Combinations of so many sums can be about any few participants.
     if n - count < limits.min_residual_df or n - n_sums < limits.min_cell - 1:
         raise ModelError(
-            f"--export-summary: {n} participants are too few for {count} columns, which hold"
-            f" {n_sums} sums; leave variables out of the shared model"
+            f"--export-summary: {n} participants are too few for {count} columns ({n_sums} "
+            "sums); remove variables from the shared model"
         )
     if leverage > limits.max_leverage:
         raise ModelError(
@@ -147,5 +147,5 @@ def _plain(basis: Float, cell: Int, numbers: Sequence[Float]) -> bool:
 
 def _refuse(problem: str, name: str) -> NoReturn:
     raise ModelError(
-        f"--export-summary: {problem}; merge levels, or leave {name} out of the shared model"
+        f"--export-summary: {problem}; merge levels, or remove {name} from the shared model"
     )

@@ -102,7 +102,7 @@ class ModelSummary(TomlTable):
         )
 
     def check(self, points: int, participants: int) -> str | None:
-        """Say what does not fit together, if anything."""
+        """Raise the first disagreement, if there is one."""
         count = len(self.columns)
         points = points if self.kind == "map" else len(self.measures)
         rows: list[Sequence[object]] = [self.sd, *self.coefficients]
@@ -134,7 +134,7 @@ class ModelSummary(TomlTable):
                 size = _ROUNDING * float(np.abs(np.nan_to_num(computed)).max(initial=0.0))
                 expected = np.array(saved, dtype=np.float64)
                 if not np.allclose(expected, computed, rtol=_ROUNDING, atol=size, equal_nan=True):
-                    return f"estimates of {name} that are not those of its coefficients"
+                    return f"estimates of {name} that do not follow from its coefficients"
         return None
 
 
@@ -223,7 +223,7 @@ def summarize(
     site: str,
     inputs: Mapping[str, Any],
 ) -> tuple[dict[str, Any], list[str]]:
-    """Make the summary of an analysis of linear models, and note what it leaves out.
+    """Make the summary of an analysis of linear models, and note its omissions.
 
     The cohort has coordinates and units; ``inputs`` are ``seg``, ``region``, ``labels``,
     ``settings_hash`` and ``versions`` of the sheets. ModelError if so few participants are behind a
@@ -323,7 +323,7 @@ def _check_model(analysis: Analysis, settings: GroupSettings) -> None:
     elif analysis.harmonization is not None:
         problem = "of harmonized values cannot be combined; leave --harmonize out"
     elif settings.glm.covariance != "ordinary":
-        problem = "with HC3 standard errors cannot be combined; leave these out"
+        problem = "with HC3 standard errors cannot be combined; exclude these"
     elif match := _OF_THE_SAMPLE.search(analysis.model.formula):
         problem = (
             f"with {match[1]}() has other columns at each site; write numbers that are the same"

@@ -36,7 +36,7 @@ def plan_sites(
     icv: str | None,
     saved: SavedEffects | None,
 ) -> SitePlan | None:
-    """Say what is harmonized, or refuse what cannot be told apart; ``None`` if nothing is asked.
+    """Plan the harmonization, or refuse inseparable effects; ``None`` if there is none.
 
     All terms of the model without the site are kept; in changes between two sessions, also their
     interactions with the session. Of an earlier analysis, its own terms are. ModelError if sites
@@ -151,8 +151,8 @@ def _check_terms(model: formulas.ModelSpec, column: str) -> None:
         names = closed_formula(term_text(term)).names
         if column in names and len(names) > 1:
             raise ModelError(
-                f"--harmonize {column}: the model has {term}, so that part of an effect is of"
-                " sites and to be kept; leave this term or --harmonize out"
+                f"--harmonize {column}: the model has {term}, an effect of sites to keep; "
+                "remove this term, or --harmonize"
             )
 
 
@@ -162,9 +162,8 @@ def _check_constant(table: pd.DataFrame, column: str) -> None:
     changing = pairs[pairs.duplicated()].unique()
     if len(changing):
         raise ModelError(
-            f"--harmonize {column}: {formulas.listed(changing)} changed {column} between the"
-            f" sessions, so that changes depend on effects of {column} that the model of changes"
-            " cannot have; use --longitudinal"
+            f"--harmonize {column}: {formulas.listed(changing)} changed {column} between "
+            "sessions, so changes depend on its effects; use --longitudinal"
         )
 
 
@@ -179,14 +178,13 @@ def _check_sizes(
     least = settings.harmonization.least_participants
     if is_single and len(new) < 2:  # noqa: PLR2004 -- one is like all
         raise ModelError(
-            f"--harmonize {column}: all participants with the variables of the model have"
-            f" {column} {formulas.listed(new) or 'n/a'}; leave it out"
+            f"--harmonize {column}: all participants with the variables of the model have "
+            f"{column} {formulas.listed(new) or 'n/a'}; remove --harmonize"
         )
     if small := [f"{one} ({counts[one]})" for one in new if counts[one] < least]:
         raise ModelError(
-            f"--harmonize {column}: too few participants in {formulas.listed(small)}; at least"
-            f" {least} are needed to tell a site from its participants: leave these out by"
-            " --exclude, or join similar ones in a column of their own"
+            f"--harmonize {column}: too few participants in {formulas.listed(small)} (least "
+            f"{least}); exclude them by --exclude, or join similar ones"
         )
 
 
@@ -212,9 +210,8 @@ def _explained(
         if length <= DEPENDENCE * float(np.linalg.norm(values)):
             if refuse:
                 raise ModelError(
-                    f"--harmonize {column}: {column} and {name} cannot be told apart, since {name}"
-                    f" does not vary within {column}s (given the other variables); compare sites"
-                    " that have all groups, or leave --harmonize out"
+                    f"--harmonize {column}: {name} does not vary within {column}s, effects "
+                    "are inseparable; use sites with all groups, or drop --harmonize"
                 )
             continue
         basis = np.column_stack([basis, residual / length])
@@ -252,9 +249,9 @@ def _icv(
 def without_tests_of_sites(
     plan: SitePlan, design: Design, model: formulas.ModelSpec, comparison: Comparison
 ) -> Design:
-    """Refuse a model that counts as free what was spent on sites, or is asked to test it.
+    """Refuse a model without the sites' degrees of freedom, or a test of sites.
 
-    Tests of single columns that are about sites are left out where no contrast was named. A test
+    Tests of single columns that are about sites are omitted where no contrast was named. A test
     after it would take shifts that were estimated from the same data for known, and reject too
     often where groups are not balanced over sites (Nygaard et al. 2016,
     doi:10.1093/biostatistics/kxv027). With the sites in the model, it pays for them.
@@ -265,9 +262,8 @@ def without_tests_of_sites(
     joined = np.hstack([design.matrix, member])
     if np.linalg.matrix_rank(joined) > np.linalg.matrix_rank(design.matrix):
         raise ModelError(
-            f"--harmonize {plan.column}: the model has to have {plan.column} as a factor, since"
-            " its effects are estimated from the same participants; add"
-            f" + C({plan.column}) to the formula"
+            f"--harmonize {plan.column}: the model needs {plan.column}, estimated from the "
+            f"same participants; add + C({plan.column}) to the formula"
         )
     weights = np.linalg.pinv(design.matrix) @ (member - member.mean(axis=0))
     about = [
@@ -278,8 +274,8 @@ def without_tests_of_sites(
     named = {spec.name for spec in model.contrasts}
     if about and (named.intersection(about) or len(about) == len(design.contrasts)):
         raise ModelError(
-            f"--harmonize {plan.column}: contrast {about[0]} is about what it takes out;"
-            " harmonize sites or scanners, and choose other contrasts by --contrast"
+            f"--harmonize {plan.column}: contrast {about[0]} tests an effect that is "
+            "removed; choose other contrasts by --contrast"
         )
     contrasts = tuple(one for one in design.contrasts if one.name not in about)
     return replace(design, contrasts=contrasts)
@@ -355,21 +351,24 @@ def _effects(
         )
     if len(effects.mean) != values.shape[1]:
         raise ModelError(
-            f"{plan.saved.file}: its map of {measure} has {len(effects.mean)} points, those of"
-            f" these participants {values.shape[1]}; use the same grid"
+            f"{plan.saved.file}: its map of {measure} has {len(effects.mean)} points, these "
+            f"participants {values.shape[1]}; use one grid"
         )
     return combat.extend_effects(effects, values, visits, pooled=pooled)
 
 
 def _notes(plan: SitePlan, settings: GroupSettings, unknown: set[str]) -> Iterator[str]:
     if plan.lost:
-        yield f"{plan.lost} visits lack {plan.column} or what is kept, and are not harmonized"
+        yield (
+            f"{plan.lost} visits lack {plan.column} or an effect that is kept, and are not "
+            "harmonized"
+        )
     for name, share in plan.explained.items():
         if share > settings.harmonization.explained:
             yield f"{plan.column} explains {share:.0%} of {name}: its effect is poorly known"
     if unknown and plan.saved:
         names = formulas.listed(unknown)
-        yield f"{plan.saved.file} has not these measures, which are left out: {names}"
+        yield f"{plan.saved.file} lacks these measures, which are excluded: {names}"
     if plan.saved is None and not plan.portable:
         yield "harmonization.json is not written: this model's columns depend on all participants"
 

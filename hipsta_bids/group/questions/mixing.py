@@ -69,7 +69,7 @@ def with_mixes(
         parts = ", ".join(f"with {name} p {p_text(p)} ({test})" for name, test, p in tests if test)
         names = ", ".join(name for name, _, p in tests if p < _LEVEL)
         ending = f"; association {parts}" if parts else ""
-        ending += f"; effects of {names} may be those of {field}" if names else ""
+        ending += f"; effects of {names} may be effects of {field}" if names else ""
         lines.append(f"hemispheres differ in {text}{ending}")
     return replace(study, mixes=tuple(lines), labels=labels)
 

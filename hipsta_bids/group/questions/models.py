@@ -189,15 +189,15 @@ def group(
 ) -> GroupFit:
     """Fit one linear model at every point of maps, and correct for the number of points.
 
-    The model is that of ``hipsta-bids ... group``, with one row per participant. Maps are taken as
+    The model is as of ``hipsta-bids ... group``, with one row per participant. Maps are taken as
     they are, see :func:`register`; repeated visits and the classification are the command's.
 
     Parameters
     ----------
     maps
         (participants, x, y) on the sheet, or (participants, vertices) on another surface, NaN for
-        missing; a mapping of such arrays by side, which are corrected together or not as the
-        setting ``multiplicity.scope`` says; or an array of xarray with the axes ``participant``,
+        missing; a mapping of arrays by side, which are corrected together or not by the
+        setting ``multiplicity.scope``; or an array of xarray with the axes ``participant``,
         perhaps ``side``, and x and y or vertices, of one session and protocol, as
         :func:`hipsta_bids.load` gives.
     table : DataFrame
@@ -212,7 +212,7 @@ def group(
     references : mapping, optional
         Reference level by factor.
     correction : {"fdr2", "bh", "permutation-tfce", "permutation-max"}, optional
-        Instead of that of the settings (``fdr2``).
+        Instead of the method of the settings (``fdr2``).
     triangles : array, optional
         (faces, 3) of maps on vertices: neighbors, for cluster enhancement.
     settings : GroupSettings, str or Path, optional
@@ -385,7 +385,7 @@ def register(
     Parameters
     ----------
     maps : xarray.Dataset or mapping
-        Maps by name, among them ``curvature`` (1/mm): those of :func:`hipsta_bids.load`, or arrays
+        Maps by name, among them ``curvature`` (1/mm): maps of :func:`hipsta_bids.load`, or arrays
         (participants, x, y) of one side, NaN for missing.
     settings : GroupSettings, str or Path, optional
         Settings of the group level, or a TOML file with some.

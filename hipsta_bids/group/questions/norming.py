@@ -78,10 +78,10 @@ def run_norms(
     among: tuple[str, str] | None = None,
     controls: tuple[str, str] | None = None,
 ) -> studies.GroupResult:
-    """Fit norms, or score people by those of a file, and write all results or none.
+    """Fit norms, or score participants by a file's, and write all results or none.
 
-    ``among`` are column and level of the participants, ``controls`` those of the controls who
-    estimate shift and scale of new sites.
+    ``among`` are column and level of the participants, ``controls`` of the controls who estimate
+    shift and scale of new sites.
     """
     dataset.check_own_dataset(options.out_dir)
     if path is not None:
@@ -119,13 +119,13 @@ def _score_people(
     repeated = table.duplicated([PARTICIPANT, *({file.site} & set(table.columns))])
     if repeated.any() and FIRST_AGE not in table:
         notes.append(
-            f"{file.age} is the same in all sessions of a participant; give that of each session in"
-            " sessions.tsv, as later visits are scored for too young an age"
+            f"{file.age} is equal in all sessions of a participant; give the age of each "
+            "session in sessions.tsv"
         )
     people = _people(study, file)
     if not people.known.any():
         reasons = "; ".join(dict.fromkeys(message for _, message in study.left_out.values()))
-        raise ModelError(f"{path}: nobody here can be scored: {reasons}")
+        raise ModelError(f"{path}: no participant can be scored: {reasons}")
     study = with_mixes(study, table[people.known], (file.age,), source=(path, file.labels))
     controls_kept = studies.members(table, controls, "--controls")
     references = controls_kept & (controls is not None) & ~repeated.to_numpy()
@@ -138,7 +138,7 @@ def _score_people(
     extended = {}
     for key, (rows, numbers) in values.items():
         if norms[key].mean.shape[1] != numbers.shape[1]:
-            points = f"{norms[key].mean.shape[1]} points, these people {numbers.shape[1]}"
+            points = f"{norms[key].mean.shape[1]} points, these participants {numbers.shape[1]}"
             raise ModelError(f"{path}: norms of {listed(key)} have {points}")
         at, least = adapted[rows], settings.norms.least_controls // 2
         extended[key] = norms[key].extended(
@@ -283,14 +283,14 @@ def _planned(study: studies.Study) -> tuple[NormsFile, normative.People]:
     counts = dict(zip(file.sites, numbers, strict=True))
     if small := [f"{site} ({n})" for site, n in counts.items() if n < rules.least_site]:
         raise ModelError(
-            f"--fit-norms: too few participants at {file.site} {listed(small)}; each needs"
-            f" {rules.least_site}: leave these out by --exclude, or join those of one scanner"
+            f"--fit-norms: too few participants at {file.site} {listed(small)} (least "
+            f"{rules.least_site}); use --exclude, or join sites of one scanner"
         )
     joined = np.hstack([np.eye(len(counts))[people.site[is_known]], people.sex[is_known]])
     if np.linalg.matrix_rank(joined) < joined.shape[1]:
         raise ModelError(
-            f"--fit-norms: {file.sex} does not vary within {file.site}, so that their effects"
-            " cannot be told apart; add sites with both"
+            f"--fit-norms: {file.sex} does not vary within {file.site}, and effects are "
+            "inseparable; add sites with both"
         )
     return file.model_copy(update={"sites": counts, "participants": int(is_known.sum())}), people
 
@@ -352,8 +352,8 @@ def _check(file: NormsFile, path: Path, study: studies.Study) -> list[str]:
     ):
         if value != expected:
             raise ModelError(
-                f"{path}: {subject}: {expected}, but here {value}; measure people as the reference"
-                " cohort of the norms was"
+                f"{path}: {subject}: {expected}, but here {value}; measure participants as "
+                "the reference cohort was"
             )
     available = {measure for measures in file.norms.values() for measure in measures}
     requested = [*study.maps, *(study.measures.summaries or ())]
@@ -364,8 +364,8 @@ def _check(file: NormsFile, path: Path, study: studies.Study) -> list[str]:
         )
     if set(collection.versions) - set(file.versions):
         note = (
-            f"the norms are of maps of hipsta_bids {listed(file.versions)}, these people were"
-            f" measured with {listed(collection.versions)}; a version may change numbers"
+            f"the norms are of maps of hipsta_bids {listed(file.versions)}, these "
+            f"participants of {listed(collection.versions)}; numbers may differ"
         )
         return [note]
     return []
@@ -390,9 +390,8 @@ def _with_new_sites(
         if count < least:
             controls_text = "=".join(controls) if controls else "(--controls COLUMN=LEVEL)"
             raise ModelError(
-                f"{path}: {file.site} {site!r} is none of the norms'"
-                f" ({listed(list(file.sites))}) and has {count} controls {controls_text} within the"
-                f" range of ages; {least} are needed to tell a site from its people"
+                f"{path}: no norms of {file.site} {site!r}, only {listed(list(file.sites))}; it"
+                f" needs {least} controls {controls_text} within the ages, and has {count}"
             )
         sites[site] = count
     return file.model_copy(update={"sites": sites})

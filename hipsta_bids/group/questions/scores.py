@@ -95,7 +95,7 @@ def score_cohort(
 
 
 def without_variable(formula: str, factor: str) -> str:
-    """Leave out all terms in which a variable has a part."""
+    """Remove all terms in which a variable has a part."""
     terms = [
         term_text(term)
         for term in Formula(closed_formula(formula).text)
@@ -206,7 +206,9 @@ def classify_groups(
     results: list[tuple[str, str, tuple[str, str], ModelComparison]] = []
     notes: list[str] = []
     if groups.column in settings.base:
-        raise UsageError(f"--base {groups.column}: that is what is told apart")
+        raise UsageError(
+            f"--base {groups.column}: this column has the groups to classify; remove it there"
+        )
     hemis, added = data.hemispheres(cohort), settings.added
     for part, hemi in enumerate(hemis):
         values = data.summary_values(cohort, hemi)

@@ -184,7 +184,7 @@ def _few(values: Sequence[float]) -> str:
     over="ignore", divide="ignore", invalid="ignore"
 )  # of numbers as other sites sent them
 def analyze_sites(sites: list[SiteSummary], settings: GroupSettings) -> Meta:
-    """Combine each contrast of each model, and tell which points survive."""
+    """Combine each contrast of each model, and determine the points that survive."""
     items = [
         Item(
             number=number,

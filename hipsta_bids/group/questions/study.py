@@ -71,7 +71,7 @@ class GroupOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class GroupResult:
-    """What was done."""
+    """Result of a question."""
 
     folder: Path
     n_participants: int
@@ -90,7 +90,7 @@ class GroupResult:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Study:
-    """What was read for a question, and of whom."""
+    """The data read for a question, and their participants."""
 
     options: GroupOptions
     settings: GroupSettings
@@ -148,7 +148,7 @@ class Study:
         }
 
     def take(self, keep: Bool, reason: tuple[str, str]) -> "Study":
-        """Keep some visits; the others are left out, with a reason and a message."""
+        """Keep some visits; the others are excluded, with a reason and a message."""
         left_out = dict.fromkeys(map(str, self.cohort.table.index[~keep]), reason)
         cohorts = {surface: one.take(keep) for surface, one in self.cohorts.items()}
         return replace(self, cohorts=cohorts, left_out=self.left_out | left_out)
@@ -181,9 +181,9 @@ class Study:
         record: Mapping[str, Any],
         fill: Callable[[Path], list[str]],
     ) -> GroupResult:
-        """Write results other than those of comparisons, and a page.
+        """Write results of questions other than comparisons, and a page.
 
-        ``fill`` writes what only this question has, and returns notes.
+        ``fill`` writes the files of this question only, and returns notes.
         """
         excluded = [*self.exclusions, *collect.exclude_visits(self.visits, self.left_out)]
         all_notes, people = [*self.notes, *notes], int(visits[PARTICIPANT].nunique())
@@ -210,8 +210,8 @@ class Study:
     ) -> GroupResult:
         """Write all results or none.
 
-        ``fill`` writes into the folder, adds to the notes, and returns what is recorded; ``counts``
-        are of participants and of what is left out.
+        ``fill`` writes into the folder, adds to the notes, and returns the record; ``counts`` are
+        of participants and of exclusions.
         """
         options, collection = self.options, self.collection
         warnings = (*collection.warnings, *self.mixes)
@@ -290,8 +290,8 @@ def read_study(
     sheets, surfaces, map_notes = external.add_external(sheets, files_of, visits)
     if covariate_maps and surfaces:
         raise ModelError(
-            f"maps {listed(surfaces)} are not on the grid of the sheet, where map() in the formula"
-            " is; leave one out"
+            f"maps {listed(surfaces)} are not on the grid of the sheet, but map() in the formula"
+            " is; remove one"
         )
     measured, volume_notes = external.add_volumes(
         sheets, collection.records, options.volumes, options.bids_dir
@@ -380,13 +380,15 @@ def _with_covariates(
 
 def _damaged(measured: read.Measured) -> tuple[str, ...]:
     lines = [
-        f"{one.participant}{f' {one.session}' if one.session else ''}, hemisphere {one.hemi}, is"
-        f" left out: {one.message}; measure it again"
+        f"{one.participant}{f' {one.session}' if one.session else ''}, hemisphere "
+        f"{one.hemi}, is excluded: {one.message}; measure it again"
         for one in measured.damaged[:_MOST_NOTES]
     ]
     n_left = len(measured.damaged) - _MOST_NOTES
     return (
-        (*lines, f"{n_left} more are left out alike, see excluded.tsv") if n_left > 0 else (*lines,)
+        (*lines, f"{n_left} more are excluded likewise, see excluded.tsv")
+        if n_left > 0
+        else (*lines,)
     )
 
 
@@ -426,13 +428,13 @@ def read_templates(path: Path | None, cohort: Cohort) -> Mapping[str, Template] 
 
 
 def folder_of(parts: Sequence[str], among: tuple[str, str] | None) -> str:
-    """Name a folder of results by what was asked, and of whom."""
+    """Name a folder of results by its question and its participants."""
     words = (*parts, *(among or ())[1:])
     return "_".join(ascii_letters(word, "-") for word in words)
 
 
 def members(table: pd.DataFrame, among: tuple[str, str] | None, option: str = "--among") -> Bool:
-    """Tell whose visits are asked for."""
+    """Select the participants that are asked for."""
     if among is None:
         return np.ones(len(table), dtype=bool)
     column, level = among

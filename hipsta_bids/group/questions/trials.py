@@ -51,7 +51,7 @@ Tables = dict[str, Mapping[str, Any]]
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Described:
-    """What is known of a layer."""
+    """Facts about a layer."""
 
     layer: Layer
     tables: Tables
@@ -99,15 +99,15 @@ class Retested:
             )
         if len(self.participants) < self._settings.min_participants:
             raise ModelError(
-                f"--retest: {len(self.participants)} participants have all of the sessions"
-                f" {sessions_text}, at least {self._settings.min_participants} are needed; name"
-                " sessions that more have by --session-label"
+                f"--retest: {len(self.participants)} participants have all sessions "
+                f"{sessions_text}, of {self._settings.min_participants} needed; name other "
+                "sessions by --session-label"
             )
 
     def arrange(self, values: Float, rows: Int) -> Float:
         """Arrange values of visits as (participants, sessions, points); NaN where missing.
 
-        ``rows`` are those of the table of all complete visits.
+        ``rows`` are rows of the table of all complete visits.
         """
         visits = self._table.iloc[rows]
         filled = np.full((len(self.participants), len(self.sessions), values.shape[1]), np.nan)
@@ -195,7 +195,7 @@ class Modeled:
 
     @property
     def rows(self) -> Int:
-        """Rows of the table of which summary measures are taken: those of the model."""
+        """Rows of the table of which summary measures are taken: the model's."""
         return self.model.design.rows
 
     def describe(self, layer: Layer) -> Described:
@@ -265,8 +265,8 @@ def _check_times(table: pd.DataFrame, time: str | None, settings: GroupSettings)
         )
     if table[PARTICIPANT].value_counts().max() < _SLOPE_SESSIONS:
         raise ModelError(
-            "--power with --visits: no participant of the reference has three sessions, so that"
-            " changes cannot be told from noise; leave --visits out, or give --retest"
+            "--power with --visits: no reference participant has three sessions to estimate "
+            "changes; remove --visits, or give --retest"
         )
 
 
@@ -280,7 +280,7 @@ def run_trial(
 ) -> studies.GroupResult:
     """Measure the agreement of sessions, or sample sizes, and write all results or none.
 
-    ``effect`` is that of a trial whose size is asked for, by the ``retest`` if there is one, and
+    ``effect`` is of a trial whose size is asked for, by the ``retest`` if there is one, and
     ``among`` are column and level of the participants.
     """
     dataset.check_own_dataset(options.out_dir)
@@ -374,7 +374,7 @@ def _notes(
     effect: trials.TrialEffect | None,
 ) -> Iterator[str]:
     if isinstance(source, Retested) and (n := int((~source.complete).sum())):
-        yield f"{n} visits of participants who lack a session are left out, see excluded.tsv"
+        yield f"{n} visits of participants who lack a session are excluded, see excluded.tsv"
     if effect is None:
         return
     if signed := dict.fromkeys(r.layer.measure for r in results if "power" not in r.tables):
@@ -384,13 +384,13 @@ def _notes(
         )
     if isinstance(source, Modeled) and effect.duration > source.follow_up:
         yield (
-            f"the trial lasts {effect.duration:g} months, the reference {source.follow_up:.3g};"
-            " that change goes on alike is an assumption"
+            f"the trial lasts {effect.duration:g} months, the reference "
+            f"{source.follow_up:.3g}; the estimate assumes that change continues linearly"
         )
     if isinstance(source, Retested) and effect.visits:
         yield (
-            "sample sizes rest on the variance of measurement alone; trials need more, as people"
-            " differ in how they change"
+            "sample sizes include only the variance of measurement; participants also "
+            "differ in change, so trials need more"
         )
     if n_later := sum(exclusion.reason == "later-session" for exclusion in study.exclusions):
         yield f"{n_later} later sessions are not in it; --visits takes all"

@@ -153,7 +153,7 @@ def return_memory() -> None:
 
 
 def mean_of_known(values: Float, axis: int) -> Float:
-    """Mean without what is missing; NaN where nothing is known."""
+    """Mean without missing values; NaN where nothing is known."""
     finite = np.isfinite(values)
     count = finite.sum(axis=axis)
     total = values.sum(axis=axis, dtype=np.float64, where=finite)
@@ -161,7 +161,7 @@ def mean_of_known(values: Float, axis: int) -> Float:
 
 
 def describe_known(parts: Iterable[Float]) -> tuple[Bool, Float, Float]:
-    """Tell what is known of a table in parts, (rows, columns), and mean and SD of its columns.
+    """Determine the known cells of a table in parts, (rows, columns), and mean and SD by column.
 
     Means and sums of squares of parts are put together as by Chan et al. (1983).
     """

@@ -127,7 +127,7 @@ def compare_models(
     """Test whether measures add to a base model, and how well both classify complete subjects.
 
     The likelihood-ratio test is the only test between the two. If a model separates the groups,
-    both are fitted by Firth's method, and the test is that of the penalized likelihood (Heinze
+    both are fitted by Firth's method, and the test is of the penalized likelihood (Heinze
     and Schemper 2002).
     """
     full = np.column_stack([base, added])
@@ -200,7 +200,7 @@ def _check(matrix: Float, case: Bool) -> None:
         )
     if np.linalg.matrix_rank(matrix / np.abs(matrix).max(axis=0).clip(1e-300)) < matrix.shape[1]:
         raise ModelError(
-            f"classification: the {matrix.shape[1]} columns are not independent; leave one out"
+            f"classification: the {matrix.shape[1]} columns are not independent; remove one"
         )
 
 

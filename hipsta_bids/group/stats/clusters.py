@@ -61,7 +61,7 @@ def enhance(statistic: Float, edges: Int) -> Float:
     """Threshold-free cluster enhancement of maps (maps, points) (Smith and Nichols 2009).
 
     NaN is outside; positive and negative clusters are separate. From the highest threshold down,
-    regions only grow: each threshold joins those of the one above.
+    regions only grow: each threshold joins regions of the one above.
     """
     values = np.nan_to_num(statistic, nan=0.0)
     size = np.abs(values).ravel()

@@ -88,11 +88,11 @@ def fit_effects(
     Participants with several visits get random intercepts, and the residual SD is the root mean
     square of the conditional residuals, as the variant MSR of Beer et al. (2020): without effects
     of sites it leaves the values as they are. Every one of the ``n_sites`` has visits. Where
-    effects are ``pooled``, points inform each other (empirical Bayes), as those of one map do;
-    else each site's own mean and variance are taken out.
+    effects are ``pooled``, points inform each other (empirical Bayes), as points of one map do;
+    else each site's own mean and variance are removed.
 
     Parameters are NaN at points where missing values leave sites and columns inseparable; moments
-    are those of residuals before harmonization.
+    are of residuals before harmonization.
     """
     rows = np.flatnonzero(visits.site >= 0)
     values, visits = values[rows], visits.take(rows)
@@ -158,7 +158,7 @@ def extend_effects(
 ) -> tuple[SiteEffects, SiteMoments]:
     """Estimate the effects of further sites, with all else as it was estimated before.
 
-    Sites beyond those of the effects are new. The moments are those of the given values.
+    Sites beyond the sites of the effects are new. The moments are of the given values.
     """
     n_known = len(effects.fixed)
     rows = np.flatnonzero(visits.site >= 0)

@@ -135,7 +135,7 @@ def varies_inside(tested: Float, blocks: Int) -> bool:
 def varies_between(tested: Float, visits: Visits) -> bool:
     """Whether any column (rows, columns) differs between participants of a block.
 
-    What is the same curve of time in all of them does not.
+    An equal curve of time in all of them does not.
     """
     member = visits.classes()[1][:, None] == np.unique(visits.classes()[1])
     curves = orth(np.hstack([member * one[:, None] for one in _powers(visits, _POWERS)]))
@@ -159,9 +159,9 @@ def _block_means(columns: Float, blocks: Int) -> Float:
 def choose_exchange(
     matrix: Float, contrast: Contrast, visits: Visits, choice: Literal["auto"] | Exchange
 ) -> Exchange:
-    """Choose what is exchanged between repeated visits (Winkler et al. 2014, 2015).
+    """Choose the exchange of repeated visits (Winkler et al. 2014, 2015).
 
-    Differences between participants, also those of their changes over time, exchange whole blocks;
+    Differences between participants, also in their changes over time, exchange whole blocks;
     changes that all have in common exchange the visits of each participant, which are alike as
     long as changes do not differ between them. With random slopes, and for means, neither holds,
     and signs are flipped.
@@ -192,7 +192,7 @@ def exchange_text(
     visits: Visits,
     choice: Literal["auto"] | Exchange,
 ) -> str:
-    """Return what is exchanged for which contrasts, without a final period."""
+    """Word the exchange of each contrast, without a final period."""
     kinds: dict[Exchange, list[str]] = {}
     for contrast in contrasts:
         kinds.setdefault(choose_exchange(matrix, contrast, visits, choice), []).append(

@@ -160,8 +160,8 @@ def fit_points(
 
     ``covariates`` (maps, rows, points) have a value at each point, and are further columns of the
     design there, as differences from their mean at the point (Casanova et al. 2007,
-    doi:10.1016/j.neuroimage.2006.09.011). Contrasts have weights of them after those of the matrix,
-    or none.
+    doi:10.1016/j.neuroimage.2006.09.011). Contrasts have weights of ``covariates`` after the
+    weights of the matrix, or none.
     """
     n_maps = 0 if covariates is None else len(covariates)
     columns = matrix.shape[1] + n_maps
@@ -212,8 +212,8 @@ def check_design(
         raise ModelError("model: the design has missing values; keep complete rows only")
     if np.linalg.matrix_rank(matrix) < matrix.shape[1]:
         raise ModelError(
-            f"model: the design's {matrix.shape[1]} columns are not independent, given"
-            f" {matrix.shape[0]} rows; leave one out"
+            f"model: the design's {matrix.shape[1]} columns are not independent, given "
+            f"{matrix.shape[0]} rows; remove one"
         )
     for contrast in contrasts:
         if contrast.weights.shape[1] != columns:
@@ -244,8 +244,8 @@ def chunks(shape: tuple[int, ...], columns: int) -> Iterator[slice]:
 def fit_block(maps: Float, basis: Float, settings: GlmSettings) -> PointBlock:
     """Solve least squares at some points, by normal equations in orthonormal coordinates.
 
-    There the equations of a complete point are the identity, and those of other points stay well
-    conditioned unless the missing subjects really carried a column.
+    There the equations of a complete point are the identity, and the equations of other points stay
+    well conditioned unless the missing subjects really carried a column.
     """
     present = np.isfinite(maps)
     values = np.where(present, maps, 0.0)
@@ -397,7 +397,7 @@ def fit_measures(
 ) -> PointwiseFit:
     """Fit the model of :func:`fit_points` by statsmodels, one column of values after the other.
 
-    A column is left out by the same rules, and effect sizes are the same.
+    A column is excluded by the same rules, and effect sizes are the same.
     """
     check_design(values, matrix, contrasts)
     block = fit_block(values, np.linalg.qr(matrix)[0], settings)
@@ -465,7 +465,7 @@ class RowModel:
 
 
 def with_mean(design: Design) -> tuple[Contrast, ...]:
-    """Contrasts of a design, with that of the model's mean over all rows in front."""
+    """Contrasts of a design, with the model's mean over all rows in front."""
     mean = Contrast(MEAN, design.matrix.mean(axis=0))
     matching = [
         one
@@ -478,7 +478,7 @@ def with_mean(design: Design) -> tuple[Contrast, ...]:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FittedMaps:
-    """What was fitted, and the fit."""
+    """Maps, and their fit."""
 
     maps: SideMaps
     """Of all rows of the model's table that have them."""
@@ -531,14 +531,13 @@ def fit_maps(
     for name, fit in fits.items():
         if not np.isfinite(fit.sigma).any():
             raise ModelError(
-                f"hemisphere {hemi}: no point of the {name} maps has enough values for the model;"
-                " look at the sheets, or use a smaller model"
+                f"hemisphere {hemi}: no point of the {name} maps has enough values; look at "
+                "the sheets, or reduce the model"
             )
         if fit.tests and not any(np.isfinite(test.se).any() for test in fit.tests):
             raise ModelError(
-                f"hemisphere {hemi}: a participant who alone determines a coefficient of the model"
-                f" leaves no HC3 standard error at any point of the {name} maps; use a smaller"
-                " model, or leave glm.covariance out"
+                f"hemisphere {hemi}: a coefficient depends on one participant at all points "
+                f"of {name}; reduce the model, or unset glm.covariance"
             )
     return FittedMaps(
         maps=side,

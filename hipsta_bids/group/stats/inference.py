@@ -78,16 +78,16 @@ def permute(
 ) -> list[PermutationTest]:
     """Permutation test of one contrast at all points (Freedman and Lane 1983).
 
-    What the covariates explain is subtracted, the residuals are shuffled between subjects, and
-    the whole model is fitted to them again (Winkler et al. 2014). If the contrast tests what
-    all subjects have in common (an intercept), signs are flipped instead of subjects shuffled.
-    Of repeated visits participants change places with all their visits, or visits with each other,
-    or the signs of all visits of a participant are flipped, as the contrast allows
+    The effect of the covariates is subtracted, the residuals are shuffled between subjects, and
+    the whole model is fitted to them again (Winkler et al. 2014). If the contrast tests a mean of
+    all subjects (an intercept), signs are flipped instead of subjects shuffled. Of repeated visits
+    participants change places with all their visits, or visits with each other, or the signs of all
+    visits of a participant are flipped, as the contrast allows
     (:func:`hipsta_bids.group.stats.exchangeability.choose_exchange`; Winkler et al. 2015).
 
-    Missing values count as what the covariates predict, which shrinks an effect; degrees of
-    freedom are those of the subjects present. ``family`` is the number of this one, from 0, and of
-    how many, to tell how far all are; without it nothing is told.
+    Missing values count as the prediction of the covariates, which shrinks an effect; degrees of
+    freedom count the subjects present. ``family`` is the number of this one, from 0, and of how
+    many, to report how far all are; without it nothing is reported.
 
     Parts of several measures, or sides, at the same points are shuffled alike, which keeps their
     dependence, and combined at each point by :func:`combine_evidence` (non-parametric combination;
@@ -127,8 +127,8 @@ def combine_evidence(p: Float, method: str) -> Float:
     """Combine p-values (measures, ...) into z: the normal quantile of their two-sided p together.
 
     ``fisher`` sums minus twice their logarithms (chi squared; Fisher 1932), ``tippett`` takes the
-    smallest (Tippett 1931). That p holds if they are independent; as what is permuted, z only has
-    to rise with the evidence. It is not negative, and NaN where any p is.
+    smallest (Tippett 1931). That p holds if they are independent; as the permuted quantity, z only
+    has to rise with the evidence. It is not negative, and NaN where any p is.
     """
     limits = np.finfo(np.float64)
     count, p = len(p), np.clip(p, limits.tiny, 1 - limits.eps)
@@ -180,9 +180,8 @@ class _Member:
                 varies = exchangeability.varies_between(weights, self._visits)
             if not varies:  # shuffling cannot break it up
                 raise ModelError(
-                    f"permutation: {contrast.name} does not vary inside the blocks, so that"
-                    " shuffling there says nothing about it; leave --blocks out, or choose larger"
-                    " blocks"
+                    f"permutation: {contrast.name} does not vary inside the blocks; remove "
+                    "--blocks, or choose larger blocks"
                 )
 
     def shuffled(self, keys: Float) -> Float:
@@ -254,7 +253,7 @@ class _Run:
         return self._statistics([member.shuffled(keys) for member in self._members])
 
     def reached(self, t: Float, highest: Float, highest_enhanced: Float) -> Float:
-        """Count (3, points) permutations that reach what was observed."""
+        """Count (3, points) permutations that reach the observed values."""
         pairs = ((t, self._observed), (highest, self._observed), (highest_enhanced, self._enhanced))
         # Values may be off by rounding.
         reach = [np.abs(values) >= np.abs(seen) * (1 - _ROUNDING) for values, seen in pairs]
@@ -425,7 +424,7 @@ def correct(
     table: pd.DataFrame,
     rules: MultiplicitySettings,
 ) -> dict[MapKey, Discoveries]:
-    """Tell which points survive, in families."""
+    """Determine the points that survive, in families."""
     tests = {
         MapKey(measure, test.contrast.name, hemi): test
         for hemi, one in fitted.items()

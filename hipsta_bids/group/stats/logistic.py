@@ -59,7 +59,7 @@ class LogisticFit:
 
 
 def is_separated(matrix: Float, case: Bool) -> bool:
-    """Whether a combination of the columns tells the groups apart without overlap.
+    """Whether a combination of the columns separates the groups without overlap.
 
     Then maximum-likelihood estimates are infinite (Albert and Anderson 1984). Found exactly, by
     a linear program (Konis 2007): the largest sum of margins under which none is negative.

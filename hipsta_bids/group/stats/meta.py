@@ -95,10 +95,10 @@ def combine(
 
     ``test`` is ``normal``; ``plain``: standard errors from the spread of the sites' estimates, and
     t with ``sites - 1`` degrees of freedom (Knapp and Hartung 2003); or ``modified``: the same, but
-    no standard error smaller than that of ``normal`` (Roever, Knapp and Friede 2015). Points of
-    fewer sites than ``least`` have no result.
+    no standard error smaller than with ``normal`` (Roever, Knapp and Friede 2015). Points of fewer
+    sites than ``least`` have no result.
 
-    I squared is that of Higgins and Thompson (2002) in terms of tau squared: tau squared over its
+    I squared follows Higgins and Thompson (2002) in terms of tau squared: tau squared over its
     sum with the typical variance within sites. For ``fixed`` and ``dl`` it is (Q - df) / Q.
     """
     usable_sites = np.isfinite(estimates) & np.isfinite(variances) & (variances > 0)
@@ -164,7 +164,7 @@ def _reml(values: Float, variances: Float, usable_sites: Bool, usable: Bool, sta
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SiteFit:
-    """What one site sends of one model: all that its participants say about the coefficients."""
+    """A site's numbers of one model: all evidence of its participants on the coefficients."""
 
     coefficients: Float
     """(columns, points)"""
@@ -195,8 +195,8 @@ def join(
     """Test a contrast in the model of all participants with a constant per site.
 
     The likelihood of that model depends on participants by the sites' coefficients, their
-    covariances and residual variances only, so that results are exactly those of one table with
-    all participants and the site as a further factor (Becker and Wu 2007).
+    covariances and residual variances only, so that results equal an analysis of one table with all
+    participants and the site as a further factor (Becker and Wu 2007).
 
     All fits have the same columns; the contrast's ``weights`` (columns,) are 0 for the
     ``intercept``, which differs between sites (``None``: all coefficients are common). Points of
@@ -313,7 +313,7 @@ class MetaResult:
 
     @property
     def models(self) -> dict[str, Combined]:
-        """Both results, by what they are called."""
+        """Both results, by name."""
         return {FIXED: self.fixed, RANDOM: self.random}
 
 
@@ -329,7 +329,7 @@ def meta_analyze(
 
     ``weights`` has the contrast at each site, the same at all but for a mean over participants.
     Where the contrast includes the constant, as the mean does, estimates are combined in two
-    stages: a model with a constant per site says nothing about it.
+    stages: a model with a constant per site does not estimate it.
     """
     estimates = np.stack([fit.estimate(row) for fit, row in zip(fits, weights, strict=True)])
     ses = np.stack([fit.se(row) for fit, row in zip(fits, weights, strict=True)])

@@ -169,10 +169,9 @@ def fit_mixed(
     By restricted maximum likelihood, which for one random intercept depends on one number: the
     ratio of the two variances. It is found for all points at once. Degrees of freedom are
     Satterthwaite's, from the curvature of the likelihood at the optimum, as in R's ``lmerTest``
-    (Kuznetsova et al. 2017); where no variance between participants is found they are those of
-    the linear model. Several rows are tested by F: the mean of the squared t of combinations that
-    are independent, with the degrees of freedom that give F its expectation (Fai and Cornelius
-    1996).
+    (Kuznetsova et al. 2017); where no variance between participants is found they are the linear
+    model's. Several rows are tested by F: the mean of the squared t of combinations that are
+    independent, with the degrees of freedom that give F its expectation (Fai and Cornelius 1996).
     """
     glm.check_design(maps, matrix, contrasts)
     _, numbers, counts = np.unique(

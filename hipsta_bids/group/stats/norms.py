@@ -49,7 +49,7 @@ class People:
 
     @property
     def known(self) -> Bool:
-        """(visits,) those that can be scored."""
+        """(visits,) whether each can be scored."""
         return np.isfinite(self.age) & np.isfinite(self.sex).all(axis=1) & (self.site >= 0)
 
     def take(self, rows: Int | Bool) -> "People":
@@ -126,7 +126,7 @@ class Norms:
         return replace(self, **{name: getattr(self, name)[:, part] for name in NORM_ARRAYS})
 
     def extended(self, values: Float, people: People, n_sites: int, least: int) -> "Norms":
-        """Add sites beyond those that are known: their shift and scale, all else as it is.
+        """Add sites beyond the known ones: their shift and scale, all else as it is.
 
         ``values`` (visits, points) are of controls, NaN where missing; sites of ``people`` from
         ``len(self.n)`` on are new, up to ``n_sites``. A point needs ``least`` values at a site.
@@ -160,13 +160,13 @@ def age_columns(age: Float, knots: Float) -> Float:
 
 
 def choose_knots(ages: Float, rules: NormSettings) -> Float:
-    """Knots at equal shares of people; beyond the outer ones are some, so that nobody is told."""
+    """Knots at equal shares of participants; some lie beyond the outer ones to hide ages."""
     ages = np.sort(ages[np.isfinite(ages)])
     if len(ages) < rules.least_participants:
         raise ModelError(
-            f"--fit-norms: {len(ages)} participants with age, sex and site are too few; norms need"
-            f" {rules.least_participants} or more: join the reference cohorts of several sites by"
-            " --derivatives"
+            f"--fit-norms: {len(ages)} participants with age, sex and site, "
+            f"{rules.least_participants} are needed; join cohorts of several sites by "
+            "--derivatives"
         )
     low, high = np.floor(ages[rules.edge - 1]), np.ceil(ages[-rules.edge])
     inside = ages[(ages >= low) & (ages <= high)]
@@ -353,9 +353,9 @@ class NormativeScores:
 def w_scores(maps: Float, matrix: Float, reference: Bool, settings: GlmSettings) -> NormativeScores:
     """Score each subject against a reference group, adjusted for covariates.
 
-    Members of the reference group are scored against its other members: as if the model had been
-    fitted without them (from their leverage, so that nothing is fitted again). Their scores
-    thus mean the same as those of everybody else.
+    Members of the reference group are scored against its other members: as if the model were fitted
+    without them (from their leverage, so that nothing is fitted again). Their scores are thus
+    comparable with the scores of all others.
     """
     if settings.covariance != "ordinary":
         raise ModelError("normative scores assume equal variances; set glm.covariance to ordinary")
@@ -367,8 +367,8 @@ def w_scores(maps: Float, matrix: Float, reference: Bool, settings: GlmSettings)
         )
     if np.linalg.matrix_rank(reference_matrix) < matrix.shape[1]:
         raise ModelError(
-            "normative scores: in the reference group the columns are not independent; leave out"
-            " a covariate that does not vary there"
+            "normative scores: columns are not independent in the reference group; remove a "
+            "covariate that does not vary there"
         )
     basis, triangle = np.linalg.qr(reference_matrix)
     rotated = matrix @ np.linalg.inv(triangle)

@@ -177,7 +177,7 @@ def slope_freedom(sums: SlopeSums, triangles: Float, rows: Float) -> Float:
     """Satterthwaite's degrees of freedom of rows of weights, (rows, points, columns).
 
     From the Hessian of minus twice the restricted likelihood for the logarithm of the residual
-    variance and the triangle; directions without curvature, as at a bound, are left out, as in
+    variance and the triangle; directions without curvature, as at a bound, are excluded, as in
     R's ``lmerTest``.
     """
     freedom = sums.n - sums.squares.shape[1]

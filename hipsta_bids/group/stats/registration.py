@@ -23,7 +23,7 @@ _TOLERANCE = 1e-4
 
 @dataclass(frozen=True)
 class Registration:
-    """Warps of all subjects, and what they did."""
+    """Warps of all subjects, and their effect."""
 
     warps: Float
     """(subjects, nodes) registered coordinate of each node, 0..1."""
@@ -160,8 +160,8 @@ def _check_profiles(profiles: Float, settings: RegistrationSettings) -> None:
     constant = profiles.std(axis=1) <= np.finfo(np.float64).eps * np.abs(profiles).max(axis=1)
     if settings.standardize and constant.any() and not constant.all():
         raise ModelError(
-            f"registration: profiles {', '.join(map(str, np.flatnonzero(constant)[:10]))} are"
-            " constant; leave them out"
+            f"registration: profiles {', '.join(map(str, np.flatnonzero(constant)[:10]))} "
+            "are constant; exclude them"
         )
 
 
@@ -220,8 +220,8 @@ def mean_profiles(maps: Float, settings: RegistrationSettings) -> Float:
     bad = np.flatnonzero(empty.mean(axis=1) > settings.max_gap)
     if len(bad):
         raise ModelError(
-            f"registration: rows {', '.join(map(str, bad[:10]))} of the maps lack more than"
-            f" {settings.max_gap:.0%} of the profile; leave them out"
+            f"registration: rows {', '.join(map(str, bad[:10]))} of the maps lack more than "
+            f"{settings.max_gap:.0%} of the profile; exclude them"
         )
     nodes = np.arange(maps.shape[1])
     for row in np.flatnonzero(empty.any(axis=1)):  # few
@@ -240,9 +240,9 @@ def shift_difference(
 ) -> dict[str, float | int]:
     """Compare displacements between groups, at all nodes along x at once.
 
-    Warps of one person are averaged first. F of a one-way analysis of variance at each node; the
-    largest is compared with those after permuting people over the groups, so that the error rate
-    is that of the whole sheet (Westfall and Young 1993).
+    Warps of one participant are averaged first. F of a one-way analysis of variance at each node;
+    the largest is compared with the largest after permuting participants over the groups, so that
+    the error rate holds for the whole sheet (Westfall and Young 1993).
 
     Parameters
     ----------
@@ -251,7 +251,7 @@ def shift_difference(
     groups : sequence of str
         Group of each sheet.
     people : ndarray
-        (sheets,) person of each sheet; the group is the same in all of one person's.
+        (sheets,) participant of each sheet; all sheets of a participant have one group.
     permutations : int
     seed : int
     """

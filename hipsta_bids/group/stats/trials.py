@@ -22,7 +22,7 @@ _TURNS = 200  # of the fixed point of the level; it settles in some tens
 
 @dataclass(frozen=True, kw_only=True)
 class Reference:
-    """What a reference cohort says about some measures or points."""
+    """Estimates of a reference cohort, of some measures or points."""
 
     n: NDArray[np.int64]
     """Participants with a value."""
@@ -55,8 +55,7 @@ class TrialEffect:
     def __post_init__(self) -> None:
         if self.kind == SLOWING and not self.visits:
             raise UsageError(
-                "--power slowing= is about change over time; say when the trial measures, as"
-                " --visits 0,12,24"
+                "--power slowing= needs visits; name the months of the trial, as --visits 0,12,24"
             )
 
     @property
@@ -82,8 +81,9 @@ def sample_size(
 
     With one visit the end point is a participant's value. With several it is the slope by least
     squares over the visits, as in a mixed model with random slopes and complete data: its variance
-    is that of true slopes plus that within participants over the sum of squared times (Ard and
-    Edland 2011). The test is Student's for two groups, so that power is that of the non-central t.
+    is the variance of true slopes plus the variance within participants over the sum of squared
+    times (Ard and Edland 2011). The test is Student's for two groups, so that power follows the
+    non-central t.
     """
     sd = endpoint_sd(effect, reference)
     difference = _difference(effect, reference.mean, reference.slope)
@@ -128,7 +128,7 @@ def endpoint_sd(effect: TrialEffect, reference: Reference) -> Float:
 
 
 def information_left(effect: TrialEffect, reference: Reference, dropout: float) -> Float:
-    """Information that a participant who is enrolled gives on average, over that of all visits.
+    """Mean information of an enrolled participant, over the information of all visits.
 
     A constant hazard leaves ``1 - dropout`` at the last visit, and who leaves is in the mixed model
     with the visits before: the information of a pattern is the inverse variance of its slope, if
@@ -187,7 +187,8 @@ def point_level(rules: MultiplicitySettings, plan: PowerSettings) -> float:
     at the level t, a share a P + (1 - a) t of the points is found. The procedure of Benjamini and
     Hochberg has then t = q (a P + (1 - a) t), which gives t (Jung 2005; Liu and Hwang 2007). The
     two-stage procedure does it with q / (1 + q), and again with q / (1 + q) over the share of
-    points not found in the first stage; its power in the first stage is that of the level there.
+    points not found in the first stage; its power in the first stage is the power at the level
+    there.
     """
     if rules.method not in {"fdr2", "bh"}:
         raise UsageError(
@@ -218,11 +219,10 @@ def repeatability(
 
     The variance is split between and within participants; NaN where it cannot be.
 
-    Where one session is missing, the participant is left out at that point; points with fewer
+    Where one session is missing, the participant is excluded at that point; points with fewer
     complete participants than ``least`` are NaN. The within-subject SD is the root of the mean
-    variance of a participant's values (Bland and Altman 1996), its limits those of chi squared.
-    ICC(2,1) is that of Shrout and Fleiss (1979), with the limits of McGraw and Wong (1996, table 7,
-    ICC(A,1)).
+    variance of a participant's values (Bland and Altman 1996), with limits of chi squared. ICC(2,1)
+    follows Shrout and Fleiss (1979), with the limits of McGraw and Wong (1996, table 7, ICC(A,1)).
     """
     k = values.shape[1]
     complete: Bool = np.asarray(np.isfinite(values).all(axis=1))

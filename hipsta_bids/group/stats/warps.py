@@ -65,7 +65,7 @@ def _along(knots: Float, coefficients: Float, places: Float) -> tuple[Float, Flo
 class Template:
     """A mean profile and the directions in which single ones differ from it.
 
-    Frozen, it takes in new subjects without changing those before.
+    Frozen, it takes in new subjects without changing earlier ones.
     """
 
     knots: Float

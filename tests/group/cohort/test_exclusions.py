@@ -87,7 +87,7 @@ def test_a_table_of_ratings_may_stand_for_one_of_exclusions(study):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        (None, "no such file"),
+        (None, "file not found"),
         ("participant_id\themi\nsub-01\tL\n", "no column rating"),
         ("hemi\trating\nL\tuse\n", "no column participant_id"),
         ("participant_id\trating\nsub-01\tuse\nsub-02\tbad\n", "line 3: 'bad' is no rating; use,"),

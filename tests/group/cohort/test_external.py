@@ -111,7 +111,7 @@ def test_named_surface_and_its_refusals(tmp_path):
         find_and_read(tmp_path, pattern, surfaces=[(None, "small.surf.gii")])
     with pytest.raises(InputError, match=r"no file none\.surf\.gii"):
         find_and_read(tmp_path, pattern, surfaces=[(None, "none.surf.gii")])
-    with pytest.raises(InputError, match="no surface of 50 vertices lies beside"):
+    with pytest.raises(InputError, match=r"50 values fit neither sheets .* nor a surface beside"):
         find_and_read(tmp_path, pattern)
     with pytest.raises(InputError, match="is no surface"):
         read_mesh(tmp_path / "sub-1_lh.shape.gii")

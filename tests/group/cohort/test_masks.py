@@ -88,4 +88,4 @@ def test_wrong_tables_are_refused_in_one_line(study, tmp_path, capsys, text, sai
     assert said in error
     assert error.count("\n") == 1
     assert run(study, "wrong", "--mask", tmp_path / "none.tsv")[0] == ExitCode.BAD_DATA
-    assert "no such file" in capsys.readouterr().err
+    assert "file not found" in capsys.readouterr().err

@@ -201,7 +201,7 @@ def test_frozen_template_gives_the_same_warps_to_a_part_of_the_subjects(results,
         ("noise", float("nan"), "noise is nan, but has to be a finite number"),
         ("mean", [1.0], "knots, mean and components do not fit each other"),
         ("knots", [0.9, 0.1, 0.2, 0.3], "numbers that rise"),
-        ("center", [0.2, 1.0], "center does not go from 0 to 1"),
+        ("center", [0.2, 1.0], "center does not run from 0 to 1"),
         ("center", [0.0, 1.0], "the template has 2 nodes along x"),
         (None, [], "it has no Hemispheres"),
     ],
@@ -274,8 +274,8 @@ def test_hemispheres_to_look_at_are_told(dataset, quick, capsys):
     files.write_json(path, json.loads(before) | {"decision": "look"})
     assert main([str(data), str(out), "group", *quick, "--name", "flagged"]) == 0
     said = capsys.readouterr().out
-    assert "note: 1 hemispheres are in it that a person should look at first" in said
-    assert f"what was done and found: {out / 'group' / 'flagged.html'}\n" in said
+    assert "note: 1 hemispheres to look at first are included without a rating" in said
+    assert f"report: {out / 'group' / 'flagged.html'}\n" in said
     # The time of each stage, as it ends.
     timed = re.findall(r"^  ([\w -]+?) +\d+\.\d s$", said, re.MULTILINE)
     assert timed[:3] == ["reading", "registration", "models"]

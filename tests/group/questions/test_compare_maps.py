@@ -354,7 +354,7 @@ def test_thickness_that_nobody_has_is_left_out_by_file(study, capsys):
     options = ["--maps", f"thickness={PATTERNS[1]}", "--no-reports", "--name", "few"]
     assert run(study, *options, out="alone") == 0
     said = capsys.readouterr().out
-    assert f"note: {path}: thickness reaches -1 mm, which no sheet does; left out" in said
+    assert f"note: {path}: thickness reaches -1 mm, which no sheet does; excluded" in said
     assert statmap(study / "alone" / "group" / "few", "L", "thickness").n.max() == COUNT - 1
 
 

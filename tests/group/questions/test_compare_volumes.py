@@ -106,7 +106,7 @@ def test_freesurfer_volumes_join_by_themselves(study, capsys):
     assert run(study) == 0
     said = capsys.readouterr().out
     assert "note: volumes freesurfer: 58 tables" in said
-    assert "volumes of sub-04 are left out" in said
+    assert "volumes of sub-04 are excluded" in said
     rows = measures(study)
     own = rows[rows.measure == "volume_freesurfer_CA1_body"].set_index("hemi")
     assert own.n.to_dict() == {"L": COUNT - 2, "R": COUNT - 1, "LR": COUNT - 2}

@@ -180,7 +180,7 @@ def test_every_number_is_about_the_same_participants(cohort, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ((), "group=AD holds fewer than 13 participants; merge levels, or leave group out"),
+        ((), "group=AD holds fewer than 13 participants; merge levels, or remove group"),
         (("--formula", "group + scale(age)"), "with scale() has other columns at each site"),
         (("--formula", "group", "--contrast", "g = group[CN], group[AD]"), "contrast"),
     ],
@@ -381,7 +381,11 @@ def test_wrong_use_is_one_line(plain, tmp_path, capsys):
         ([first], 64, "two sites or more"),
         ([first, first], 64, "are the same summary"),
         ([f"x={first}", f"x={second}"], 64, "two sites are called x"),
-        ([first, second, "--settings", str(permuted)], 64, "nobody to permute"),
+        (
+            [first, second, "--settings", str(permuted)],
+            64,
+            "summaries have no participants to permute",
+        ),
         ([first, str(tmp_path / "none.json")], 65, "no summary"),
     ):
         assert main(["meta", *arguments, str(tmp_path / "out")]) == code

@@ -230,7 +230,7 @@ def test_repeated_sessions(tmp_path, quick, capsys):
         )
     call[call.index("site")] = "place"
     assert main([*call, "--paired", "1", "2"]) == 65
-    assert "sub-01 changed place between the sessions" in capsys.readouterr().err
+    assert "sub-01 changed place between sessions" in capsys.readouterr().err
 
 
 def relabel(rows, sites):
@@ -241,14 +241,14 @@ REFUSED = {
     "groups are sites": (
         lambda rows: relabel(rows, [row[1] for row in rows]),
         [],
-        "site and group[T.AD] cannot be told apart",
+        "group[T.AD] does not vary within sites",
     ),
     "one of few": (
         lambda rows: relabel(rows, ["C", *(row[4] for row in rows[1:])]),
         [],
-        "too few participants in C (1); at least 10",
+        "too few participants in C (1) (least 10)",
     ),
-    "one site": (lambda rows: relabel(rows, ["A"] * N), [], "have site A; leave it out"),
+    "one site": (lambda rows: relabel(rows, ["A"] * N), [], "have site A; remove --harmonize"),
     "no site in the model": (
         lambda rows: rows,
         ["--formula", "group + age"],
@@ -262,12 +262,12 @@ REFUSED = {
     "what is tested": (
         lambda rows: rows,
         ["--harmonize", "group"],
-        "contrast CN-AD is about what it takes out",
+        "contrast CN-AD tests an effect that is removed",
     ),
     "sites alone": (
         lambda rows: rows,
         ["--formula", "site"],
-        "contrast site[T.B] is about what it takes out",
+        "contrast site[T.B] tests an effect that is removed",
     ),
     "unknown column": (
         lambda rows: rows,
@@ -317,7 +317,7 @@ SPOILED = {
         65,
         "shift of thickness, L, has (1, 147)",
     ),
-    "points": (fewer_points, 65, "has 146 points, those of these participants 147"),
+    "points": (fewer_points, 65, "has 146 points, these participants 147"),
     "text": (lambda c: thickness(c, mean="os"), 65, "mean is 'os', but has to be a list"),
     "negative": (
         lambda c: thickness(c, sd=[-1.0] * 147),

@@ -135,7 +135,7 @@ def test_each_kind_of_mix_is_refused_or_named(tmp_path, call, field):
     (warning,) = result.lines
     said = f"hemispheres differ in {field}: {counts}; association with group p 0.002 (Fisher's"
     assert warning.startswith(f"warning: {said}")
-    assert warning.endswith(f"effects of group may be those of {field}")
+    assert warning.endswith(f"effects of group may be effects of {field}")
     assert result.record["settings"]["design"]["mixed"] == [field]
     (text,) = result.record["mixes"]
     assert text == warning.removeprefix("warning: ")
@@ -246,7 +246,7 @@ def test_sides_of_different_kinds(tmp_path, call):
     assert "differ in edited: mask (12), n/a (12)" in refused(call, dataset, "--asymmetry")
     (line,) = call(dataset, "--asymmetry", "--mixed", "edited").lines
     assert "with side p < 0.001 (Fisher's exact test)" in line
-    assert line.endswith("effects of side may be those of edited")
+    assert line.endswith("effects of side may be effects of edited")
     # All participants are of the same kind: both.
     assert "with group" not in line
 
@@ -281,7 +281,7 @@ def test_visits_of_different_kinds(tmp_path, call, options, term):
     (line,) = result.lines
     assert f"{text}; association with" in line
     assert f"with {term} p < 0.001 (" in line
-    assert "may be those of version" in line
+    assert "may be effects of version" in line
     assert line.removeprefix("warning: ") in result.methods
 
 
@@ -392,4 +392,4 @@ def test_tests_are_those_of_participants(tmp_path, call):
     exact = stats.fisher_exact(np.array(counts), method=random).pvalue
     assert f"with sex p {exact:.3f} (Fisher's exact test)" in line
     assert f_test.pvalue < 0.05 < exact
-    assert line.endswith("; effects of age may be those of analysis")
+    assert line.endswith("; effects of age may be effects of analysis")

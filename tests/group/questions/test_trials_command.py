@@ -184,7 +184,7 @@ def test_retest_feeds_sample_sizes(dataset):
     np.testing.assert_allclose(sizes.sd_endpoint, np.sqrt(2) * agreed.sd_within, rtol=1e-8)
     np.testing.assert_allclose(sizes.arm_difference, 0.05 * agreed["mean"], rtol=1e-8)
     record = json.loads((folder / "analysis.json").read_text())
-    assert any("variance of measurement alone" in note for note in record["notes"])
+    assert any("include only the variance of measurement" in note for note in record["notes"])
 
 
 def test_maps_of_other_programs_lie_on_their_surface(tmp_path):
@@ -236,7 +236,7 @@ def test_harmonization_of_the_settings_is_refused(dataset, tmp_path, capsys):
     data, out = dataset
     asked = ["--power", "thinning=5%", "--settings", str(settings)]
     assert main([str(data), str(out), "group", *asked]) == 64
-    assert "nothing is harmonized" in capsys.readouterr().err
+    assert "harmonization is not possible" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -250,13 +250,13 @@ def test_harmonization_of_the_settings_is_refused(dataset, tmp_path, capsys):
         (["--power", "thinning=5%", "--visits", "12"], 64, "two or more"),
         (["--power", "thinning=5%", "--dropout", "1"], 64, "dropout"),
         (["--power", "thinning=5%", "--correction", "permutation-max"], 64, "fdr2 or bh"),
-        (["--power", "thinning=5%", "--paired", "1", "2"], 64, "--paired: has no meaning"),
-        (["--retest", "--harmonize", "site"], 64, "--harmonize: has no meaning with --retest"),
+        (["--power", "thinning=5%", "--paired", "1", "2"], 64, "--paired: has no effect"),
+        (["--retest", "--harmonize", "site"], 64, "--harmonize: has no effect with --retest"),
         (["--visits", "0,12"], 64, "without --retest or --power"),
         (["--retest", "--dropout", ".1"], 64, "without --power"),
-        (["--retest", "--formula", "age"], 64, "--formula: has no meaning with --retest"),
+        (["--retest", "--formula", "age"], 64, "--formula: has no effect with --retest"),
         (["--retest", "--session-label", "1"], 65, "no second session"),
-        (["--retest", "--participant-label", "01", "02"], 65, "at least 5 are needed"),
+        (["--retest", "--participant-label", "01", "02"], 65, "of 5 needed"),
         (["--retest", "--among", "group=MCI"], 65, "there are AD, CN"),
         (["--retest", "--among", "sexx=F"], 65, "did you mean sex"),
         (
