@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 
 from hipsta_bids.cli.commands import (
+    figure_parser,
     meta_parser,
     phantom_parser,
     resample_parser,
@@ -297,6 +298,7 @@ def options_page() -> str:
         ("hipsta-bids phantom", phantom_parser()),
         ("hipsta-bids surrogate", surrogate_parser()),
         ("hipsta-bids meta", meta_parser()),
+        ("hipsta-bids figure", figure_parser()),
         ("hipsta-bids resample", resample_parser()),
     ):
         parts.append(f"## {title}")

@@ -1,8 +1,8 @@
 """Which hemispheres of the participant level enter the group level, and which are left out, why."""
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from sys import intern
 from typing import Any
@@ -140,7 +140,7 @@ def collect_sheets(request: GroupRequest, *, may_lack: bool = False) -> Collecti
     _refuse_twice(places)
     choices = Choices(request.exclude_table, request.ratings)
     records: list[SheetRecord] = []
-    left_out: list[Exclusion] = []
+    left_out = [exclusion for root in roots for exclusion in _excluded_labels(root, request)]
     quality = []
     for result in sorted(places, key=_key):
         record = hemisphere.read_record(result)
@@ -226,6 +226,20 @@ def _wanted_results(root: Path, request: GroupRequest) -> list[hemisphere.Result
         for result in hemisphere.list_results(root)
         if request.wants(result.name.subject, result.name.session)
     ]
+
+
+def _excluded_labels(root: Path, request: GroupRequest) -> Iterator[Exclusion]:
+    """List the hemispheres of participants whom --exclude-participant-label names."""
+    included = replace(request, excluded=()) if request.excluded else request
+    for result in hemisphere.list_results(root) if request.excluded else ():
+        name = result.name
+        is_same = (name.region, name.seg) == (request.region, request.seg or name.seg)
+        if (
+            is_same
+            and name.subject in request.excluded
+            and included.wants(name.subject, name.session)
+        ):
+            yield Exclusion.of_sheet(name, "listed", "--exclude-participant-label")
 
 
 def _other_regions(

@@ -131,7 +131,7 @@ class Terms:
         return None, ""
 
     def _marginal(self, free: Sequence[str], fixed: Mapping[str, str], contrast: str) -> Float:
-        """Reduce a reference grid: differences of free factors, slopes of free numbers, means."""
+        """Reduce a reference grid: slopes of numbers, and reference minus level of factors."""
         axes: dict[str, Sequence[object]] = {}
         reductions = []
         for name in map(str, self.table.columns):
@@ -153,7 +153,7 @@ class Terms:
                 axes[name] = axes[name] if is_pair else [middle]
             n = len(axes[name])
             if name in free:
-                reductions.append(np.hstack([-np.ones((size - 1, 1)), np.eye(size - 1)]))
+                reductions.append(np.hstack([np.ones((size - 1, 1)), -np.eye(size - 1)]))
             else:
                 reductions.append(np.full((1, n), 1 / n))
         rows = self._evaluate(axes, contrast)

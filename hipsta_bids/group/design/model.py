@@ -304,7 +304,12 @@ def interactions(formula: str) -> list[str]:
         return []
     variables = (closed_formula(term_text(term)).names for term in terms)
     sets = {frozenset(names): names for names in variables if len(names) > 1}
-    return [":".join(f"`{name}`" for name in names) for names in sets.values()]
+    plain = (":".join(names) for names in sets.values())
+    quoted = (":".join(f"`{name}`" for name in names) for names in sets.values())
+    return [
+        name if all(map(str.isidentifier, name.split(":"))) else f"{name} = {text}"
+        for name, text in zip(plain, quoted, strict=True)
+    ]
 
 
 def folder_name(formula: str, measures: tuple[str, ...] = ()) -> str:

@@ -89,3 +89,14 @@ def test_participants_without_any_sheet_count(tmp_path):
     record = json.loads((out / "group" / "q" / "analysis.json").read_text())
     assert any("the decision differs between groups" in note for note in record["notes"])
     assert files.read_json(out / "group" / "q" / "quality.json")["hemispheres"]["Description"]
+
+
+def test_excluded_labels_are_listed_among_exclusions(tmp_path):
+    data, out = write_dataset(tmp_path)
+    options = ["--exclude-participant-label", "03", "--name", "without", *FAST]
+    assert main([str(data), str(out), "group", *options]) == 0
+    rows = table(out / "group" / "without" / "excluded.tsv")
+    assert rows.participant_id.tolist() == ["sub-03", "sub-03"]
+    assert set(rows.message) == {"--exclude-participant-label"}
+    assert main([str(data), str(out), "group", "--name", "all", *FAST]) == 0
+    assert not len(table(out / "group" / "all" / "excluded.tsv"))

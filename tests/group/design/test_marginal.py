@@ -152,7 +152,7 @@ def test_cells_and_conditions():
             cells["CN", "F", middle] + cells["CN", "M", middle]
         )
         / 2,
-        "sex | group=AD": cells["AD", "M", middle] - cells["AD", "F", middle],
+        "sex | group=AD": cells["AD", "F", middle] - cells["AD", "M", middle],
     }
     found = estimate("group * sex * age", *cases)
     for (text, weights), test in zip(cases.items(), found.values(), strict=True):
@@ -187,7 +187,7 @@ def test_interactions_are_tested_without_being_asked_for():
     ):
         document = model_document(ModelRequest(formula=formula), table, groups, GroupSettings())
         names = [contrast.name for contrast in parse_model(document).contrasts]
-        assert [name.replace("`", "") for name in names] == ["CN-AD", "CN-MCI", *expected]
+        assert names == ["CN-AD", "CN-MCI", *expected]
         design = build_design(table, parse_model(document), DesignSettings(), {"group": "CN"})
         assert len(design.contrasts) == 2 + len(expected)
 
