@@ -1,7 +1,7 @@
 """Which hemispheres of the participant level enter the group level, and which are left out, why."""
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from sys import intern
@@ -141,11 +141,12 @@ def collect_sheets(request: GroupRequest, *, may_lack: bool = False) -> Collecti
     choices = Choices(request.exclude_table, request.ratings)
     records: list[SheetRecord] = []
     left_out = [exclusion for root in roots for exclusion in _excluded_labels(root, request)]
-    quality = []
+    quality, digests = [], []
     for result in sorted(places, key=_key):
         record = hemisphere.read_record(result)
         entry = _judge(result, record, request, choices)
         quality.append(_quality(result.name, record, choices))
+        digests.append((result.name, _digest(record)))
         if isinstance(entry, Exclusion):
             left_out.append(entry)
         else:
@@ -164,11 +165,11 @@ def collect_sheets(request: GroupRequest, *, may_lack: bool = False) -> Collecti
         settings_hash=digest,
         quality=pd.DataFrame(quality),
         versions=tuple(sorted({record.version for record in records})),
-        ratings=choices.counts((result.name, _digest(result)) for result in places),
+        ratings=choices.counts(digests),
         notes=(
             *notes,
-            *choices.excluded.notes((result.name, _digest(result)) for result in results),
-            *choices.rated.notes((result.name, _digest(result)) for result in results),
+            *choices.excluded.notes(_with_digests(results)),
+            *choices.rated.notes(_with_digests(results)),
         ),
         warnings=_several_versions(records),
     )
@@ -183,14 +184,21 @@ def _quality(
         SESSION: f"ses-{name.session}" if name.session else None,
         "side": name.hemi,
         "decision": str(record.get("decision")),
-        "rating": choices.rating(name, record.get("input_hash")),
+        "rating": choices.rating(name, _digest(record)),
     }
 
 
-def _digest(result: hemisphere.ResultPlace) -> str | None:
-    """Hash of a hemisphere's input and settings, if its record has one."""
-    digest = hemisphere.read_record(result).get("input_hash")
+def _digest(record: Mapping[str, Any]) -> str | None:
+    """Return the hash of a hemisphere's input and settings, if its record has one."""
+    digest = record.get("input_hash")
     return None if digest is None else str(digest)
+
+
+def _with_digests(
+    results: Iterable[hemisphere.ResultPlace],
+) -> Iterator[tuple[HemisphereName, str | None]]:
+    """Return the names of hemispheres with the hashes of their records, as they are asked for."""
+    return ((result.name, _digest(hemisphere.read_record(result))) for result in results)
 
 
 def _several_versions(records: Sequence[SheetRecord]) -> tuple[str, ...]:
@@ -305,7 +313,7 @@ def _judge(
 ) -> SheetRecord | Exclusion:
     decision = record.get("decision")
     reason, message = record.get("reason") or str(decision), record.get("message") or ""
-    rated = result.name, record.get("input_hash")
+    rated = result.name, _digest(record)
     unwanted = choices.reason_to_leave_out(*rated)
     if unwanted is not None:
         reason, message = unwanted
