@@ -37,6 +37,7 @@ from hipsta_bids import __version__
 from hipsta_bids.io import files
 from hipsta_bids.phantom import Phantom
 from hipsta_bids.types import Float
+from validation.report import commit
 
 HIPSTA = "hipsta"
 #: Programs by name in the tables; the others are values of ``--method``.
@@ -407,18 +408,6 @@ def write_tables(folder: Path, tables: Mapping[str, pd.DataFrame], command: str,
         "libraries": {"python": about["python"], "Hipsta": peer, **about["versions"]},
     }
     files.write_json(folder / "beside-hipsta.json", record)
-
-
-def commit() -> str:
-    """Return the commit of this checkout; a change that is not committed shows as ``-dirty``."""
-    command = ["git", "describe", "--always", "--dirty", "--exclude", "*"]
-    try:
-        done = subprocess.run(  # noqa: S603  (a fixed command)
-            command, cwd=Path(__file__).parent, capture_output=True, text=True, check=False
-        )
-    except OSError:
-        return files.MISSING
-    return done.stdout.strip() or files.MISSING
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -3,10 +3,14 @@
 import json
 import os
 import platform
+import sys
 from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
+
+# A benchmark runs as a file, which leaves the checkout and its validation off the path.
+sys.path.append(str(Path(__file__).resolve().parents[1]))
 
 _LIBRARIES = ("hipsta_bids", "numpy", "scipy", "scikit-image", "tetgen")
 
