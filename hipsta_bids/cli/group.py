@@ -102,7 +102,12 @@ def _add_sheets(parser: Parser) -> None:
         " surface beside a map, or the grid of the sheets)",
         type=_maybe_named,
     )
-    add("--seg", "NAME", "segmentation protocol, where there are several")
+    add(
+        "--seg",
+        "NAME...",
+        "segmentation protocol, where there are several; two or more are analyzed each, and "
+        "compared",
+    )
     add(
         "--mixed",
         "FIELD...",
@@ -457,6 +462,7 @@ def _options(parsed: argparse.Namespace, arguments: Sequence[str]) -> "GroupOpti
         parsed,
         roots=tuple(dict.fromkeys(parsed.derivatives)) or (parsed.output_dir,),
         subjects=tuple(parsed.participant_label),
+        seg=next(iter(parsed.seg), None),
         excluded=tuple(parsed.exclude_participant_label),
         sessions=tuple(parsed.session_label),
         exclude_table=parsed.exclude,

@@ -61,6 +61,8 @@ class GroupOptions:
     export_summary: str | None = None
     """Name of this site in a summary for other sites, empty for that of the folder; ``None`` for no
     summary."""
+    part: str = ""
+    """End of the folder's name: of one analysis of several."""
     reports: bool = True
     """Whether a page is made."""
     figures: bool = False
@@ -217,6 +219,7 @@ class Study:
         warnings = (*collection.warnings, *self.mixes)
         region = options.sheets.region
         name = options.model.name or (name if region == "body" else f"{name}_{region}")
+        name += options.part
         _describe_dataset(options)
         final = options.out_dir / write.GROUP_FOLDER / name
         with write.whole_folder(final) as folder:
