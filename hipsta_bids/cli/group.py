@@ -103,6 +103,12 @@ def _add_sheets(parser: Parser) -> None:
         type=_maybe_named,
     )
     add(
+        "--maps-crop",
+        "",
+        "crop --maps to the sheets: sample them at the nodes of each participant's sheet, by "
+        "surfaces in scanner space",
+    )
+    add(
         "--seg",
         "NAME...",
         "segmentation protocol, where there are several; two or more are analyzed each, and "

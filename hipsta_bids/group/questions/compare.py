@@ -124,6 +124,11 @@ def _analyze(options: studies.GroupOptions, settings: GroupSettings) -> studies.
             region=options.sheets.region,
             ratings=study.collection.ratings,
             labels=study.labels,
+            cropped=[
+                name
+                for name, pattern in options.maps
+                if options.maps_crop and name in study.maps and not pattern.endswith(".tsv")
+            ],
         )
         files.write_json(folder / "model.json", document)
         if len(quality):
