@@ -196,7 +196,7 @@ def test_maps_of_one_analysis_are_compared_by_name(compared, tmp_path):
     assert rows["measure"].unique().tolist() == ["thickness"]
     assert not (tmp_path / "maps" / "effects.tsv").exists()
     assert (tmp_path / "maps" / "figures" / "thickness_maps.pdf").stat().st_size > 1000
-    assert '<th scope="col">Map</th>' in (tmp_path / "maps.html").read_text()
+    assert "own, map thickness" in (tmp_path / "maps.html").read_text()
 
 
 def test_refusals_name_the_problem(compared, tmp_path, capsys):
