@@ -179,6 +179,7 @@ def test_page_links_analyses_and_figure_names_subfields_of_each(compared):
     assert not page.open
     assert not page.unlabeled
     assert "could not be" not in text
+    assert "<h3>Thickness: effect maps</h3>" in text
     for seg in PROTOCOLS:
         assert f"{MODEL}_seg-{seg}.html" in page.addresses
     figure = (group / MODEL / "figures" / "thickness_maps.svg").read_text()
