@@ -102,9 +102,11 @@ def compare_analyses(
         "classification": agreement.joined_tables(entries, "classification", _PAIRS),
         "agreement": agreement.agreement_table(entries),
     }
-    if not len(tables["agreement"]) and not len(tables["effects"]):
+    effects = tables["effects"]
+    tests = effects.groupby(["contrast", "measure"])["analysis"].nunique() if len(effects) else [0]
+    if not len(tables["agreement"]) and max(tests) < 2:  # noqa: PLR2004 -- analyses
         raise ModelError(
-            "compare: no contrast of the same name in two analyses; use the same --contrast"
+            "compare: two analyses have no contrast of one name; give both the same --contrast"
         )
     notes = list(agreement.differences(entries))
     table = tables["agreement"]

@@ -219,6 +219,12 @@ def test_refusals_name_the_problem(compared, tmp_path, capsys):
     ):
         assert main(["compare", *words]) == code
         assert text in capsys.readouterr().err
+    data, out, options = compared
+    age = ("--formula", "group + age + sex", "--contrast", "age", "--no-classification")
+    call = (*options, *age, "--seg", "fs", "--name", "age")
+    assert main([str(data), str(out), "group", *call]) == 0
+    assert main(["compare", first, str(group / "age"), str(tmp_path / "out")]) == 65
+    assert "no contrast of one name" in capsys.readouterr().err
     trial = [str(compared[0]), str(compared[1]), "group", "--retest", "--seg", "ashs", "fs"]
     assert main(trial) == 64
     assert "name one protocol with --retest" in capsys.readouterr().err
