@@ -95,6 +95,8 @@ def group(folder: Path) -> None:
         shared_template = ["--template", out / "group" / "site-one" / "template.json"]
         sites.append(f"{site}={out}/group/site-{site}/summary.json")
     command("meta", *sites, folder / "group" / "meta")
+    analyses = (out / "group" / name for name in ("site-one", "site-two"))
+    command("compare", *analyses, folder / "group" / "both")
 
 
 CASES: dict[str, Callable[[Path], None]] = {"demo": demo, "shared": shared, "group": group}

@@ -56,6 +56,15 @@ def meta_parser() -> Parser:
     return parser
 
 
+def compare_parser() -> Parser:
+    """Describe ``hipsta-bids compare``."""
+    parser, add = parser_of("compare")
+    add("analyses", "FOLDER", nargs="+")
+    add("out", "OUT", type=Path)
+    add("--figures")
+    return parser
+
+
 def resample_parser() -> Parser:
     """Describe ``hipsta-bids resample``."""
     parser, add = parser_of("resample")
@@ -235,6 +244,21 @@ def _site(text: str) -> tuple[str | None, Path]:
     if equals and name and "/" not in name:
         return name, Path(path)
     return None, Path(text)
+
+
+def run_compare(arguments: Sequence[str]) -> ExitCode:
+    """Compare finished analyses."""
+    options = compare_parser().parse_intermixed_args(arguments)
+    from hipsta_bids.group.questions.several import check_folder, compare_analyses  # noqa: PLC0415  (heavy)
+
+    check_folder(options.out)
+    analyses = [_site(text) for text in options.analyses]
+    command = "hipsta-bids", "compare", *arguments
+    for note in compare_analyses(analyses, options.out, command, figures=options.figures):
+        echo(f"note: {note}")
+    echo(f"results: {options.out}")
+    echo(f"report: {options.out}.html")
+    return ExitCode.OK
 
 
 def draw_figure(arguments: Sequence[str]) -> ExitCode:

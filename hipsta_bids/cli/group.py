@@ -102,7 +102,18 @@ def _add_sheets(parser: Parser) -> None:
         " surface beside a map, or the grid of the sheets)",
         type=_maybe_named,
     )
-    add("--seg", "NAME", "segmentation protocol, where there are several")
+    add(
+        "--maps-crop",
+        "",
+        "crop --maps to the sheets: sample them at the nodes of each participant's sheet, by "
+        "surfaces in scanner space",
+    )
+    add(
+        "--seg",
+        "NAME...",
+        "segmentation protocol, where there are several; two or more are analyzed each, and "
+        "compared",
+    )
     add(
         "--mixed",
         "FIELD...",
@@ -457,6 +468,7 @@ def _options(parsed: argparse.Namespace, arguments: Sequence[str]) -> "GroupOpti
         parsed,
         roots=tuple(dict.fromkeys(parsed.derivatives)) or (parsed.output_dir,),
         subjects=tuple(parsed.participant_label),
+        seg=next(iter(parsed.seg), None),
         excluded=tuple(parsed.exclude_participant_label),
         sessions=tuple(parsed.session_label),
         exclude_table=parsed.exclude,

@@ -34,6 +34,7 @@ COMMANDS = {
     "phantom": ("write_phantoms", "DIR", "write a synthetic cohort with a known effect"),
     "surrogate": ("run_surrogate", "IN OUT", "measure thickness in single slices to check maps"),
     "meta": ("run_meta_analysis", "SITE... OUT", "combine summaries of sites (group level)"),
+    "compare": ("run_compare", "FOLDER... OUT", "compare finished analyses (group level)"),
     "figure": ("draw_figure", "WHAT OUT", "draw a figure for a paper from results"),
     "resample": ("run_resample", "MAP... OUT", "move maps to HippUnfold's surfaces, or from there"),
     "validate": ("run_validation", "", None),

@@ -130,6 +130,10 @@ def run_comparison(
             f" {multiplicity.alpha:g}; at least {math.ceil(1 / multiplicity.alpha)}"
             " are needed, and thousands are better"
         )
+    if protocols := tuple(dict.fromkeys(parsed.seg))[1:]:
+        from hipsta_bids.group.questions.several import run_protocols  # noqa: PLC0415  (heavy)
+
+        return run_protocols(options, settings, (parsed.seg[0], *protocols))
     return run_group(options, settings)
 
 
@@ -141,6 +145,8 @@ def run_question(
     if len(flags) > 1 and flags != ["--retest", "--power"]:
         raise UsageError(f"give one of {', '.join(flags)}")
     _refuse(parsed, _COMPARISON_ONLY, f"with {' and '.join(flags)}")
+    if len(set(parsed.seg)) > 1:
+        raise UsageError(f"--seg: name one protocol with {' and '.join(flags)}")
     if settings.harmonization.column:
         raise UsageError(
             f"{' and '.join(flags)}: harmonization is not possible; remove "

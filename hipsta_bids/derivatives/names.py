@@ -233,6 +233,9 @@ TRIAL_MAPS: dict[str, tuple[str, str, str]] = {
 #: Folder and page of a meta-analysis, in an output folder of its own.
 META, META_REPORT = "meta", "meta.html"
 
+#: Record of a comparison of analyses, in its folder.
+COMPARISON = "comparison.json"
+
 #: Lines of ``.bidsignore``, and why BIDS has no name for what each hides.
 IGNORED: dict[str, str] = TEXTS["ignored"]
 

@@ -225,6 +225,18 @@ def _sections_of_groups(results: GroupResults) -> Mapping[str, Any] | None:
     return {"picture": pictures[0]} if pictures else None
 
 
+def _surrogate(results: GroupResults) -> Mapping[str, Any] | None:
+    """Show thickness in single slices by group."""
+    title = "Surrogate thickness by group"
+    pictures = embedded(results, "surrogate", title, f"{title}, with limits of the means")
+    text = (
+        "Thickness from the medial axis of single slices, without a mesh (`hipsta-bids surrogate`)."
+        " Means are not adjusted for covariates. Limits hold at each point, not for whole curves."
+    )
+    about = {"title": title, "text": text, "file": "surrogate.tsv", "columns": [], "rows": []}
+    return {**about, "pictures": pictures} if pictures else None
+
+
 def methods(results: GroupResults) -> Mapping[str, Any] | None:
     """Take the methods paragraph apart for the page."""
     path = results.folder / "methods.md"
@@ -266,6 +278,7 @@ SECTIONS: tuple[Section[GroupResults], ...] = (
     Section("registration", "Registration", "group/registration.html", _registration),
     Section("harmonization", "Harmonization", "group/harmonization.html", _harmonization),
     Section("sections", "Average cross-sections", "group/sections.html", _sections_of_groups),
+    Section("surrogate", "Surrogate thickness", "comparison/table.html", _surrogate),
     Section("methods", "Methods paragraph", "group/methods.html", methods),
     Section("origin", "Origin", "group/origin.html", origin),
 )

@@ -26,6 +26,7 @@ _THICKNESS = ("thickness_mean", "thickness_nodes")
 _TEXT = (
     *("measure", "unit", "contrast", "hemi", "group", "subfield", "shares", "test", "effect"),
     *("file", "model", "control", "case", "base", "added", "classifier", "region"),
+    *("analysis", "other", "seg", "groups", "formula", "correction"),
     *("participant_id", "session_id", "reason", "message", "site", "kind", "version", "template"),
 )
 

@@ -11,7 +11,13 @@ from stand_ins import make_input, stand_in_job
 
 from hipsta_bids import __version__
 from hipsta_bids.cli import main
-from hipsta_bids.cli.commands import meta_parser, phantom_parser, resample_parser, surrogate_parser
+from hipsta_bids.cli.commands import (
+    compare_parser,
+    meta_parser,
+    phantom_parser,
+    resample_parser,
+    surrogate_parser,
+)
 from hipsta_bids.cli.main import EPILOG
 from hipsta_bids.cli.parser import help_texts
 from hipsta_bids.cli.participant import build_parser
@@ -220,6 +226,7 @@ def test_spellings_of_other_bids_apps(alias, field, value):
         ("surrogate", surrogate_parser),
         ("phantom", phantom_parser),
         ("meta", meta_parser),
+        ("compare", compare_parser),
         ("resample", resample_parser),
     ],
 )

@@ -103,8 +103,8 @@ def test_the_page_is_whole_and_made_for_all_readers(page):
 
 @pytest.mark.parametrize("key", [section.key for section in page_module.SECTIONS])
 def test_every_part_is_there(page, key):
-    # Average cross-sections need surfaces, which these sheets lack; the others are options.
-    absent = {"sections", "harmonization", "power", "retest", "norms"}
+    # Average cross-sections need surfaces, which these sheets lack; the others are optional.
+    absent = {"sections", "harmonization", "power", "retest", "norms", "surrogate"}
     assert (f'id="group-{key}"' in page) == (key not in absent)
 
 

@@ -16,7 +16,7 @@ import pytest
 from small_cohorts import table
 from test_tutorials import DOCS, commands, whole
 
-from hipsta_bids.cli.commands import phantom_parser, surrogate_parser
+from hipsta_bids.cli.commands import compare_parser, phantom_parser, surrogate_parser
 from hipsta_bids.cli.group import group_parser
 from hipsta_bids.cli.main import main
 from hipsta_bids.cli.participant import build_parser
@@ -60,8 +60,9 @@ def test_the_settings_of_the_page_are_those_of_the_published_method():
 
 def test_the_commands_of_the_page_are_understood():
     first, *_ = every = commands_of_page()
-    kinds = [line[0] if line[0] in {"phantom", "surrogate"} else line[2] for line in every]
-    assert kinds == ["phantom", "participant", "group", "surrogate", *kinds[:3]]
+    named = {"phantom", "surrogate", "compare"}
+    kinds = [line[0] if line[0] in named else line[2] for line in every]
+    assert kinds == ["phantom", "participant", "group", "surrogate", *kinds[:3], "compare"]
     assert phantom_parser().parse_args(first[1:]).groups == ["CU", "MCI", "DAT"]
     for line in every:
         if "participant" in line:
@@ -69,6 +70,11 @@ def test_the_commands_of_the_page_are_understood():
             assert options.method == "published"
         elif line[0] == "surrogate":
             surrogate_parser().parse_args(line[1:])
+        elif line[0] == "compare":
+            names = [
+                text.partition("=")[0] for text in compare_parser().parse_args(line[1:]).analyses
+            ]
+            assert names == ["published", "ashs"]
         elif "group" in line:
             assert len(group_parser().parse_args(line).contrast) == 5
 
@@ -125,6 +131,15 @@ def test_the_planted_loss_is_found_with_both_segmentations(study):
         thin = rows[(rows.measure == "thickness_mean_CA1") & (rows.contrast == "CU-DAT")]
         assert len(thin) == 3
         assert ((thin.estimate > 0) & (thin.p_fdr < 0.05)).all()
+
+
+@whole
+def test_both_segmentations_are_in_one_table(study):
+    """The planted loss is in both, so that effect maps of the dementia group go together."""
+    rows = table(study / "segmentations" / "agreement.tsv")
+    thickness = rows[(rows.measure == "thickness") & (rows.contrast == "CU-DAT")]
+    assert len(thickness) == 2
+    assert (thickness.r > 0).all()
 
 
 @whole

@@ -4,6 +4,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import product
 from pathlib import Path
 
@@ -190,7 +191,7 @@ def _mesh(source: ExternalFiles, hemi: str, points: int) -> Mesh | None:
     if source.request.surface is not None:
         return _named_surface(source, hemi, points)
     paths = source.files[hemi].values()
-    meshes = (read_surface(one) for path in paths for one in _surfaces_beside(path, hemi))
+    meshes = (read_surface(one) for path in paths for one in surfaces_beside(path, hemi))
     return next((mesh for mesh in meshes if len(mesh.points) == points), None)
 
 
@@ -214,14 +215,17 @@ def _named_surface(source: ExternalFiles, hemi: str, points: int) -> Mesh:
     )
 
 
-def _surfaces_beside(path: Path, hemi: str) -> list[Path]:
-    """HippUnfold's unfolded surface: beside the map, or in version 2 in ``surf/``."""
+def surfaces_beside(path: Path, hemi: str, *, flat: bool = True) -> list[Path]:
+    """HippUnfold's unfolded surface, or others: beside the map, or in version 2 in ``surf/``."""
     wanted_entities = {**entities(path.name), "hemi": hemi}
     keys = ("sub", "ses", "hemi", "den", "label")
     folders = path.parent, path.parent.parent / "surf"
-    pattern = "*space-unfold*_midthickness.surf.gii"
+    pattern = "*_midthickness.surf.gii"
     candidates = {
-        one: entities(one.name) for folder in folders for one in sorted(folder.glob(pattern))
+        one: entities(one.name)
+        for folder in folders
+        for one in sorted(folder.glob(pattern))
+        if ("_space-unfold" in one.name) == flat
     }
     # Sheets of this program have an unfolded surface too, but their maps have their grid.
     return [
@@ -243,10 +247,19 @@ def find_all(
     return sources, sorted(visits, key=lambda visit: (visit[0], visit[1] or ""))
 
 
+Reader = Callable[[ExternalFiles, Sequence[VisitKey]], tuple[dict[str, SideMaps], str, list[str]]]
+"""Reads one map, as ``read_maps``."""
+
+
 def add_external(
-    measured: Measured, sources: Iterable[ExternalFiles], visits: Sequence[VisitKey]
+    measured: Measured,
+    sources: Iterable[ExternalFiles],
+    visits: Sequence[VisitKey],
+    crop: Reader | None = None,
 ) -> tuple[Measured, dict[str, Cohort], list[str]]:
     """Read other programs' maps; maps on the grid of the sheets are added to the sheets.
+
+    ``crop`` reads maps that are no tables, to bring them to this grid.
 
     Returns the sheets, cohorts by surface of maps with points of their own, and notes.
 
@@ -256,7 +269,9 @@ def add_external(
     maps, units, notes = {}, dict(measured.units), []
     for source in sources:
         name = source.request.name
-        maps[name], units[name], left_out = read_maps(source, visits, grid, with_sheets=with_sheets)
+        read = partial(read_maps, grid=grid, with_sheets=with_sheets)
+        reader = crop if crop is not None and not source.request.pattern.endswith(".tsv") else read
+        maps[name], units[name], left_out = reader(source, visits)
         notes += left_out
         counts = ", ".join(f"{len(side.rows)} {hemi}" for hemi, side in maps[name].items())
         points = ", ".join(str(np.prod(side.shape)) for side in maps[name].values())

@@ -19,6 +19,7 @@ from hipsta_bids.group.output import panels, style
 from hipsta_bids.group.output.maps import draw_measure
 from hipsta_bids.group.output.results import Analysis, ScoredMaps
 from hipsta_bids.group.output.shapes import AverageShape
+from hipsta_bids.group.output.slices import draw_surrogate
 from hipsta_bids.group.stats.arrays import Float, describe_known, mean_of_known
 from hipsta_bids.group.stats.glm import FittedMaps
 from hipsta_bids.io.files import MISSING
@@ -483,6 +484,8 @@ def draw_figures(
         yield "registration", partial(draw_registration, saved)
     if shapes:
         yield "sections", partial(draw_sections, cohorts[SHEET], analysis, shapes)
+    if len(saved.table("surrogate")):
+        yield "surrogate", partial(draw_surrogate, saved)
     if analysis.pairs:
         yield "roc", partial(draw_roc, saved)
         if any(one.full.calibration.judged for *_, one in analysis.pairs):

@@ -2,13 +2,14 @@
 
 import re
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from hipsta_bids import __version__
 from hipsta_bids.derivatives.dataset import references
+from hipsta_bids.group.cohort.crop import REACH
 from hipsta_bids.group.cohort.data import Cohort
 from hipsta_bids.group.cohort.read import LEAST_SHARE
 from hipsta_bids.group.design import settings as group_settings
@@ -98,6 +99,7 @@ def methods_text(
     n_out: int,
     *,
     surfaces: Sequence[str] = (),
+    cropped: Sequence[str] = (),
     region: str = "body",
     ratings: Mapping[str, int] | None = None,
 ) -> str:
@@ -111,11 +113,7 @@ def methods_text(
             " were excluded."
         )
     aligned = [_registration(analysis, settings, cite)] if analysis.registrations else []
-    if surfaces:
-        aligned.append(
-            f"Maps of other programs ({', '.join(surfaces)}) were compared point by point, without"
-            " registration."
-        )
+    aligned += _other_maps(surfaces, cropped)
     if aligned:
         paragraphs.append(" ".join(aligned))
     if region in EXPERIMENTAL and analysis.fitted:
@@ -138,6 +136,21 @@ def methods_text(
         points = (f"- {escaped(line)}" for line in analysis.skipped)
         paragraphs.append("\n".join(["Notes:", "", *points]))
     return cite.page(paragraphs, region)
+
+
+def _other_maps(surfaces: Sequence[str], cropped: Sequence[str]) -> Iterator[str]:
+    """Say how maps of other programs were brought to points that correspond."""
+    if surfaces:
+        yield (
+            f"Maps of other programs ({', '.join(surfaces)}) were compared point by point, without"
+            " registration."
+        )
+    if cropped:
+        yield (
+            f"Maps of other programs ({', '.join(cropped)}) were sampled at the nodes of each"
+            f" participant's sheet, within {REACH:g} mm of the program's surface in scanner"
+            " space. They end at the end planes of the sheet and follow its registration."
+        )
 
 
 def _sample(

@@ -86,6 +86,8 @@ class Row:
     """Of significance, on maps of it."""
     ticks: Mapping[float, str] = field(default_factory=dict)
     """Positions and texts on the color bar, where it is not to choose them."""
+    grounds: Mapping[str, Ground] = field(default_factory=dict)
+    """By side, where unfolded maps lie on others than the maps of other rows."""
 
 
 def spanned(colors: str, values: Mapping[str, Float]) -> Scale:
@@ -404,6 +406,7 @@ def _draw_row(
         if column.hemi not in row.values:
             continue
         values, survive = row.values[column.hemi], row.survive.get(column.hemi)
+        ground = row.grounds.get(column.hemi, column.ground)
         if column.seen is not None:
             picture = draw_view(*column.seen, values, row.scale, survive, point=dpi / 72)
             style.place_picture(figure, picture, (column.box[0], top, column.box[1], height))
@@ -411,12 +414,12 @@ def _draw_row(
         axes = _axes(figure, column.box[0], top, column.box[1], height)
         axes.set_gid(map_id(row.kind, row.index, column.hemi))
         axes.set_facecolor(str(_UNKNOWN))
-        if column.ground.mesh is None:
-            _draw_sheet(axes, column.ground, values, row.scale)
+        if ground.mesh is None:
+            _draw_sheet(axes, ground, values, row.scale)
         else:
-            draw_mesh(axes, column.ground.mesh, values, row.scale)
+            draw_mesh(axes, ground.mesh, values, row.scale)
         if survive is not None:
-            _enclose(axes, column.ground, survive)
+            _enclose(axes, ground, survive)
     edge = sum(columns[-1].box) + _BAR * MM
     _draw_bar(_axes(figure, edge, top, _BAR_WIDTH * MM, height), row)
 

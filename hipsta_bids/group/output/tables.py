@@ -33,6 +33,8 @@ _MEANINGS = tomllib.loads((files("hipsta_bids.group.output") / "columns.toml").r
 COLUMNS: Mapping[str, str] = _MEANINGS["group"]
 #: The same of a meta-analysis.
 META_COLUMNS: Mapping[str, str] = COLUMNS | _MEANINGS["meta"]
+#: The same of analyses that are compared.
+COMPARISON_COLUMNS: Mapping[str, str] = COLUMNS | _MEANINGS["comparison"]
 #: The same of measures that are tested together.
 JOINT_COLUMNS: Mapping[str, str] = COLUMNS | _MEANINGS["joint"]
 

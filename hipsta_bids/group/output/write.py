@@ -82,6 +82,7 @@ def write_results(
     region: str = "body",
     ratings: Mapping[str, int] | None = None,
     labels: Mapping[str, list[str]],
+    cropped: Sequence[str] = (),
 ) -> None:
     """Write tables, maps and text; cohorts and analyses are by surface."""
     cohort, analysis = cohorts[SHEET], analyses[SHEET]
@@ -123,6 +124,7 @@ def write_results(
         settings,
         len(exclusions),
         surfaces=[surface for surface in cohorts if surface != SHEET],
+        cropped=cropped,
         region=region,
         ratings=ratings,
     )

@@ -18,6 +18,7 @@ from hipsta_bids.group.design.settings import GroupSettings
 from hipsta_bids.group.output.results import Analysis, harmonization_record
 from hipsta_bids.group.output.saved import load_effects
 from hipsta_bids.group.output.shapes import average_shapes, write_shapes
+from hipsta_bids.group.output.slices import surrogate_table
 from hipsta_bids.group.output.tables import summary_tests
 from hipsta_bids.group.output.write import draw, write_results, write_table
 from hipsta_bids.group.questions import analysis as fitting
@@ -106,6 +107,7 @@ def _analyze(options: studies.GroupOptions, settings: GroupSettings) -> studies.
         shares = study.masked[study.masked["visit"].isin(cohort.table.index)]
         notes.append(mask_note(shares, cohort.table[groups.column] if groups else None))
     summary = _summary(study, analysis, notes)
+    in_slices = surrogate_table(study.collection.records, analysis, settings.glm.confidence)
     tell("average surfaces")
     shapes = average_shapes(study.collection.records, cohort, analysis, settings.shapes)
     # One is enough from here on, and all may take much memory.
@@ -124,8 +126,15 @@ def _analyze(options: studies.GroupOptions, settings: GroupSettings) -> studies.
             region=options.sheets.region,
             ratings=study.collection.ratings,
             labels=study.labels,
+            cropped=[
+                name
+                for name, pattern in options.maps
+                if options.maps_crop and name in study.maps and not pattern.endswith(".tsv")
+            ],
         )
         files.write_json(folder / "model.json", document)
+        if len(in_slices):
+            write_table(folder, "surrogate", in_slices)
         if len(quality):
             write_table(folder, "quality", quality)
         if summary is not None:

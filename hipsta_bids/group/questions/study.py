@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +12,10 @@ import pandas as pd
 from hipsta_bids import __version__
 from hipsta_bids.derivatives import dataset
 from hipsta_bids.derivatives.names import group_report
-from hipsta_bids.errors import ModelError
+from hipsta_bids.errors import ModelError, UsageError
 from hipsta_bids.group.cohort import collect, external, read
 from hipsta_bids.group.cohort.covariates import add_icv, add_time, read_covariates, spelled_note
+from hipsta_bids.group.cohort.crop import Places, crop_maps
 from hipsta_bids.group.cohort.data import SHEET, Cohort, Measures, choose_visits
 from hipsta_bids.group.cohort.masks import mask_sheets
 from hipsta_bids.group.design import model as designs
@@ -50,6 +52,8 @@ class GroupOptions:
     """Names and patterns of other programs' maps."""
     surfaces: tuple[tuple[str | None, str], ...] = ()
     """Patterns of the surfaces to draw these on, for one or for all."""
+    maps_crop: bool = False
+    """Whether these maps are sampled at the nodes of the sheets."""
     volumes: tuple[tuple[str, str], ...] = ()
     """Names and patterns of other programs' tables of volumes."""
     measures: tuple[str, ...] = ()
@@ -61,6 +65,8 @@ class GroupOptions:
     export_summary: str | None = None
     """Name of this site in a summary for other sites, empty for that of the folder; ``None`` for no
     summary."""
+    part: str = ""
+    """End of the folder's name: of one analysis of several."""
     reports: bool = True
     """Whether a page is made."""
     figures: bool = False
@@ -217,6 +223,7 @@ class Study:
         warnings = (*collection.warnings, *self.mixes)
         region = options.sheets.region
         name = options.model.name or (name if region == "body" else f"{name}_{region}")
+        name += options.part
         _describe_dataset(options)
         final = options.out_dir / write.GROUP_FOLDER / name
         with write.whole_folder(final) as folder:
@@ -287,7 +294,8 @@ def read_study(
         visits,
         max_gap=settings.registration.max_gap,
     )
-    sheets, surfaces, map_notes = external.add_external(sheets, files_of, visits)
+    crop = partial(crop_maps, places=_places(collection)) if options.maps_crop else None
+    sheets, surfaces, map_notes = external.add_external(sheets, files_of, visits, crop)
     if covariate_maps and surfaces:
         raise ModelError(
             f"maps {listed(surfaces)} are not on the grid of the sheet, but map() in the formula"
@@ -357,6 +365,14 @@ def read_study(
     )
     keep = members(cohort.table, among)
     return study.take(keep, ("not-asked", "another level than --among"))
+
+
+def _places(collection: collect.Collection) -> Places:
+    """Return the sheets by visit and hemisphere."""
+    results = [record.result for record in collection.records]
+    if not results:
+        raise UsageError("--maps-crop: there are no sheets; run the participant level first")
+    return {((r.name.subject, r.name.session), r.name.hemi): r for r in results}
 
 
 def _with_covariates(
