@@ -63,6 +63,7 @@ def resample_parser() -> Parser:
     add("out", "OUT", type=Path)
     add("--surface", "FILE", nargs="+", required=True)
     add("--sheet", "FILE", nargs="+", default=[])
+    add("--to-surface", "FILE", nargs="+", default=[])
     add("--column", "NAME", default="thickness")
     add("--settings", "FILE.toml")
     return parser
@@ -275,7 +276,8 @@ def run_resample(arguments: Sequence[str]) -> ExitCode:
 
     sheet = load_settings(options.settings).sheet
     files = options.maps, options.out, options.surface
-    echo(resample(*files, sheet, column=options.column, sheets=options.sheet))
+    between = {"sheets": options.sheet, "targets": options.to_surface}
+    echo(resample(*files, sheet, column=options.column, **between))
     return ExitCode.OK
 
 

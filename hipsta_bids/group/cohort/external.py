@@ -23,6 +23,7 @@ from hipsta_bids.inputs.maps import Found, check_pattern, fields_of, fill, find,
 from hipsta_bids.io import files
 from hipsta_bids.io.files import entities
 from hipsta_bids.io.gifti import DENSE_SCALARS, PointMap, cifti_sides, read_map, read_surface
+from hipsta_bids.io.hippunfold import has_opposite_sign, unfolded_beside
 from hipsta_bids.types import Mesh, VisitKey
 
 
@@ -141,7 +142,12 @@ def read_maps(
     for hemi, path_of in source.files.items():
         keys = sorted(path_of, key=row_of.__getitem__)
         paths = [path_of[visit] for visit in keys]
-        maps = [read_map(path, name, hemi) for path in paths]
+        maps = [_read_map(path, name, hemi) for path in paths]
+        if turned := sum(has_opposite_sign(path, hemi) for path in paths):
+            notes.append(
+                f"--maps {name}: curvature of {turned} right hemispheres by HippUnfold 1 was"
+                " multiplied by -1 (opposite sign)"
+            )
         _refuse_mixed(name, hemi, paths, maps)
         # The curvature of other programs may be huge at single vertices of good maps.
         problems = [why_impossible(name, m.values) if name == THICKNESS else None for m in maps]
@@ -174,6 +180,13 @@ def read_maps(
     return sides, units[0], notes
 
 
+def _read_map(path: Path, name: str, hemi: str) -> PointMap:
+    """Read a map with the sign of the left side."""
+    as_given = read_map(path, name, hemi)
+    sign = -1 if has_opposite_sign(path, hemi) else 1
+    return replace(as_given, values=sign * as_given.values)  # noqa: PD011  (no table)
+
+
 def _refuse_mixed(name: str, hemi: str, paths: Sequence[Path], maps: Sequence[PointMap]) -> None:
     counts = Counter(len(one.values) for one in maps)
     if len(counts) > 1:
@@ -190,7 +203,7 @@ def _mesh(source: ExternalFiles, hemi: str, points: int) -> Mesh | None:
     if source.request.surface is not None:
         return _named_surface(source, hemi, points)
     paths = source.files[hemi].values()
-    meshes = (read_surface(one) for path in paths for one in _surfaces_beside(path, hemi))
+    meshes = (read_surface(one) for path in paths for one in unfolded_beside(path, hemi))
     return next((mesh for mesh in meshes if len(mesh.points) == points), None)
 
 
@@ -212,23 +225,6 @@ def _named_surface(source: ExternalFiles, hemi: str, points: int) -> Mesh:
     raise InputError(
         f"--maps-surface: no file {next(iter(names))}; it serves to draw {request.name}"
     )
-
-
-def _surfaces_beside(path: Path, hemi: str) -> list[Path]:
-    """HippUnfold's unfolded surface: beside the map, or in version 2 in ``surf/``."""
-    wanted_entities = {**entities(path.name), "hemi": hemi}
-    keys = ("sub", "ses", "hemi", "den", "label")
-    folders = path.parent, path.parent.parent / "surf"
-    pattern = "*space-unfold*_midthickness.surf.gii"
-    candidates = {
-        one: entities(one.name) for folder in folders for one in sorted(folder.glob(pattern))
-    }
-    # Sheets of this program have an unfolded surface too, but their maps have their grid.
-    return [
-        one
-        for one, other in candidates.items()
-        if "seg" not in other and all(wanted_entities.get(key) == other.get(key) for key in keys)
-    ]
 
 
 def find_all(
