@@ -69,6 +69,19 @@ def resample_parser() -> Parser:
     return parser
 
 
+def export_parser() -> Parser:
+    """Describe ``hipsta-bids export``."""
+    parser, add = parser_of("export")
+    add("output_dir", "OUT_DIR", type=Path)
+    add("folder", "DIR", type=Path)
+    add("--format", choices=["freesurfer", "vtk", "ply"], default="freesurfer")
+    add("--seg", "NAME")
+    add("--region", "NAME", default="body")
+    add("--participant-label", "LABEL", nargs="+", type=bids_label("sub-"), default=[])
+    add("--space-of", "PATTERN", default="")
+    return parser
+
+
 def figure_parser() -> Parser:
     """Describe ``hipsta-bids figure``."""
     parser, add = parser_of("figure")
@@ -278,6 +291,24 @@ def run_resample(arguments: Sequence[str]) -> ExitCode:
     files = options.maps, options.out, options.surface
     between = {"sheets": options.sheet, "targets": options.to_surface}
     echo(resample(*files, sheet, column=options.column, **between))
+    return ExitCode.OK
+
+
+def run_export(arguments: Sequence[str]) -> ExitCode:
+    """Write surfaces and maps in formats of other programs."""
+    options = export_parser().parse_intermixed_args(arguments)
+    from hipsta_bids.participant.export import export_surfaces  # noqa: PLC0415  (heavy)
+
+    paths = export_surfaces(
+        options.output_dir,
+        options.folder,
+        options.format,
+        protocol=options.seg,
+        region=options.region,
+        participants=options.participant_label,
+        image=options.space_of,
+    )
+    echo(f"{options.folder}: {len(paths)} files")
     return ExitCode.OK
 
 

@@ -36,6 +36,7 @@ COMMANDS = {
     "meta": ("run_meta_analysis", "SITE... OUT", "combine summaries of sites (group level)"),
     "figure": ("draw_figure", "WHAT OUT", "draw a figure for a paper from results"),
     "resample": ("run_resample", "MAP... OUT", "move maps to HippUnfold's surfaces, or from there"),
+    "export": ("run_export", "OUT_DIR DIR", "write surfaces for FreeSurfer, or as VTK or PLY"),
     "validate": ("run_validation", "", None),
 }
 

@@ -371,13 +371,18 @@ def write_surface(path: Path, mesh: Mesh, maps: Mapping[str, Float]) -> None:
     """
     if path.suffix not in ENDINGS:
         raise UsageError(f"{path.name}: surfaces end with {', '.join(ENDINGS)}")
+    files.write_bytes(path, encode_surface(path.suffix, mesh, maps))
+
+
+def encode_surface(ending: str, mesh: Mesh, maps: Mapping[str, Float]) -> bytes:
+    """Encode a surface for :func:`write_surface`."""
     present_points = np.asarray(np.isfinite(mesh.points).all(axis=1), dtype=np.bool_)
     points = np.where(
         present_points[:, None], mesh.points, mesh.points[present_points].mean(axis=0)
     )
     faces = mesh.triangles[present_points[mesh.triangles].all(axis=1)]
-    data = {} if path.suffix == ".obj" else {name: np.ravel(maps[name]) for name in maps}
-    files.write_bytes(path, _by_meshio(path.suffix[1:], points, ("triangle", faces), data))
+    data = {} if ending == ".obj" else {name: np.ravel(maps[name]) for name in maps}
+    return _by_meshio(ending[1:], points, ("triangle", faces), data)
 
 
 def read_surface(path: Path) -> Mesh:
