@@ -99,6 +99,8 @@ def _add_signals(parser: Parser) -> None:
     add("--map", "NAME=PATTERN...", type=named_pattern)
     add("--map-sampling", "[NAME=]depth|mid...", type=_choice("depth", "mid"))
     add("--map-interpolation", "[NAME=]linear|nearest...", type=_choice("linear", "nearest"))
+    add("--map-transform", "NAME=PATTERN...", type=named_pattern)
+    add("--map-reference", "NAME=PATTERN...", type=named_pattern)
     add("--roi", "FILE.tsv")
 
 
@@ -203,7 +205,9 @@ def _run(options: "Namespace", arguments: Sequence[str]) -> ExitCode:
     from hipsta_bids.io.volumes import limit_memory  # noqa: PLC0415  (heavy)
 
     limit_memory(options.mem)
-    requests = map_requests(options.map, options.map_sampling, options.map_interpolation)
+    choices = options.map_sampling, options.map_interpolation
+    spaces = options.map_transform, options.map_reference
+    requests = map_requests(options.map, *choices, *spaces)
     with console.searching(has_bar=not (options.quiet or options.dry_run)):
         findings = _find(request, options.shard, say=console.echo if options.dry_run else None)
     if findings is None:
