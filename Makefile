@@ -94,7 +94,7 @@ COMPILE = "$(BIN)/python" -m uv pip compile pyproject.toml --quiet --universal \
 	--no-emit-find-links --custom-compile-command "make lock" $(LOCK_FLAGS)
 lock: $(STAMP)
 	"$(BIN)/python" -m pip install -qq --disable-pip-version-check "uv>=0.8"
-	$(COMPILE) --extra cluster --output-file requirements.lock
+	$(COMPILE) --extra cluster --extra transforms --output-file requirements.lock
 	$(COMPILE) --extra dev --extra docs --constraints requirements.lock --output-file requirements-dev.lock
 
 clean:

@@ -96,7 +96,7 @@ def test_imports_are_the_declared_dependencies():
         "sklearn": "scikit-learn",
     }
     extras = PROJECT["optional-dependencies"]
-    requirements = (*PROJECT["dependencies"], *extras["arrow"])
+    requirements = (*PROJECT["dependencies"], *extras["arrow"], *extras["transforms"])
     declared = {canonical(requirement) for requirement in requirements}
     trees = (
         ast.parse(path.read_text(encoding="utf-8")) for path in (ROOT / "hipsta_bids").rglob("*.py")

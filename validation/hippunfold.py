@@ -9,11 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from hipsta_bids.errors import InputError
 from hipsta_bids.geometry.digital import to_ras
 from hipsta_bids.geometry.wall import vertex_normals
 from hipsta_bids.inputs.labels import read_label_volume
 from hipsta_bids.inputs.search import HemisphereInput, InputRequest, find_hemispheres
 from hipsta_bids.io.gifti import read_mesh
+from hipsta_bids.io.hippunfold import unfolded_shares
 from hipsta_bids.participant.unfolded import Correspondence
 from hipsta_bids.participant.whole import MAX_VOXEL
 from hipsta_bids.protocols.load import load_protocol
@@ -183,7 +185,10 @@ def measure_places(case: tuple[Source, Path]) -> Cells:
     maps = cases.measure_body(*_volume(source), settings)
     sheet = maps.sheet
     vertices = _values(f"{_surfaces(source)}midthickness.surf.gii", "pointset")
-    between = Correspondence(read_mesh(flat), settings.sheet, maps.maps["proximodistal"])
+    unfolded = unfolded_shares(read_mesh(flat))
+    if unfolded is None:
+        raise InputError(f"{flat}: is no unfolded surface of HippUnfold")
+    between = Correspondence(unfolded[1], settings.sheet, maps.maps["proximodistal"])
     points = sheet.points[:, :, sheet.middle]
     off = np.linalg.norm(between.to_nodes(vertices) - points, axis=-1)[sheet.valid]
     nearest = np.asarray(cKDTree(vertices).query(points[sheet.valid])[1], dtype=np.intp)

@@ -72,8 +72,22 @@ def resample_parser() -> Parser:
     add("out", "OUT", type=Path)
     add("--surface", "FILE", nargs="+", required=True)
     add("--sheet", "FILE", nargs="+", default=[])
+    add("--to-surface", "FILE", nargs="+", default=[])
     add("--column", "NAME", default="thickness")
     add("--settings", "FILE.toml")
+    return parser
+
+
+def export_parser() -> Parser:
+    """Describe ``hipsta-bids export``."""
+    parser, add = parser_of("export")
+    add("output_dir", "OUT_DIR", type=Path)
+    add("folder", "DIR", type=Path)
+    add("--format", choices=["freesurfer", "vtk", "ply"], default="freesurfer")
+    add("--seg", "NAME")
+    add("--region", "NAME", default="body")
+    add("--participant-label", "LABEL", nargs="+", type=bids_label("sub-"), default=[])
+    add("--space-of", "PATTERN", default="")
     return parser
 
 
@@ -299,7 +313,26 @@ def run_resample(arguments: Sequence[str]) -> ExitCode:
 
     sheet = load_settings(options.settings).sheet
     files = options.maps, options.out, options.surface
-    echo(resample(*files, sheet, column=options.column, sheets=options.sheet))
+    between = {"sheets": options.sheet, "targets": options.to_surface}
+    echo(resample(*files, sheet, column=options.column, **between))
+    return ExitCode.OK
+
+
+def run_export(arguments: Sequence[str]) -> ExitCode:
+    """Write surfaces and maps in formats of other programs."""
+    options = export_parser().parse_intermixed_args(arguments)
+    from hipsta_bids.participant.export import export_surfaces  # noqa: PLC0415  (heavy)
+
+    paths = export_surfaces(
+        options.output_dir,
+        options.folder,
+        options.format,
+        protocol=options.seg,
+        region=options.region,
+        participants=options.participant_label,
+        image=options.space_of,
+    )
+    echo(f"{options.folder}: {len(paths)} files")
     return ExitCode.OK
 
 

@@ -37,6 +37,7 @@ COMMANDS = {
     "compare": ("run_compare", "FOLDER... OUT", "compare finished analyses (group level)"),
     "figure": ("draw_figure", "WHAT OUT", "draw a figure for a paper from results"),
     "resample": ("run_resample", "MAP... OUT", "move maps to HippUnfold's surfaces, or from there"),
+    "export": ("run_export", "OUT_DIR DIR", "write surfaces for FreeSurfer, or as VTK or PLY"),
     "validate": ("run_validation", "", None),
 }
 

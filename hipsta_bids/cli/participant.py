@@ -99,6 +99,8 @@ def _add_signals(parser: Parser) -> None:
     add("--map", "NAME=PATTERN...", type=named_pattern)
     add("--map-sampling", "[NAME=]depth|mid...", type=_choice("depth", "mid"))
     add("--map-interpolation", "[NAME=]linear|nearest...", type=_choice("linear", "nearest"))
+    add("--map-transform", "NAME=PATTERN...", type=named_pattern)
+    add("--map-reference", "NAME=PATTERN...", type=named_pattern)
     add("--roi", "FILE.tsv")
 
 
@@ -197,13 +199,15 @@ def _run(options: "Namespace", arguments: Sequence[str]) -> ExitCode:
         console.echo(f"note: region {settings.body.region} is experimental")
     request = input_request(options)
     console.echo_start(options.analysis_level, options.bids_dir)
+    from hipsta_bids.derivatives.dataset import upgrade_notes  # noqa: PLC0415  (heavy)
     from hipsta_bids.inputs import account, search  # noqa: PLC0415  (heavy)
     from hipsta_bids.inputs.edits import attach_ends  # noqa: PLC0415  (heavy)
     from hipsta_bids.inputs.maps import attach, map_requests  # noqa: PLC0415  (heavy)
     from hipsta_bids.io.volumes import limit_memory  # noqa: PLC0415  (heavy)
 
     limit_memory(options.mem)
-    requests = map_requests(options.map, options.map_sampling, options.map_interpolation)
+    keys = ("sampling", "interpolation", "transform", "reference")
+    requests = map_requests(options.map, *(getattr(options, f"map_{key}") for key in keys))
     with console.searching(has_bar=not (options.quiet or options.dry_run)):
         findings = _find(request, options.shard, say=console.echo if options.dry_run else None)
     if findings is None:
@@ -211,7 +215,13 @@ def _run(options: "Namespace", arguments: Sequence[str]) -> ExitCode:
         return ExitCode.OK
     items, end_notes = attach_ends(findings.items, options.ends)
     items, map_notes = attach(items, requests, options.roi, options.bids_dir)
-    notes = (*search.dataset_notes(request, items), *findings.notes, *end_notes, *map_notes)
+    notes = (
+        *search.dataset_notes(request, items),
+        *findings.notes,
+        *end_notes,
+        *map_notes,
+        *upgrade_notes(options.output_dir),
+    )
     unused = (*findings.ignored, *findings.other_entries)
     inputs = account.input_table(items, unused, options.bids_dir)
     for note in notes:

@@ -81,13 +81,15 @@ def settle_settings(root: Path, settings: Settings) -> str:
     """Record the resolved settings, or check that the earlier runs here had the same ones.
 
     One folder holds results of one set of settings only: maps made with different ones must
-    not be pooled, so this holds for every run, ``--force`` or not.
+    not be pooled, so this holds for every run, ``--force`` or not. Settings that an earlier
+    version lacked may be added; with settings that this version lacks it is refused.
     """
     path = root / DATASET_FILES["settings"]
     digest, resolved = shared_settings(settings)
     if path.exists():
         earlier = files.read_json(path)
-        if earlier.get("hash") == digest:
+        is_same_version = earlier.get("version") == __version__
+        if earlier.get("hash") == digest and is_same_version:
             return digest
         before = earlier.get("settings")
         recorded = flatten(before if isinstance(before, dict) else {})
@@ -97,18 +99,31 @@ def settle_settings(root: Path, settings: Settings) -> str:
                 f"{root}: results of version {earlier.get('version', 'unknown')} with other "
                 "settings; use a new output folder, or delete this one"
             )
+        keys = current if is_same_version else recorded
         changes = [
             f"{key} was {recorded.get(key, 'not there')}, now {current.get(key, 'not there')}"
-            for key in dict.fromkeys((*recorded, *current))
+            for key in keys
             if recorded.get(key) != current.get(key)
         ]
-        raise SettingsError(
-            f"{root}: results with other settings ({'; '.join(changes) or 'hash differs'}); "
-            "use a new output folder, or delete this one"
-        )
+        if changes or is_same_version or not recorded:
+            raise SettingsError(
+                f"{root}: results with other settings ({'; '.join(changes) or 'hash differs'}); "
+                "use a new output folder, or delete this one"
+            )
     content = {"hash": digest, "version": __version__, "settings": resolved}
     files.write_json(path, content)
     return digest
+
+
+def upgrade_notes(root: Path) -> list[str]:
+    """Note that another version of the program has filled a folder; a run makes all of it again."""
+    path = root / DATASET_FILES["settings"]
+    earlier = files.read_json(path).get("version") if path.is_file() else None
+    if earlier in {None, __version__}:
+        return []
+    return [
+        f"{root}: results of version {earlier}; all hemispheres are measured again by {__version__}"
+    ]
 
 
 def shared_settings(settings: Settings) -> tuple[str, dict[str, Any]]:

@@ -20,6 +20,7 @@ from hipsta_bids.geometry.catalog import MAPS
 from hipsta_bids.geometry.sampling import Regions
 from hipsta_bids.inputs.scan import HemisphereInput, MapSource
 from hipsta_bids.io import files
+from hipsta_bids.io.transforms import check_installed
 from hipsta_bids.types import Visit
 
 #: Columns of a file of regions: node numbers as in the sheet table, and the region's name.
@@ -172,6 +173,8 @@ def map_requests(
     patterns: Sequence[tuple[str, str]],
     samplings: Sequence[tuple[str | None, str]],
     interpolations: Sequence[tuple[str | None, str]],
+    transforms: Sequence[tuple[str, str]] = (),
+    references: Sequence[tuple[str, str]] = (),
 ) -> tuple[MapSource, ...]:
     """Combine and check the options about maps; choices without a name are for all other maps."""
     names = [name for name, _ in patterns]
@@ -187,7 +190,18 @@ def map_requests(
             fault = "belongs to other outputs" if name in reserved else "occurs twice"
             raise UsageError(f"--map: the name {name} {fault}; choose another one")
         check_pattern("--map", name, pattern)
-    for option, choices in (("sampling", samplings), ("interpolation", interpolations)):
+    if transforms:
+        check_installed("--map-transform")
+    for option, files_of in (("transform", transforms), ("reference", references)):
+        for name, pattern in files_of:
+            check_pattern(f"--map-{option}", name, pattern)
+    options = {
+        "sampling": samplings,
+        "interpolation": interpolations,
+        "transform": transforms,
+        "reference": references,
+    }
+    for option, choices in options.items():
         unknown_names = [name for name, _ in choices if name is not None and name not in names]
         if unknown_names:
             raise UsageError(f"--map-{option}: there is no --map {unknown_names[0]}=...")
@@ -199,6 +213,8 @@ def map_requests(
             pattern=pattern,
             sampling=sampling_of.get(name, sampling_of[None]),
             interpolation=interpolation_of.get(name, interpolation_of[None]),
+            transform=dict(transforms).get(name),
+            reference=dict(references).get(name),
         )
         for name, pattern in patterns
     )
@@ -234,16 +250,26 @@ def attach(
 
 
 def _source(item: HemisphereInput, request: MapSource, bids_dir: Path) -> MapSource:
-    name = fill(request.pattern, item.subject, item.session, item.hemi)
-    matches = find(name, bids_dir)
+    patterns = {"path": request.pattern, "transform": request.transform}
+    patterns["reference"] = request.reference
+    paths: dict[str, Path | None] = {}
     missing = None
-    if not matches:
-        missing = f"no file {name}"
-    elif len(matches) > 1:
-        missing = f"{len(matches)} files match {name}: {matches[0]}, {matches[1]}"
+    for key, pattern in patterns.items():
+        if pattern is None:
+            continue
+        name = fill(str(pattern), item.subject, item.session, item.hemi)
+        matches = find(name, bids_dir)
+        if not matches:
+            missing = missing or f"no file {name}"
+        elif len(matches) > 1:
+            missing = missing or f"{len(matches)} files match {name}: {matches[0]}, {matches[1]}"
+        else:
+            paths[key] = matches[0]
     return replace(
         request,
-        path=None if missing else matches[0],
+        path=None if missing else paths["path"],
+        transform=paths.get("transform"),
+        reference=paths.get("reference"),
         missing=missing,
         source_path=None if Path(request.pattern).is_absolute() else bids_dir,
     )

@@ -109,6 +109,10 @@ class MapSource:
     """Why there is no path, in one phrase."""
     source_path: Path | None = None
     """The dataset that it is in, if it is in the one that was given."""
+    transform: str | Path | None = None
+    """From the volume to the space of the labels: a pattern, and then a path."""
+    reference: str | Path | None = None
+    """The image that FSL registered the volume to; likewise."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -18,14 +18,19 @@ import tempfile
 import warnings
 import zlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 from xml.parsers.expat import ExpatError
 
 import nibabel as nib
 import numpy as np
-from nibabel.cifti2.cifti2 import Cifti2BrainModel, Cifti2HeaderError, Cifti2Image
+from nibabel.cifti2.cifti2 import (
+    CIFTI_BRAIN_STRUCTURES,
+    Cifti2BrainModel,
+    Cifti2HeaderError,
+    Cifti2Image,
+)
 from nibabel.cifti2.cifti2_axes import BrainModelAxis, ScalarAxis
 from nibabel.filebasedimages import ImageFileError
 from nibabel.gifti.gifti import (
@@ -41,7 +46,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hipsta_bids.errors import InputError, UsageError
 from hipsta_bids.io import files
-from hipsta_bids.io.files import entities
+from hipsta_bids.io.hippunfold import has_opposite_sign, suffix
 from hipsta_bids.opening import TABLE, open_regular, read_bounded
 from hipsta_bids.types import Coordinates, Float, Int, Mesh, TetMesh
 
@@ -66,6 +71,14 @@ _CIFTI_SIDES = {"LEFT": "L", "RIGHT": "R"}
 _DAMAGE = (
     *(OSError, ValueError, TypeError, LookupError, AttributeError, AssertionError, MemoryError),
     *(ImageFileError, HeaderDataError, Cifti2HeaderError, ExpatError, zlib.error, struct.error),
+)
+#: Structure of Workbench 2 beside the hippocampus in files of the HCP, which nibabel does not know.
+_DENTATE = "HIPPOCAMPUS_DENTATE"
+CIFTI_BRAIN_STRUCTURES.add_codes(
+    [
+        (f"{_DENTATE}_{side}", f"CIFTI_STRUCTURE_{_DENTATE}_{side}", f"{_DENTATE.title()} {side}")
+        for side in ("LEFT", "RIGHT")
+    ]
 )
 _MOST_VERTICES = 10_000_000  # of a surface that a file names but does not hold
 
@@ -193,7 +206,8 @@ def _surface_models(path: Path, image: Cifti2Image) -> dict[str, Cifti2BrainMode
         brain_models = list(image.header.get_index_map(image.ndim - 1).brain_models)
     except _DAMAGE as error:
         raise _unreadable(path, "CIFTI", error) from error
-    for model in brain_models:
+    sheets = [model for model in brain_models if _DENTATE not in model.brain_structure]
+    for model in sheets or brain_models:
         hemi = _CIFTI_SIDES.get(model.brain_structure.rpartition("_")[2])
         if hemi is None or not model.surface_number_of_vertices:
             continue
@@ -225,12 +239,18 @@ def _from_cifti(path: Path, hemi: str) -> PointMap:
         values[list(model.vertex_indices)] = data
     except _DAMAGE as error:
         raise _unreadable(path, "CIFTI", error) from error
-    suffix = entities(path.name)["suffix"]
-    return PointMap(values=_finite(values), unit=_UNITS.get(suffix, ARBITRARY))
+    return PointMap(values=_finite(values), unit=_UNITS.get(suffix(path), ARBITRARY))
 
 
 def read_map(path: Path, name: str, hemi: str) -> PointMap:
-    """Read the map of a hemisphere."""
+    """Read the map of a hemisphere; curvature has one sign on both sides."""
+    point_map = _read_map(path, name, hemi)
+    if has_opposite_sign(path, hemi):
+        return replace(point_map, values=-point_map.values)
+    return point_map
+
+
+def _read_map(path: Path, name: str, hemi: str) -> PointMap:
     if path.suffix == ".tsv":
         return _from_table(path, name)
     if path.name.endswith(DENSE_SCALARS):
@@ -240,8 +260,7 @@ def read_map(path: Path, name: str, hemi: str) -> PointMap:
     arrays = [array for array in arrays if array.data.ndim == 1]
     if len(arrays) != 1:
         raise InputError(f"{path}: holds {len(arrays)} maps; give a file with one")
-    pairs = entities(path.name)
-    unit = dict(arrays[0].meta).get("Units") or _UNITS.get(pairs["suffix"], ARBITRARY)
+    unit = dict(arrays[0].meta).get("Units") or _UNITS.get(suffix(path), ARBITRARY)
     return PointMap(values=_finite(arrays[0].data), unit=str(unit))
 
 
@@ -359,13 +378,18 @@ def write_surface(path: Path, mesh: Mesh, maps: Mapping[str, Float]) -> None:
     """
     if path.suffix not in ENDINGS:
         raise UsageError(f"{path.name}: surfaces end with {', '.join(ENDINGS)}")
+    files.write_bytes(path, encode_surface(path.suffix, mesh, maps))
+
+
+def encode_surface(ending: str, mesh: Mesh, maps: Mapping[str, Float]) -> bytes:
+    """Encode a surface for :func:`write_surface`."""
     present_points = np.asarray(np.isfinite(mesh.points).all(axis=1), dtype=np.bool_)
     points = np.where(
         present_points[:, None], mesh.points, mesh.points[present_points].mean(axis=0)
     )
     faces = mesh.triangles[present_points[mesh.triangles].all(axis=1)]
-    data = {} if path.suffix == ".obj" else {name: np.ravel(maps[name]) for name in maps}
-    files.write_bytes(path, _by_meshio(path.suffix[1:], points, ("triangle", faces), data))
+    data = {} if ending == ".obj" else {name: np.ravel(maps[name]) for name in maps}
+    return _by_meshio(ending[1:], points, ("triangle", faces), data)
 
 
 def read_surface(path: Path) -> Mesh:

@@ -43,8 +43,12 @@ def write_map(
     count = sampled.values.shape[2]
     names = _column_names(source.name, count)
     digits = 7 if source.interpolation == "linear" else 15
-    write_nodes(result.path("map_table", source.name), names, sampled.values, digits)
+    columns = _with_mean(source, sampled.values)
+    values = np.stack(list(columns.values()), axis=-1)
+    write_nodes(result.path("map_table", source.name), list(columns), values, digits)
     definitions = describe_columns(hemisphere.NODES)
+    if source.name in columns:
+        definitions[source.name] = {"Description": "mean of the volumes, in their unit"}
     for number, name in enumerate(names, start=1):
         text = f"volume {number} of the source" if count > 1 else "value of the source"
         definitions[name] = {"Description": f"{text}, in its own unit"}
@@ -54,6 +58,15 @@ def write_map(
     files.write_bytes(
         result.path(key, source.name), gifti.maps_bytes(flat, hemi=result.name.hemi, names=names)
     )
+
+
+def _with_mean(source: MapSource, values: Float) -> dict[str, Float]:
+    """Name the volumes (Nx, Ny, T) of a map; numbers of several volumes begin with their mean."""
+    names = _column_names(source.name, values.shape[2])
+    columns = {name: values[:, :, number] for number, name in enumerate(names)}
+    if len(names) > 1 and source.interpolation == "linear":
+        return {source.name: values.mean(axis=2), **columns}
+    return columns
 
 
 def write_nodes(path: Path, names: Sequence[str], values: Float, digits: int = 7) -> None:
@@ -105,7 +118,10 @@ Mapped = tuple[MapSource, dict[str, Any], sampling.SampledMap]
 def signal_hash(item: HemisphereInput) -> list[object]:
     """List what decides about maps and regions: their files' contents and how they are read."""
     maps = [
-        [source.name, source.sampling, source.interpolation, _content(source.path)]
+        [
+            *(source.name, source.sampling, source.interpolation, _content(source.path)),
+            *(_content(Path(path)) for path in (source.transform, source.reference) if path),
+        ]
         for source in item.maps
     ]
     return [maps, _content(item.regions)] if maps or item.regions else []
@@ -135,6 +151,8 @@ def add_signals(
             "sampling": source.sampling,
             "interpolation": source.interpolation,
         }
+        if isinstance(source.transform, Path):
+            entry["transform"] = source_address(source.transform, sources)
         entries.append(entry)
         if source.path is None:
             entry["note"] = source.missing
@@ -172,11 +190,18 @@ def add_signals(
 def _sample(
     source: MapSource, path: Path, maps: HemisphereMaps, settings: MapSettings
 ) -> sampling.SampledMap:
+    from hipsta_bids.io.transforms import read_transform  # noqa: PLC0415  (in workers only)
     from hipsta_bids.io.volumes import read_scalars  # noqa: PLC0415  (nibabel, in workers only)
 
+    sheet = maps.layers if source.sampling == "depth" else maps.sheet
+    if isinstance(source.transform, Path):
+        reference = Path(source.reference) if source.reference else None
+        to_image = read_transform(source.transform, path, reference)
+        points = to_image(sheet.points.reshape(-1, 3)).reshape(sheet.points.shape)
+        sheet = replace(sheet, points=points)
     sampled = sampling.sample_on_sheet(
-        read_scalars(path, maps.sheet.points.reshape(-1, 3)),
-        maps.layers if source.sampling == "depth" else maps.sheet,
+        read_scalars(path, sheet.points.reshape(-1, 3)),
+        sheet,
         settings,
         sampling=source.sampling,
         interpolation=source.interpolation,
@@ -198,9 +223,8 @@ def write_signals(
     for source, entry, sampled in mapped:
         about = {key.capitalize(): value for key, value in entry.items()}
         write_map(result, source, sampled, about)
-        columns = _column_names(source.name, sampled.values.shape[2])
         kind = numbers if source.interpolation == "linear" else labels
-        kind |= {name: sampled.values[:, :, k] for k, name in enumerate(columns)}
+        kind |= _with_mean(source, sampled.values)
     if regions is not None:
         statistics = sampling.summarize_regions(regions, maps.sheet, numbers, labels)
         _write_regions(result, regions, statistics)

@@ -1,6 +1,6 @@
-"""Maps between the whole sheet and HippUnfold's unfolded surfaces.
+"""Maps between the whole sheet and HippUnfold's unfolded surfaces, and between these surfaces.
 
-Both cover the hippocampus from its posterior to its anterior end and from the subiculum to the end
+All cover the hippocampus from its posterior to its anterior end and from the subiculum to the end
 of the sheet at CA3. What has the same share of both ways is taken for the same place.
 """
 
@@ -9,44 +9,38 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from scipy.interpolate import LinearNDInterpolator
+from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 
 from hipsta_bids.errors import InputError, UsageError
 from hipsta_bids.geometry.catalog import MAPS
 from hipsta_bids.geometry.sheet import sheet_levels
 from hipsta_bids.io import files, gifti
 from hipsta_bids.io.gifti import DENSE_SCALARS, PointMap
+from hipsta_bids.io.hippunfold import unfolded_shares
 from hipsta_bids.participant.maps import write_nodes
 from hipsta_bids.settings import SheetSettings
-from hipsta_bids.types import Float, Mesh
+from hipsta_bids.types import Float
 
 TABLE, METRICS = ".tsv", (".shape.gii", ".func.gii")
 """Endings of outputs, beside `DENSE_SCALARS`."""
-_LOW, _SIZE = np.array([-40.0, -200.0]), np.array([40.0, 20.0])
-"""HippUnfold's unfolded rectangle, mm: posterior to anterior, and subiculum to dentate gyrus.
-
-As in surfaces of `space-unfold` (DeKraker et al. 2022, eLife 11:e77945).
-"""
-_ROOM = 0.5
-"""mm; vertices lie no farther outside the rectangle."""
+Unfolded = tuple[str, Float]
+"""Label of an unfolded surface, and shares of its vertices."""
 _LARGEST = 1 + 1e-4
 """Of a proximal-distal coordinate, with room for rounding."""
-_COVERED = 0.9
-"""A surface covers this share of the rectangle along both axes, at least."""
 
 
 class Correspondence:
     """Where HippUnfold's vertices lie on the whole sheet."""
 
     def __init__(
-        self, flat: Mesh, settings: SheetSettings, proximodistal: Float | None = None
+        self, shares: Float, settings: SheetSettings, proximodistal: Float | None = None
     ) -> None:
-        """Place the vertices of an unfolded surface, in mm as HippUnfold writes them.
+        """Place vertices by their shares (V, 2) of both ways (``unfolded_shares``).
 
         ``proximodistal`` (Nx, Ny) of the sheet takes the place of x, if it is given.
         """
         x, y, _ = sheet_levels(settings, "whole")
-        anterior, lateral = ((flat.points[:, :2] - _LOW) / _SIZE).T
+        anterior, lateral = shares.T
         #: (V, 2) from -1 to 1 between the edges, and y between the ends of the sheet.
         self.places: Float = np.column_stack([2 * lateral - 1, y[0] + anterior * (y[-1] - y[0])])
         along = np.broadcast_to(y, (len(x), len(y)))
@@ -75,6 +69,7 @@ def resample(
     *,
     column: str = "thickness",
     sheets: Sequence[Path] = (),
+    targets: Sequence[Path] = (),
 ) -> str:
     """Move maps of one or both sides to HippUnfold's vertices, or from there to the whole sheet.
 
@@ -82,58 +77,123 @@ def resample(
     files of HippUnfold; ``out`` is GIFTI, CIFTI or, of one side of the sheet, a table, by its
     ending. ``surfaces`` are HippUnfold's unfolded ones, one for both sides or one for each;
     ``settings`` are the settings of the sheets; ``sheets`` their ``desc-proximodistal`` maps, one
-    for each side. Returns one line about the result.
+    for each side. ``targets`` are unfolded surfaces of another density or version, to which maps
+    of HippUnfold are moved instead of to the sheet. Returns one line about the result.
     """
     if not out.name.endswith((TABLE, *METRICS, DENSE_SCALARS)):
         ends = ", ".join((*METRICS, DENSE_SCALARS))
         raise UsageError(f"{out}: results end with {ends} or {TABLE}")
-    if out.resolve() in {path.resolve() for path in (*paths, *surfaces)}:
+    if out.resolve() in {path.resolve() for path in (*paths, *surfaces, *targets)}:
         raise UsageError(f"{out}: is an input; choose another name")
-    surface_of = {_hemi(path): _unfolded(path) for path in surfaces}
+    if targets and sheets:
+        raise UsageError("--sheet: has no use between two surfaces of HippUnfold; omit it")
+    surface_of, target_of = _by_side(surfaces), _by_side(targets)
     positions_of = {hemi: side.values for path in sheets for hemi, side in _read(path, column)}
-    x, y, _ = sheet_levels(settings, "whole")
-    nodes = len(x), len(y)
     moved: dict[str, PointMap] = {}
     path_of: dict[str, Path] = {}
-    vertices = False
+    to_vertices = bool(targets)
     sides = ((path, *pair) for path in paths for pair in _read(path, column))
     for path, hemi, side in sides:
         if hemi in moved:
             raise _several(f"{path_of[hemi]} and {path}: both are of side {hemi}")
-        flat = surface_of.get(hemi, surface_of.get(None))
-        if flat is None:
-            raise InputError(
-                f"{path}: there is no unfolded surface of side {hemi}; add it to --surface"
-            )
-        places = positions_of.get(hemi)
-        if places is not None and (
-            places.size != nodes[0] * nodes[1] or np.nanmax(np.abs(places)) > _LARGEST
-        ):
+        surface = _of_side(surface_of, hemi, path, "--surface")
+        if targets:
+            target = _of_side(target_of, hemi, path, "--to-surface")
+            values = _to_surface(path, side, surface, target)
+        else:
+            on_nodes, values = _to_other(path, side, surface, settings, positions_of.get(hemi))
+            if moved and on_nodes != to_vertices:
+                raise _several(f"{path}: is not on the same points as {paths[0]}")
+            to_vertices = on_nodes
+        moved[hemi], path_of[hemi] = replace(side, values=values), path
+    _write(out, moved, to_nodes=not to_vertices)
+    missing = np.mean(np.isnan(np.concatenate([side.values.ravel() for side in moved.values()])))
+    points = "vertices of HippUnfold" if to_vertices else "nodes of the whole sheet"
+    points_each = ", ".join(f"{side.values.size} {hemi}" for hemi, side in moved.items())
+    return f"{out}: {points_each} {points}, {missing:.0%} without a value"
+
+
+def _to_other(
+    path: Path, side: PointMap, surface: Unfolded, settings: SheetSettings, places: Float | None
+) -> tuple[bool, Float]:
+    """Move a map from the nodes of the sheet to vertices, or from there; return whether the former.
+
+    ``places`` are the sheet's proximal-distal coordinates, if they were given.
+    """
+    label, shares = surface
+    if label != "hipp":
+        raise InputError(f"{path}: the sheet has no {label}; give label-hipp, or --to-surface")
+    x, y, _ = sheet_levels(settings, "whole")
+    nodes = len(x), len(y)
+    if places is not None:
+        if places.size != nodes[0] * nodes[1] or np.nanmax(np.abs(places)) > _LARGEST:
             raise InputError(
                 f"--sheet: {nodes[0]} x {nodes[1]} points are needed; give the sheet's "
                 "desc-proximodistal map, or the results' --settings"
             )
-        between = Correspondence(flat, settings, None if places is None else places.reshape(nodes))
-        on_nodes = len(side.values) == nodes[0] * nodes[1] and side.nodes in (None, nodes)
-        if not on_nodes and len(side.values) != len(flat.points):
-            raise InputError(
-                f"{path}: {len(side.values)} points fit neither the sheet ({nodes[0]} x "
-                f"{nodes[1]}) nor the surface ({len(flat.points)}); give its surface, or "
-                "--settings"
-            )
-        if moved and on_nodes != vertices:
-            raise _several(f"{path}: is not on the same points as {paths[0]}")
-        vertices = on_nodes
-        if on_nodes:
-            values = between.to_vertices(side.values.reshape(nodes))
-        else:
-            values = between.to_nodes(side.values)
-        moved[hemi], path_of[hemi] = replace(side, values=values), path
-    _write(out, moved, to_nodes=not vertices)
-    missing = np.mean(np.isnan(np.concatenate([side.values.ravel() for side in moved.values()])))
-    points = "vertices of HippUnfold" if vertices else "nodes of the whole sheet"
-    points_each = ", ".join(f"{side.values.size} {hemi}" for hemi, side in moved.items())
-    return f"{out}: {points_each} {points}, {missing:.0%} without a value"
+        places = places.reshape(nodes)
+    between = Correspondence(shares, settings, places)
+    if len(side.values) == nodes[0] * nodes[1] and side.nodes in (None, nodes):
+        return True, between.to_vertices(side.values.reshape(nodes))
+    if len(side.values) != len(shares):
+        raise InputError(
+            f"{path}: {len(side.values)} points fit neither the sheet ({nodes[0]} x "
+            f"{nodes[1]}) nor the surface ({len(shares)}); give its surface, or "
+            "--settings"
+        )
+    return False, between.to_nodes(side.values)
+
+
+def _to_surface(path: Path, side: PointMap, surface: Unfolded, target: Unfolded) -> Float:
+    """Move a map to the vertices of another unfolded surface."""
+    (label, shares), (target_label, goal) = surface, target
+    if target_label != label or len(side.values) != len(shares):
+        raise InputError(
+            f"{path}: {len(side.values)} values, --surface is {label} with {len(shares)}"
+            f" vertices, --to-surface is {target_label}; give surfaces of one label"
+        )
+    return between_surfaces(shares, goal, side.values)
+
+
+def between_surfaces(shares: Float, goal: Float, values: Float) -> Float:
+    """Interpolate a map from vertices (V,) to the vertices (W,) of another surface.
+
+    Both positions are shares of the way. Outer vertices of the other surface may lie up to a
+    spacing outside: the map is continued there by point reflection at the edge. NaN beside NaN.
+    """
+    linear, nearest = (
+        make(shares, values) for make in (LinearNDInterpolator, NearestNDInterpolator)
+    )
+    covers = LinearNDInterpolator(shares, np.zeros(len(shares)))
+
+    def interpolate(places: Float) -> Float:
+        covered = np.isfinite(covers(places))
+        return np.asarray(np.where(covered, linear(places), nearest(places)), dtype=np.float64)
+
+    edge = np.clip(goal, shares.min(axis=0), shares.max(axis=0))
+    inside = (edge == goal).all(axis=1)
+    continued = 2 * interpolate(edge) - interpolate(2 * edge - goal)
+    return np.where(inside, interpolate(goal), continued)
+
+
+def _by_side(paths: Sequence[Path]) -> dict[str | None, Unfolded]:
+    """Read unfolded surfaces; a single one without a side in its name is for both sides.
+
+    HippUnfold 2 has one template for both sides, which calls itself right.
+    """
+    if len(paths) > 1:
+        return {_hemi(path): _unfolded(path) for path in paths}
+    return {files.entities(path.name).get("hemi"): _unfolded(path) for path in paths}
+
+
+def _of_side(
+    surface_of: Mapping[str | None, Unfolded], hemi: str, path: Path, option: str
+) -> Unfolded:
+    """Choose the surface of a side, or the one of both."""
+    surface = surface_of.get(hemi, surface_of.get(None))
+    if surface is None:
+        raise InputError(f"{path}: there is no unfolded surface of side {hemi}; add it to {option}")
+    return surface
 
 
 def _write(out: Path, maps: Mapping[str, PointMap], *, to_nodes: bool) -> None:
@@ -191,18 +251,15 @@ def _hemi(path: Path) -> str | None:
     return named or inside
 
 
-def _unfolded(path: Path) -> Mesh:
-    """Read an unfolded surface of HippUnfold."""
-    flat = gifti.read_mesh(path)
-    low, high = flat.points.min(axis=0), flat.points.max(axis=0)
-    inside = (low[:2] >= _LOW - _ROOM).all() and (high[:2] <= _LOW + _SIZE + _ROOM).all()
-    covers = ((high - low)[:2] >= _COVERED * _SIZE).all()
-    if not (inside and covers and flat.flat):
+def _unfolded(path: Path) -> Unfolded:
+    """Read an unfolded surface of HippUnfold: its label, and shares of its vertices."""
+    surface = unfolded_shares(gifti.read_mesh(path))
+    if surface is None:
         raise InputError(
-            f"{path}: is no unfolded surface of HippUnfold; give space-unfold, label-hipp (x "
-            "-40 to 0, y -200 to -180 mm)"
+            f"{path}: is no unfolded surface of HippUnfold; give its space-unfold_..."
+            "_midthickness.surf.gii"
         )
-    return flat
+    return surface
 
 
 def _several(problem: str) -> InputError:

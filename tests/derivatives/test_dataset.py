@@ -80,6 +80,26 @@ def test_settings_that_are_gone_are_those_of_another_version(tmp_path):
         dataset.settle_settings(tmp_path, Settings())
 
 
+def test_a_new_version_may_add_settings(tmp_path):
+    path = tmp_path / "desc-settings.json"
+    digest = dataset.settle_settings(tmp_path, Settings())
+    current = files.read_json(path)
+    assert not dataset.upgrade_notes(tmp_path)
+    earlier = json.loads(json.dumps(current)) | {"hash": "0", "version": "0.0.9"}
+    del earlier["settings"]["grid"]
+    files.write_json(path, earlier)
+    (note,) = dataset.upgrade_notes(tmp_path)
+    assert "results of version 0.0.9; all hemispheres are measured again" in note
+    assert dataset.settle_settings(tmp_path, Settings()) == digest
+    assert files.read_json(path) == current
+    files.write_json(path, earlier)
+    with pytest.raises(SettingsError, match=r"body\.end_rule was"):
+        dataset.settle_settings(tmp_path, Settings().changed(body={"end_rule": "last-slice"}))
+    files.write_json(path, earlier | {"version": current["version"]})  # not by this version
+    with pytest.raises(SettingsError, match=r"grid\.spacing was not there"):
+        dataset.settle_settings(tmp_path, Settings())
+
+
 def test_apptainer_and_the_address_in_the_package_are_named(tmp_path, monkeypatch):
     monkeypatch.setenv("HIPSTA_BIDS_CONTAINER_TYPE", "docker")  # of the image it was made from
     monkeypatch.setenv("APPTAINER_CONTAINER", "/images/hipsta_bids.sif")

@@ -167,7 +167,8 @@ def test_four_dimensions_give_a_column_each(done):
     out, _ = done
     found = table(out, "map_table", "bold")
     one = table(out, "map_table", "T1w")["T1w"]
-    assert list(found.columns) == ["x", "y", "bold_1", "bold_2", "bold_3"]
+    assert list(found.columns) == ["x", "y", "bold", "bold_1", "bold_2", "bold_3"]
+    np.testing.assert_allclose(found["bold"], 2 * one / 3, rtol=1e-5)  # the mean
     # Values are written with seven digits, and read from single precision.
     np.testing.assert_allclose(found["bold_1"], one, rtol=1e-5)
     np.testing.assert_allclose(found["bold_2"], 2 * one, rtol=1e-5)

@@ -3,14 +3,19 @@
 from functools import cache
 from pathlib import Path
 
+import nibabel as nib
 import numpy as np
 import pytest
+from hippunfold_like import write_map
 from measured_phantoms import measure
+from scipy.spatial import cKDTree
 
+from hipsta_bids.cli.main import main
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.inputs.labels import read_label_volume
 from hipsta_bids.inputs.scan import HemisphereInput
 from hipsta_bids.inputs.search import InputRequest, find_hemispheres
+from hipsta_bids.io.gifti import read_mesh
 from hipsta_bids.protocols.load import load_protocol
 from validation import hippunfold
 
@@ -75,3 +80,54 @@ def test_labels_of_a_millimeter_are_refused(hemi):
     with pytest.raises(GeometryError, match=r"voxels of 1\.00 mm are too") as caught:
         measure(volume, hemi)
     assert caught.value.reason == "sheet-too-thin"
+
+
+MAPS = DATA.parent / "hippomaps"
+FLAT = "tpl-avg_space-{}_den-{}_label-{}_midthickness.surf.gii"
+#: Label, densities, and the error that the coarser one allows: the dentate gyrus has 8 rows of
+#: vertices over its fold in 2k, and 4 in 512.
+MOVES = [
+    ("hipp", "0p5mm", "2k", 0.01),
+    ("hipp", "0p5mm", "512", 0.01),
+    ("hipp", "2k", "512", 0.01),
+    ("dentate", "0p5mm", "2k", 0.03),
+    ("dentate", "0p5mm", "512", 0.08),
+]
+
+
+def canonical(density, label):
+    return read_mesh(MAPS / FLAT.format("canonical", density, label)).points
+
+
+@pytest.mark.parametrize(("label", "dense", "coarse", "most"), MOVES)
+def test_maps_move_between_versions_of_hippunfold(tmp_path, label, dense, coarse, most):
+    """What has one canonical position is one point: version 1 (mm) and version 2 (vertices)."""
+    start, goal = canonical(dense, label), canonical(coarse, label)
+    values = np.sin(start[:, 1] / 6) + 0.05 * start[:, 0]
+    surfaces = [MAPS / FLAT.format("unfold", one, label) for one in (dense, coarse)]
+    there, moved, back = (tmp_path / f"hemi-L_{n}.shape.gii" for n in ("a", "b", "c"))
+    write_map(there, values)
+    for source, out, (flat, target) in (
+        (there, moved, surfaces),
+        (moved, back, surfaces[::-1]),
+    ):
+        arguments = source, out, "--surface", flat, "--to-surface", target
+        assert main(["resample", *map(str, arguments)]) == 0
+    found, returned = (nib.load(path).agg_data() for path in (moved, back))
+    nearest = cKDTree(start).query(goal)[1]
+    assert np.corrcoef(found, values[nearest])[0, 1] >= 0.99
+    error = (returned - values) / np.ptp(values)
+    assert np.sqrt(np.mean(error**2)) < most
+
+
+def test_labels_of_surfaces_that_are_moved_have_to_agree(tmp_path, capsys):
+    path = tmp_path / "hemi-L_a.shape.gii"
+    write_map(path, np.ones(7262))
+    flat, dentate = (
+        str(MAPS / FLAT.format("unfold", *name)) for name in (("0p5mm", "hipp"), ("2k", "dentate"))
+    )
+    out = str(tmp_path / "out.shape.gii")
+    assert main(["resample", str(path), out, "--surface", flat, "--to-surface", dentate]) == 65
+    assert "give surfaces of one label" in capsys.readouterr().err
+    assert main(["resample", str(path), out, "--surface", dentate]) == 65
+    assert "the sheet has no dentate" in capsys.readouterr().err

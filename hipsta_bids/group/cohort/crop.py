@@ -13,11 +13,12 @@ import pandas as pd
 from hipsta_bids.derivatives.hemisphere import ResultPlace, read_sheet
 from hipsta_bids.errors import InputError
 from hipsta_bids.geometry.surrogate import compare_nearby
-from hipsta_bids.group.cohort.external import ExternalFiles, surfaces_beside
+from hipsta_bids.group.cohort.external import ExternalFiles, sign_notes
 from hipsta_bids.group.stats.arrays import SideMaps
 from hipsta_bids.inputs.maps import fill, find
 from hipsta_bids.io import files
 from hipsta_bids.io.gifti import read_map, read_surface
+from hipsta_bids.io.hippunfold import surfaces_beside
 from hipsta_bids.types import VisitKey
 
 #: Nodes farther than this from all vertices have no value, mm; sheets are as thick or thicker.
@@ -37,6 +38,7 @@ def crop_maps(
     row_of = {visit: row for row, visit in enumerate(visits)}
     name, sides, units, notes = source.request.name, {}, ["1"], list[str]()
     for hemi, path_of in source.files.items():
+        notes += sign_notes(name, hemi, path_of.values())
         values = {}
         for visit in sorted(path_of, key=row_of.__getitem__):
             place = places.get((visit, hemi))

@@ -24,6 +24,7 @@ from hipsta_bids.inputs.maps import Found, check_pattern, fields_of, fill, find,
 from hipsta_bids.io import files
 from hipsta_bids.io.files import entities
 from hipsta_bids.io.gifti import DENSE_SCALARS, PointMap, cifti_sides, read_map, read_surface
+from hipsta_bids.io.hippunfold import has_opposite_sign, surfaces_beside
 from hipsta_bids.types import Mesh, VisitKey
 
 
@@ -143,6 +144,7 @@ def read_maps(
         keys = sorted(path_of, key=row_of.__getitem__)
         paths = [path_of[visit] for visit in keys]
         maps = [read_map(path, name, hemi) for path in paths]
+        notes += sign_notes(name, hemi, paths)
         _refuse_mixed(name, hemi, paths, maps)
         # The curvature of other programs may be huge at single vertices of good maps.
         problems = [why_impossible(name, m.values) if name == THICKNESS else None for m in maps]
@@ -173,6 +175,13 @@ def read_maps(
         )
         units.append(first.unit)
     return sides, units[0], notes
+
+
+def sign_notes(name: str, hemi: str, paths: Iterable[Path]) -> list[str]:
+    """Note maps that were multiplied by -1 when they were read."""
+    turned = sum(has_opposite_sign(path, hemi) for path in paths)
+    text = f"curvature of {turned} right hemispheres by HippUnfold 1 was multiplied by -1"
+    return [f"--maps {name}: {text} (opposite sign)"] if turned else []
 
 
 def _refuse_mixed(name: str, hemi: str, paths: Sequence[Path], maps: Sequence[PointMap]) -> None:
@@ -213,26 +222,6 @@ def _named_surface(source: ExternalFiles, hemi: str, points: int) -> Mesh:
     raise InputError(
         f"--maps-surface: no file {next(iter(names))}; it serves to draw {request.name}"
     )
-
-
-def surfaces_beside(path: Path, hemi: str, *, flat: bool = True) -> list[Path]:
-    """HippUnfold's unfolded surface, or others: beside the map, or in version 2 in ``surf/``."""
-    wanted_entities = {**entities(path.name), "hemi": hemi}
-    keys = ("sub", "ses", "hemi", "den", "label")
-    folders = path.parent, path.parent.parent / "surf"
-    pattern = "*_midthickness.surf.gii"
-    candidates = {
-        one: entities(one.name)
-        for folder in folders
-        for one in sorted(folder.glob(pattern))
-        if ("_space-unfold" in one.name) == flat
-    }
-    # Sheets of this program have an unfolded surface too, but their maps have their grid.
-    return [
-        one
-        for one, other in candidates.items()
-        if "seg" not in other and all(wanted_entities.get(key) == other.get(key) for key in keys)
-    ]
 
 
 def find_all(

@@ -239,7 +239,7 @@ def _draw_rows(
     for number, (hemi, ground) in enumerate(sides.items()):
         left = (_LEFT + number * (space + _BETWEEN)) * MM
         if ground.unfolded:
-            ends = X_ENDS if ground.mesh is None else (laid_out(ground.mesh)[2][0], "")
+            ends = X_ENDS if ground.mesh is None else laid_out(ground.mesh)[1]
             box = round(left), round(unit * MM)
             columns.append(_Column(hemi=hemi, ground=ground, box=box, title="unfolded", ends=ends))
             left += (unit + _GAP) * MM
@@ -450,8 +450,8 @@ def _enclose(axes: "Axes", ground: Ground, survive: Bool) -> None:
     if ground.mesh is not None:
         from matplotlib.tri import Triangulation  # noqa: PLC0415  (slow to load)
 
-        plane, triangles, _ = laid_out(ground.mesh)
-        grid = Triangulation(plane[:, 0], plane[:, 1], triangles)
+        plane = laid_out(ground.mesh)[0]
+        grid = Triangulation(plane[:, 0], plane[:, 1], ground.mesh.triangles)
         axes.tricontour(grid, survive.ravel().astype(np.float64), **line)
         return
     # Closed where it meets the edges of the sheet.

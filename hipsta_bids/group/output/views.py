@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hipsta_bids.group.stats.arrays import Bool, Float, Int
+from hipsta_bids.io.hippunfold import unfolded_shares
+from hipsta_bids.reports.display import X_ENDS, Y_ENDS
 from hipsta_bids.types import Mesh
 
 if TYPE_CHECKING:
@@ -221,13 +223,13 @@ def _thick(line: Bool, width: float) -> Bool:
 
 def draw_mesh(axes: "Axes", mesh: Mesh, values: Float, scale: Mapping[str, Any]) -> None:
     """Draw a map on a flat surface, in its own coordinates."""
-    plane, triangles, words = laid_out(mesh)
-    finite = np.isfinite(values.ravel()[triangles]).all(axis=1)
+    plane, _, name = laid_out(mesh)
+    finite = np.isfinite(values.ravel()[mesh.triangles]).all(axis=1)
     axes.set_aspect("equal")
-    axes.set_ylabel(words[1], labelpad=2)
+    axes.set_ylabel(name, labelpad=2)
     (left, bottom), (right, top) = plane.min(axis=0), plane.max(axis=0)
     if finite.any():
-        faces = triangles[finite]
+        faces = mesh.triangles[finite]
         colors = values.ravel()[faces].mean(axis=1)
         axes.tripcolor(
             plane[:, 0],
@@ -239,17 +241,18 @@ def draw_mesh(axes: "Axes", mesh: Mesh, values: Float, scale: Mapping[str, Any])
             rasterized=True,
         )
     axes.set_xlim(left, right)
-    axes.set_ylim(*((top, bottom) if words[1].startswith("x") else (bottom, top)))
+    axes.set_ylim(bottom, top)
 
 
-def laid_out(mesh: Mesh) -> tuple[Float, Int, tuple[str, str]]:
-    """Positions of a flat surface in the plane, triangles, and what the axes are.
+def laid_out(mesh: Mesh) -> tuple[Float, tuple[str, str], str]:
+    """Positions of a flat surface in the plane, words at its lower ends, and the upright axis.
 
-    HippUnfold's runs from anterior to posterior along x and from the subiculum to the dentate
-    gyrus along y, so that x points down and y to the right, as on a sheet.
+    HippUnfold's surfaces lie as sheets do, the posterior end at the bottom. Others have their
+    longer axis upright.
     """
     reach = np.ptp(mesh.points, axis=0)
-    names = ("x of the surface", "y of the surface")
-    if reach[0] > reach[1]:
-        return mesh.points[:, [1, 0]], mesh.triangles, (names[1], names[0])
-    return mesh.points[:, :2], mesh.triangles, names
+    along = int(reach[1] >= reach[0])
+    plane = mesh.points[:, [1 - along, along]]
+    if unfolded_shares(mesh) is None:
+        return plane, (f"{'yx'[along]} of the surface", ""), f"{'xy'[along]} of the surface"
+    return plane, X_ENDS, " to ".join(Y_ENDS)

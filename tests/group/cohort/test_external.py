@@ -70,6 +70,47 @@ def test_maps_of_hippunfold_with_the_surface_beside(tmp_path, version):
     assert np.isnan(sides["R"].maps["hipp"]).sum() == (values < 1).sum()
 
 
+def test_curvature_has_one_sign_on_both_sides(tmp_path, version):
+    """HippUnfold 1 gives curvature of right hemispheres with the opposite sign."""
+    values = np.linspace(-0.4, 0.6, 50)
+    for hemi, sign in (("L", 1), ("R", -1 if version == 1 else 1)):
+        write_subject(tmp_path, "01", version, sign * values, hemi, measure="curvature")
+    pattern = PATTERNS[version].replace("thickness", "curvature")
+    (request,) = map_patterns([("bend", pattern)], (), ())
+    found = find_maps(request, tmp_path, (), anybody)
+    sides, _, notes = read_maps(found, [("01", None)], GRID, with_sheets=True)
+    for side in sides.values():
+        np.testing.assert_allclose(side.maps["bend"][0, :, 0], values, rtol=1e-6)
+    assert [note for note in notes if "multiplied by -1" in note] == notes
+    assert len(notes) == (version == 1)
+
+
+@pytest.mark.parametrize(
+    "name", ["{subject}.{hemi}.hipp_thickness", "{subject}.hippocampus_thickness"]
+)
+def test_maps_in_the_folders_of_the_hcp(tmp_path, name):
+    """Names and structures are those of the HCP's pipelines."""
+    folder = tmp_path / "100307" / "T1w" / "HippUnfold" / "2k"
+    values = {"L": np.linspace(0.5, 2, 50), "R": np.linspace(1, 3, 50)}
+    for hemi in "LR":
+        write_surface(folder / f"100307.{hemi}.hipp_flat.2k.surf.gii", POINTS, TRIANGLES)
+        write_map(folder / f"100307.{hemi}.hipp_thickness.2k.shape.gii", values[hemi])
+    sides = {"HIPPOCAMPUS_LEFT": values["L"], "HIPPOCAMPUS_RIGHT": values["R"]}
+    sides |= {"HIPPOCAMPUS_DENTATE_LEFT": np.ones(20), "HIPPOCAMPUS_DENTATE_RIGHT": np.ones(20)}
+    axes = [BrainModelAxis.from_surface(np.arange(len(v)), len(v), s) for s, v in sides.items()]
+    scalars = ScalarAxis(["thickness"]), sum(axes[1:], start=axes[0])
+    image = Cifti2Image(np.concatenate(list(sides.values()))[None], scalars)
+    image.to_filename(folder / "100307.hippocampus_thickness.2k.dscalar.nii")
+    ending = "shape.gii" if "hemi" in name else "dscalar.nii"
+    pattern = f"{{subject}}/T1w/HippUnfold/2k/{name}.2k.{ending}"
+    sides, unit, visits = find_and_read(tmp_path, pattern)
+    assert unit == "mm"
+    assert visits == [("100307", None)]
+    for hemi, side in sides.items():
+        np.testing.assert_allclose(side.maps["hipp"][0, :, 0], values[hemi], rtol=1e-6)
+        np.testing.assert_allclose(side.mesh.points, POINTS, rtol=1e-6)
+
+
 def test_sessions_of_the_sheets_decide(tmp_path):
     pattern = "hippunfold/sub-{subject}/ses-{session}/surf/*_hemi-{hemi}_*_thickness.shape.gii"
     for session in ("a", "b"):

@@ -4,6 +4,7 @@ import contextlib
 import io
 import re
 import zlib
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -118,11 +119,25 @@ def test_a_flat_surface_is_drawn_upright_in_its_own_coordinates(size, words):
     mesh, _ = surface(*size, 0.0)
     axis = new_figure((3.0, 3.0), None).subplots()
     draw_mesh(axis, mesh, np.zeros(len(mesh.points)), GRAY)
-    assert laid_out(mesh)[2][0] == f"{words[0]} of the surface"
+    assert laid_out(mesh)[1] == (f"{words[0]} of the surface", "")
     assert axis.get_ylabel() == f"{words[1]} of the surface"
     assert axis.get_xlim() == (-4.0, 4.0)
-    # Its x, from anterior to posterior, goes down where it is the longer one.
-    assert axis.get_ylim() == ((10.0, -10.0) if words == "yx" else (-10.0, 10.0))
+    assert axis.get_ylim() == (-10.0, 10.0)
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_unfolded_surfaces_of_hippunfold_lie_as_sheets_do(version):
+    """Of both versions the posterior end is at the bottom and the subiculum on the left."""
+    mesh, _ = surface(40.0, 20.0, 0.0)
+    points = mesh.points + np.array([-20.0, -190.0, 1.0])  # version 1: x is posterior to anterior
+    mesh = replace(mesh, points=points if version == 1 else points[:, [1, 0, 2]])
+    plane, ends, name = laid_out(mesh)
+    np.testing.assert_array_equal(plane, points[:, [1, 0]])
+    assert ends == ("medial", "lateral")
+    assert name == "posterior to anterior"
+    axis = new_figure((3.0, 3.0), None).subplots()
+    draw_mesh(axis, mesh, np.zeros(len(points)), GRAY)
+    assert axis.get_ylim() == (-40.0, 0.0)
 
 
 def test_triangles_without_a_value_are_left_out():
