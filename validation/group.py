@@ -164,28 +164,43 @@ def simulate_cohort(plan: SimulationPlan, seed: int) -> SimulatedCohort:
     size = random.standard_normal((n, 2)) * plan.warp_sd
     size[:, 0] += plan.shift * group
     warps = grid + (size - size.mean(axis=0)) @ waves / (x_nodes - 1)
-    affected = _region(plan)
-    level, *factors = plan.amplitude
-    bumps = [(factor * h, *at) for factor, (h, *at) in zip(factors, _BEND[1], strict=True)]
-    scaled = _bumps(warps, level * _BEND[0], bumps)
-    bend = np.where(group[:, None], scaled, _bumps(warps, *_BEND))
+    affected = region(plan)
+    scaled = mean_curvature(warps, plan.amplitude)
+    bend = np.where(group[:, None], scaled, mean_curvature(warps))
     bend *= 1 + plan.amplitude_sd * random.standard_normal((n, 1))
     curvature = bend[:, :, None] + plan.curvature_sd * random.standard_normal((n, x_nodes, y_nodes))
     field = plan.thickness_sd * smooth_noise(random, (n, x_nodes, y_nodes), plan.correlation)
     field += plan.age_slope * (age - age.mean())[:, None, None]
     field -= plan.effect * plan.thickness_sd * group[:, None, None] * affected
     # A subject shows the values of a registered point where that point lies in the subject.
-    seen = _at(field, warps) + _bumps(warps, *_WALL)[:, :, None]
+    seen = _at(field, warps) + mean_wall(warps)[:, :, None]
     return SimulatedCohort(seen, curvature, group, age, sex, warps, affected)
 
 
-def _region(plan: SimulationPlan) -> Float:
+def region(plan: SimulationPlan) -> Float:
     """Share of the full effect at each registered node: a plateau with cosine edges."""
     edges = []
     for nodes, center, half in zip(plan.nodes, plan.center, plan.core, strict=True):
         beyond = (np.abs(np.arange(nodes) - center) - half) / plan.taper
         edges.append(0.5 + 0.5 * np.cos(np.pi * np.clip(beyond, 0, 1)))
     return np.asarray(np.outer(edges[0], edges[1]), dtype=np.float64)
+
+
+def mean_wall(at: Float) -> Float:
+    """Return mean thickness at positions along x, mm."""
+    return _bumps(at, *_WALL)
+
+
+def mean_curvature(
+    at: Float, amplitude: tuple[float, float, float, float] = (1.0, 1.0, 1.0, 1.0)
+) -> Float:
+    """Return mean curvature at positions along x, 1/mm, by factors of its level and bumps."""
+    level, *factors = amplitude
+    bumps = [
+        (factor * height, *place)
+        for factor, (height, *place) in zip(factors, _BEND[1], strict=True)
+    ]
+    return _bumps(at, level * _BEND[0], bumps)
 
 
 def _bumps(at: Float, level: float, bumps: Sequence[Sequence[float]]) -> Float:
@@ -283,10 +298,10 @@ def run(full: bool) -> Iterator[Content]:
     yield {"plan": plan}
     yield _cohorts(plan, range(COHORTS if full else FEW_COHORTS))
     yield _amplitudes(BIAS_COHORTS if full else FEW_BIAS_COHORTS)
-    yield _corrections(nulls, *_limits(nulls))
+    yield _corrections(nulls, *limits(nulls))
     joint = JOINT_COHORTS if full else FEW_JOINT_COHORTS
-    yield _together(joint, *_limits(joint))
-    yield repeated_visits(*_limits(nulls), range(nulls))
+    yield _together(joint, *limits(joint))
+    yield repeated_visits(*limits(nulls), range(nulls))
 
 
 @table("group.cohorts")
@@ -335,7 +350,7 @@ def _amplitudes(cohorts: int) -> Iterator[Cells]:
             }
 
 
-def _limits(cohorts: int) -> tuple[float, float]:
+def limits(cohorts: int) -> tuple[float, float]:
     """Shares of null cohorts with findings that are as intended; of few, within three SDs."""
     if cohorts >= NULL_COHORTS:
         return LEVEL_RANGE

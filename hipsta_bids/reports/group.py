@@ -183,13 +183,19 @@ def _registration(results: GroupResults) -> Mapping[str, Any] | None:
     if len(extreme):
         extreme = extreme.sort_values("displacement", ascending=False)
     settings = (results.record.get("settings") or {}).get("registration") or {}
-    alt = "Curvature from medial to lateral before and after registration, and warps, by group"
+    alignment = records(results.table("alignment"))
+    names = {"registration": "Curvature before and after, warps, and positions"}
+    for measure in dict.fromkeys(row["measure"] for row in alignment):
+        title = f"Statistics with and without registration, {cells.display_name(measure)}"
+        names |= {f"{measure}_alignment{end}": title for end in ("", "_2", "_3")}
     return {
         "align": settings.get("align"),
         "rows": records(table),
-        "alignment": records(results.table("alignment")),
+        "alignment": alignment,
         "extreme": records(extreme),
-        "pictures": embedded(results, "registration", "Registration", alt),
+        "pictures": [
+            picture for name, title in names.items() for picture in embedded(results, name, title)
+        ],
     }
 
 

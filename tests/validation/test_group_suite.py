@@ -46,7 +46,7 @@ def test_the_default_moves_groups_least_where_curvature_differs(monkeypatch):
 @pytest.mark.long
 def test_corrections_keep_the_family_wise_error_and_find_the_effect(monkeypatch):
     monkeypatch.setattr(group, "PERMUTATIONS", 60)
-    table = group._corrections(12, *group._limits(12))
+    table = group._corrections(12, *group.limits(12))
     assert table.targets == 4
     assert table.missed == 0
     power = {row["correction"]: row["core power"] for row in table.rows}
@@ -59,7 +59,7 @@ def test_corrections_keep_the_family_wise_error_and_find_the_effect(monkeypatch)
 
 def test_measures_together_keep_the_family_wise_error_and_find_more(monkeypatch):
     monkeypatch.setattr(group, "PERMUTATIONS", 60)
-    table = group._together(10, *group._limits(10))
+    table = group._together(10, *group.limits(10))
     assert table.targets == 5
     assert table.missed == 0
     both, single = (

@@ -16,7 +16,7 @@ import pandas as pd
 
 from hipsta_bids.group.cohort.data import SHEET, Cohort
 from hipsta_bids.group.output import panels, style
-from hipsta_bids.group.output.maps import draw_measure
+from hipsta_bids.group.output.maps import draw_alignment, draw_measure
 from hipsta_bids.group.output.results import Analysis, ScoredMaps
 from hipsta_bids.group.output.shapes import AverageShape
 from hipsta_bids.group.output.slices import draw_surrogate
@@ -202,7 +202,7 @@ def _sides_name(hemi: str) -> str:
 
 
 def draw_registration(results: GroupResults, width: float | None = None) -> "list[Figure]":
-    """Draw curvature from medial to lateral before and after registration, and the warps."""
+    """Draw curvature from medial to lateral before and after registration, and positions."""
     from matplotlib.collections import LineCollection  # noqa: PLC0415  (slow to load)
 
     profiles = results.table("profiles")
@@ -210,11 +210,13 @@ def draw_registration(results: GroupResults, width: float | None = None) -> "lis
     sides = [str(hemi) for hemi in profiles["hemi"].unique()]
     groups = [str(name) for name in profiles["group"].unique()]
     wide = (width or style.TWO_COLUMNS) > style.ONE_COLUMN
-    shape = (len(sides), 3) if wide else (3, len(sides))
-    size = (style.TWO_COLUMNS, 48.0 * len(sides)) if wide else (style.ONE_COLUMN, 150.0)
+    shape = (len(sides), 4) if wide else (4, len(sides))
+    size = (style.TWO_COLUMNS, 44.0 * len(sides)) if wide else (style.ONE_COLUMN, 200.0)
     figure, axes = style.new_panels(*shape, size)
     label = with_brackets("curvature", str(profiles["unit"].iloc[0]))
-    for hemi, (before, after, shifts) in zip(sides, axes if wide else axes.T, strict=True):
+    for hemi, (before, after, shifts, positions) in zip(
+        sides, axes if wide else axes.T, strict=True
+    ):
         for axis, registered in ((before, False), (after, True)):
             is_shown = (profiles["hemi"] == hemi) & (profiles["registered"] == registered)
             for color, group in zip(cycle(COLORS), groups, strict=False):
@@ -227,25 +229,40 @@ def draw_registration(results: GroupResults, width: float | None = None) -> "lis
         step = -(-sum(map(len, moved.values())) // _MOST_LINES)
         for color, group in zip(cycle(COLORS), groups, strict=False):
             nodes = np.linspace(0, 1, moved[group].shape[1])
-            lines = [np.column_stack([nodes, line]) for line in moved[group][::step]]
-            shifts.add_collection(LineCollection(lines, colors=color, alpha=0.25, linewidths=0.4))
+            shifted = moved[group][::step]
+            for axis, drawn in ((shifts, shifted), (positions, nodes + shifted / (len(nodes) - 1))):
+                lines = [np.column_stack([nodes, line]) for line in drawn]
+                axis.add_collection(LineCollection(lines, colors=color, alpha=0.25, linewidths=0.4))
         for color, group in zip(cycle(COLORS), groups, strict=False):
             _, mean, sd = describe_known([moved[group]])
             _curve(shifts, mean, sd / np.sqrt(max(len(moved[group]), 1)), color, group)
         shifts.axhline(0, color="black", linewidth=0.5)
         shifts.set_title(f"{SIDES[hemi]}, warps" + (f" (1 of {step} drawn)" if step > 1 else ""))
         shifts.set_ylabel("shift to lateral [nodes]")
-        for axis in (before, after, shifts):
+        positions.set_title(f"{SIDES[hemi]}, positions")
+        _mark_positions(positions)
+        for axis in (before, after, shifts, positions):
             mark_medial(axis, np.array([0.0, 1.0]))
     # Sides can be compared, as can both states.
     grid = axes if wide else axes.T
-    for panels_alike in (grid[:, :2].ravel(), grid[:, 2]):
+    for panels_alike in (grid[:, :2].ravel(), grid[:, 2], grid[:, 3]):
         ends = np.array([axis.get_ylim() for axis in panels_alike])
         for axis in panels_alike:
             axis.set_ylim(ends[:, 0].min(), ends[:, 1].max())
     style.explain(figure, grid[0, 0], "mean, 2 standard errors")
     style.letter_panels(axes.flat)
     return [figure]
+
+
+def _mark_positions(axis: "Axes") -> None:
+    """Draw the identity, and name both axes of positions."""
+    axis.plot([0, 1], [0, 1], "--", color="black", linewidth=0.5)
+    axis.set_xlabel("original position")
+    axis.set_ylabel("registered position")
+    axis.set_yticks([0, 1], X_ENDS, rotation=90)
+    low, high = axis.get_yticklabels()
+    low.set_verticalalignment("bottom")
+    high.set_verticalalignment("top")
 
 
 def _shifts_of(results: GroupResults, hemi: str, groups: Sequence[str]) -> dict[str, Float]:
@@ -482,6 +499,9 @@ def draw_figures(
     templates = [one.template for one in analysis.registrations.values()]
     if templates and None not in templates:
         yield "registration", partial(draw_registration, saved)
+    for measure in dict.fromkeys(key.measure for key in analysis.unregistered):
+        if all_measures or measure in measures[:MOST_FIGURES]:
+            yield f"{measure}_alignment", partial(draw_alignment, saved, measure)
     if shapes:
         yield "sections", partial(draw_sections, cohorts[SHEET], analysis, shapes)
     if len(saved.table("surrogate")):

@@ -4,7 +4,7 @@ No model is fitted for a figure: what a figure shows is in the tables of its fol
 """
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -39,6 +39,9 @@ class ContrastMap:
     alpha: float
 
 
+#: Ends of columns of tests, and what they are of.
+_STATES = {"": "Registered", "_unregistered": "Not registered"}
+
 Tests = Mapping[str, Mapping[str, Mapping[str, ContrastMap]]]
 """By side, measure and contrast."""
 
@@ -50,6 +53,48 @@ def draw_measure(
     blocks = [[row] for row in mean_rows(results, measure)]
     blocks += contrast_rows(results, measure)
     return panels.draw_pages(read_grounds(results, measure), blocks, views=views, dpi=dpi)
+
+
+def draw_alignment(results: GroupResults, measure: str) -> "list[Figure]":
+    """Draw statistics of a measure with and without registration, unfolded, by contrast."""
+    grounds = read_grounds(results, measure)
+    flat = {hemi: replace(ground, surface=None) for hemi, ground in grounds.items()}
+    return panels.draw_pages(flat, list(alignment_rows(results, measure)))
+
+
+def alignment_rows(results: GroupResults, measure: str) -> Iterator[list[Row]]:
+    """Show the statistic of each contrast with and without registration, on one scale."""
+    maps = results.table("maps")
+    for index, (name, rows) in enumerate(
+        maps[maps["measure"] == measure].groupby("contrast", sort=False)
+    ):
+        points = {str(row["hemi"]): results.table(str(row["file"])) for row in records(rows)}
+        kind = group_maps.kind_of_test(measure, next(iter(points.values())))
+        low, colors, _ = display.effect_colors(kind)
+        statistics = {
+            end: {hemi: own[f"statistic{end}"].to_numpy(np.float64) for hemi, own in points.items()}
+            for end in _STATES
+        }
+        values = display.known([own for sides in statistics.values() for own in sides.values()])
+        reach = float(np.abs(values).max(initial=1.0))
+        block = []
+        for end, state in _STATES.items():
+            survive = {
+                hemi: (own[f"significant{end}"] == True).to_numpy(bool)  # noqa: E712  (may be missing)
+                for hemi, own in points.items()
+            }
+            block.append(
+                Row(
+                    kind="statistic",
+                    index=index,
+                    title=f"{state}: {name}",
+                    label=f"{kind} statistic",
+                    scale={"cmap": colors, "vmin": low * reach, "vmax": reach},
+                    values=statistics[end],
+                    survive=survive,
+                )
+            )
+        yield block
 
 
 def contrast_rows(results: GroupResults, measure: str) -> Iterator[list[Row]]:

@@ -125,9 +125,10 @@ class Analysis:
     fitted: Mapping[str, FittedMaps]
     """Fitted maps by hemisphere; ``LR`` is left minus right."""
     found: Mapping[MapKey, Discoveries]
-    unregistered: Mapping[MapKey, Discoveries]
-    """The same of maps that were not registered; empty without registration, with permutations,
-    which are too slow to do twice, and with harmonization from a file."""
+    unregistered: Mapping[MapKey, tuple[Float, Discoveries]]
+    """Statistic (points,), and the same, of maps that were not registered; empty without
+    registration, with permutations, which are too slow to do twice, and with harmonization from a
+    file."""
     reference: tuple[str, int] | None
     """Covariates that scores are adjusted for, and participants of the reference group; ``None``
     without scores."""

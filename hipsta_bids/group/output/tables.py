@@ -97,6 +97,9 @@ def _statistics(cohort: Cohort, analysis: results.Analysis) -> Iterator[Named]:
         values = columns.point_columns(
             test, discoveries, columns.frame_of(cohort, fitted), fitted.fits[key.measure].n
         )
+        if (before := analysis.unregistered.get(key)) is not None:
+            values["statistic_unregistered"] = before[0]
+            values["significant_unregistered"] = before[1].rejected
         yield map_name(key.hemi, key.measure, key.contrast), pd.DataFrame(values)
 
 
@@ -258,20 +261,31 @@ def registration_tables(
 
 
 def _alignment(analysis: results.Analysis) -> pd.DataFrame:
-    """One row per map: points that survive with and without registration."""
+    """One row per map: what survives with and without registration, and how alike both are."""
     rows = []
-    for key, discoveries in analysis.found.items():
-        before = analysis.unregistered.get(key)
-        if before is not None:
+    for key, test, discoveries in results.tested_maps(analysis):
+        if key in analysis.unregistered:
+            statistic, before = analysis.unregistered[key]
+            n_significant, n_unregistered, n_both = (
+                int(points.sum())
+                for points in (
+                    discoveries.rejected,
+                    before.rejected,
+                    discoveries.rejected & before.rejected,
+                )
+            )
+            survive = n_significant + n_unregistered
             rows.append(
                 {
                     "measure": key.measure,
                     "contrast": key.contrast,
                     "hemi": key.hemi,
                     "n_tests": discoveries.n_tests,
-                    "n_significant": int(discoveries.rejected.sum()),
-                    "n_unregistered": int(before.rejected.sum()),
-                    "n_both": int((discoveries.rejected & before.rejected).sum()),
+                    "n_significant": n_significant,
+                    "n_unregistered": n_unregistered,
+                    "n_both": n_both,
+                    "dice": 2 * n_both / survive if survive else np.nan,
+                    "statistic_r": pd.Series(test.statistic).corr(pd.Series(statistic)),
                 }
             )
     return pd.DataFrame(rows)

@@ -128,11 +128,20 @@ def analyze_cohort(
         settings=settings,
     )
     harmonization, compared, fitted, discoveries = fit(measured, registrations=registrations)
-    unregistered: Mapping[inference.MapKey, inference.Discoveries] = {}
+    unregistered: Mapping[inference.MapKey, tuple[arrays.Float, inference.Discoveries]] = {}
     # Effects of sites from a file are those of registered nodes.
     is_repeated = settings.registration.align != "none" and (plan is None or plan.saved is None)
     if is_repeated and settings.multiplicity.method not in inference.PERMUTATIONS:
-        unregistered = fit(cohort)[3]
+        *_, maps_before, before = fit(cohort)
+        unregistered = {
+            (key := inference.MapKey(measure, test.contrast.name, hemi)): (
+                test.statistic,
+                before[key],
+            )
+            for hemi, side in maps_before.items()
+            for measure, point_fit in side.fits.items()
+            for test in point_fit.tests
+        }
     reference, scored, scores = score_cohort(
         compared,
         model,

@@ -220,7 +220,7 @@ def test_what_is_written_is_beside_maps_and_the_ruler_is_clear_of_the_color_bar(
 def test_sides_have_the_same_ticks():
     (figure,) = draw_registration(results())
     figure.draw_without_rendering()
-    rows = np.reshape(figure.axes, (2, 3))
+    rows = np.reshape(figure.axes, (2, 4))
     for left, right in rows.T:
         assert left.get_ylim() == right.get_ylim()
         assert left.get_yticks().tolist() == right.get_yticks().tolist()

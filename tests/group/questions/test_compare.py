@@ -53,6 +53,9 @@ def _quick_figures(request, monkeypatch):
         monkeypatch.setattr(write, "draw_figures", lambda *_: iter(()))
 
 
+_MAP_FIGURES = ("maps", "alignment")
+
+
 def statmap(folder, hemi):
     return table(folder / f"hemi-{hemi}_contrast-CNAD_desc-thickness_statmap.tsv")
 
@@ -69,7 +72,11 @@ def test_planted_thinning_is_the_peak_of_both_hemispheres(results):
         assert node == pytest.approx(PLAN.center[0], abs=2.0)
 
 
-def test_map_is_what_the_written_maps_and_covariates_give(results):
+@pytest.mark.parametrize(
+    ("maps", "statistic"),
+    [("thickness_registered", "statistic"), ("thickness", "statistic_unregistered")],
+)
+def test_map_is_what_the_written_maps_and_covariates_give(results, maps, statistic):
     """Anybody can repeat the fit from the hand-over file alone."""
     long = parquet.read_table(results / "maps.parquet").to_pandas()
     people = table(results / "covariates.tsv")
@@ -77,7 +84,7 @@ def test_map_is_what_the_written_maps_and_covariates_give(results):
     wide = own.pivot_table(
         index="participant_id",
         columns=["node_x", "node_y"],
-        values="thickness_registered",
+        values=maps,
         observed=True,
         dropna=False,
     ).loc[people.participant_id]
@@ -88,7 +95,7 @@ def test_map_is_what_the_written_maps_and_covariates_give(results):
     values = wide.to_numpy(dtype=float)
     (test,) = fit_points(values, matrix, [contrast], GlmSettings()).tests
     # Maps are handed over in single precision.
-    np.testing.assert_allclose(statmap(results, "L").statistic, test.statistic, rtol=1e-3)
+    np.testing.assert_allclose(statmap(results, "L")[statistic], test.statistic, rtol=1e-3)
 
 
 def test_tables_say_what_their_columns_are(results):
@@ -125,6 +132,14 @@ def test_findings_are_counted_with_and_without_registration(results):
     columns = ["measure", "contrast", "hemi", "n_tests", "n_significant"]
     pd.testing.assert_frame_equal(with_it[columns], maps[columns])
     assert (with_it.n_both <= with_it[["n_significant", "n_unregistered"]].min(axis=1)).all()
+    for hemi, row in with_it[with_it.measure == "thickness"].set_index("hemi").iterrows():
+        points = statmap(results, hemi)
+        after, before = points.significant, points.significant_unregistered
+        assert (before.sum(), (after & before).sum()) == (row.n_unregistered, row.n_both)
+        assert row.dice == pytest.approx(2 * row.n_both / (after.sum() + before.sum()))
+        expected = np.corrcoef(points.statistic, points.statistic_unregistered)[0, 1]
+        assert row.statistic_r == pytest.approx(expected)
+        assert 0.5 < row.statistic_r < 0.99  # moved by two nodes, but the same thinning
     # The cohort's groups are apart, so that the maps differ.
     assert (with_it.n_unregistered != with_it.n_significant).any()
     moved = pd.read_table(results / "registration.tsv")
@@ -336,7 +351,11 @@ def test_left_out_hemispheres_are_listed_with_the_reason(tmp_path, quick):
 
 def test_figures_are_drawn_as_pictures_and_drawings(results):
     names = {path.stem for path in (results / "figures").glob("*.png")}
-    assert names == {"thickness_maps", "curvature_maps", "registration", "roc"}
+    shown = {f"{name}_{kind}" for name in ("thickness", "curvature") for kind in _MAP_FIGURES}
+    assert names == shown | {"registration", "roc"}
+    compared = (results / "figures" / "thickness_alignment.svg").read_text()
+    assert ">Registered: CN-AD<" in compared
+    assert ">Not registered: CN-AD<" in compared
     for name in names:
         drawing = (results / "figures" / f"{name}.svg").read_text()
         # Words stay words, so that they can be searched and edited.
