@@ -488,8 +488,8 @@ def draw_figures(
     """List the figures that a page shows by name, or all, for :func:`encode`."""
     views: panels.Views = {}
     dpi = style.DOTS_PER_INCH if all_measures else _SCREEN
-    measures = measures_of(saved)
-    for measure in measures if all_measures else measures[:MOST_FIGURES]:
+    measures = measures_of(saved)[: None if all_measures else MOST_FIGURES]
+    for measure in measures:
         yield f"{measure}_maps", partial(draw_measure, saved, measure, views, dpi)
     for surface, analysis in analyses.items():
         if analysis.harmonization is not None and analysis.fitted:
@@ -499,9 +499,9 @@ def draw_figures(
     templates = [one.template for one in analysis.registrations.values()]
     if templates and None not in templates:
         yield "registration", partial(draw_registration, saved)
-    for measure in dict.fromkeys(key.measure for key in analysis.unregistered):
-        if all_measures or measure in measures[:MOST_FIGURES]:
-            yield f"{measure}_alignment", partial(draw_alignment, saved, measure)
+    unregistered = {key.measure for key in analysis.unregistered}
+    for measure in (name for name in measures if name in unregistered):
+        yield f"{measure}_alignment", partial(draw_alignment, saved, measure)
     if shapes:
         yield "sections", partial(draw_sections, cohorts[SHEET], analysis, shapes)
     if len(saved.table("surrogate")):
