@@ -116,11 +116,7 @@ def write_results(
             files.write_json(folder / "harmonization.json", effects.model_dump(by_alias=True))
     for surface, one in analyses.items():
         _write_surfaces(folder, cohorts[surface], one)
-        about = {
-            key: describe_test(one, settings, key, test, found)
-            for key, test, found in results.tested_maps(one)
-        }
-        write_stats(folder, stats_of(results.tested_maps(one)), about)
+        write_stats(folder, stats_of(results.tested_maps(one)), _about_tests(one, settings))
         table, sheets = one.compared.table, bool(one.registered)
         write_scores(folder, cohorts[surface], table, one.scored, letter="w", sheets=sheets)
     _write_joint(folder, joint, settings, averages)
@@ -259,52 +255,44 @@ def stats_of(
     }
 
 
-#: ``StatMapType`` by the value of ``stat-``, in the letters of NeuroVault; else "Other".
-_MAP_TYPES = {"t": "T", "F": "F", "z": "Z", "pcorrected": "P"}
-_MEANINGS = {
-    "d": "Cohen's d",
-    "eta2": "partial eta squared",
-    "pcorrected": "p-value, corrected for the number of points",
+#: ``StatMapType``, in the letters of NeuroVault, and description by the value of ``stat-``.
+_MAP_TYPES = {
+    "t": ("T", "t statistic"),
+    "F": ("F", "F statistic"),
+    "d": ("Other", "Cohen's d"),
+    "eta2": ("Other", "partial eta squared"),
+    "pcorrected": ("P", "p-value, corrected for the number of points"),
 }
+_About = Mapping[MapKey, Mapping[str, Any]]
 
 
-def describe_test(
-    analysis: results.Analysis,
-    settings: GroupSettings,
-    key: MapKey,
-    test: PointTest,
-    discoveries: Discoveries,
-) -> dict[str, Any]:
-    """Describe a test for the sidecars of its maps."""
-    fit, rules = analysis.fitted[key.hemi].fits[key.measure], settings.multiplicity
-    df, n = test.df[np.isfinite(test.df)], fit.n[np.isfinite(test.df)]
+def _about_tests(analysis: results.Analysis, settings: GroupSettings) -> _About:
+    """Describe tests for the sidecars of their maps."""
+    rules, about = settings.multiplicity, {}
     names = [*analysis.design.columns, *(f"map({name})" for name in analysis.model.maps)]
-    return {
-        "Measure": key.measure,
-        "Contrast": key.contrast,
-        "ContrastWeights": dict(zip(names, test.contrast.weights.T.tolist(), strict=True)),
-        "Model": analysis.model.text,
-        "ModelType": "linear mixed model" if analysis.comparison.longitudinal else "linear model",
-        "DegreesOfFreedom": [float(df.min()), float(df.max())] if len(df) else None,
-        "DegreesOfFreedomNumerator": test.contrast.n_rows if test.kind == "F" else None,
-        "NumberOfParticipants": analysis.n_participants,
-        "NumberOfRows": [int(n.min()), int(n.max())] if len(n) else None,
-        "Correction": rules.method,
-        "Level": discoveries.alpha,
-        "Family": f"all points of equal {', '.join(FAMILY[rules.scope])}",
-        "NumberOfTests": discoveries.n_tests,
-    }
+    for key, test, discoveries in results.tested_maps(analysis):
+        fitted = np.isfinite(test.df)
+        df, n = test.df[fitted], analysis.fitted[key.hemi].fits[key.measure].n[fitted]
+        about[key] = {
+            "Measure": key.measure,
+            "Contrast": key.contrast,
+            "ContrastWeights": dict(zip(names, test.contrast.weights.T.tolist(), strict=True)),
+            "Model": analysis.model.text,
+            "Mixed": analysis.comparison.longitudinal,
+            "DegreesOfFreedom": [float(df.min()), float(df.max())] if len(df) else None,
+            "DegreesOfFreedomNumerator": test.contrast.n_rows if test.kind == "F" else None,
+            "NumberOfParticipants": analysis.n_participants,
+            "NumberOfRows": [int(n.min()), int(n.max())] if len(n) else None,
+            "Correction": rules.method,
+            "Level": discoveries.alpha,
+            "Family": f"all points of equal {', '.join(FAMILY[rules.scope])}",
+            "NumberOfTests": discoveries.n_tests,
+        }
+    return about
 
 
-def write_stats(
-    folder: Path,
-    maps: Mapping[MapKey, _Stats],
-    about: Mapping[MapKey, Mapping[str, Any]] | None = None,
-) -> None:
-    """Write maps of statistics as GIFTI, and maps of both sides as one CIFTI file.
-
-    Maps with an entry of ``about`` have sidecars.
-    """
+def write_stats(folder: Path, maps: Mapping[MapKey, _Stats], about: _About | None = None) -> None:
+    """Write maps of statistics as GIFTI, with sidecars if described, and of both sides as CIFTI."""
     grouped: dict[str, dict[str, _Stats]] = {}
     for key, stats in maps.items():
         for stat, values in stats.items():
@@ -315,9 +303,8 @@ def write_stats(
             content = gifti.shape_bytes(values, hemi=hemi, name=stem, unit="1")
             files.write_bytes(folder / f"{stem}.shape.gii", content)
             if about is not None and key in about:
-                meaning = _MEANINGS.get(stat, f"{stat} statistic")
-                kind = {"StatMapType": _MAP_TYPES.get(stat, "Other"), "Description": meaning}
-                files.write_json(folder / f"{stem}.json", {**kind, **about[key]})
+                words = dict(zip(("StatMapType", "Description"), _MAP_TYPES[stat], strict=True))
+                files.write_json(folder / f"{stem}.json", words | dict(about[key]))
         if key.hemi in {"L", "R"}:
             name = tables.map_name("", key.measure, key.contrast)
             grouped.setdefault(name, {})[key.hemi] = stats
