@@ -1,8 +1,8 @@
 """Hippocampal thickness, curvature and shape maps from subfield segmentations.
 
 ``import hipsta_bids as hb`` gives :func:`measure`, :func:`load`, :func:`register`, :func:`group`,
-:func:`figure`, :func:`example`, and the functions ``plot_sheet``, ``plot_surface`` and
-``plot_group``. They are loaded when first used.
+:func:`correlate`, :func:`figure`, :func:`example`, and the functions ``plot_sheet``,
+``plot_surface`` and ``plot_group``. They are loaded when first used.
 """
 
 __version__ = "0.1.0"
@@ -12,6 +12,7 @@ _MODULES = {
     "measure": "hipsta_bids.api.maps",
     "load": "hipsta_bids.api.datasets",
     "example": "hipsta_bids.api.datasets",
+    "correlate": "hipsta_bids.group.questions.correlate",
     "register": "hipsta_bids.group.questions.models",
     "figure": "hipsta_bids.api.figures",
     "plot_sheet": "hipsta_bids.api.plots",
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from hipsta_bids.api.figures import figure
     from hipsta_bids.api.maps import measure
     from hipsta_bids.api.plots import plot_group, plot_sheet, plot_surface
+    from hipsta_bids.group.questions.correlate import correlate
     from hipsta_bids.group.questions.models import group, register
 else:
 
@@ -43,6 +45,7 @@ else:
 
 
 __all__ = [
+    "correlate",
     "example",
     "figure",
     "group",

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from hipsta_bids.cli.commands import (
     compare_parser,
+    correlate_parser,
     figure_parser,
     meta_parser,
     phantom_parser,
@@ -128,9 +129,9 @@ beside it gives place and numbers. This page lists the reasons by the action tha
 
 OPTIONS_TEXT = """\
 `hipsta-bids BIDS_DIR OUTPUT_DIR participant` measures; `hipsta-bids BIDS_DIR OUTPUT_DIR group`
-analyzes. The commands `demo`, `demo-data`, `phantom`, `surrogate`, `meta`, `compare`, `resample`,
-`settings` and `protocols` print their options with `--help`, as both levels do; `--version` prints
-the version. Options accept underscores instead of hyphens (`--n_procs`)."""
+analyzes. The commands `demo`, `demo-data`, `phantom`, `surrogate`, `meta`, `compare`, `correlate`,
+`resample`, `settings` and `protocols` print their options with `--help`, as both levels do;
+`--version` prints the version. Options accept underscores instead of hyphens (`--n_procs`)."""
 
 _SHARED_TEXT = "properties of all images with these suffixes"
 
@@ -301,6 +302,7 @@ def options_page() -> str:
         ("hipsta-bids meta", meta_parser()),
         ("hipsta-bids compare", compare_parser()),
         ("hipsta-bids figure", figure_parser()),
+        ("hipsta-bids correlate", correlate_parser()),
         ("hipsta-bids resample", resample_parser()),
     ):
         parts.append(f"## {title}")

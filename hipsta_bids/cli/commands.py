@@ -4,6 +4,7 @@ import argparse
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from hipsta_bids.cli import parser as parsing
 from hipsta_bids.cli import participant
 from hipsta_bids.cli.console import echo, echo_table, warn
 from hipsta_bids.cli.parser import Parser, bids_label, from_namespace, given_settings, parser_of
@@ -88,6 +89,17 @@ def export_parser() -> Parser:
     add("--region", "NAME", default="body")
     add("--participant-label", "LABEL", nargs="+", type=bids_label("sub-"), default=[])
     add("--space-of", "PATTERN", default="")
+    return parser
+
+
+def correlate_parser() -> Parser:
+    """Describe ``hipsta-bids correlate``."""
+    parser, add = parser_of("correlate")
+    add("maps", "MAP", nargs=2)
+    add("out", "OUT", type=Path)
+    add("--surface", "FILE", type=Path, required=True)
+    add("--permutations", "N", type=parsing.positive_int, default=10_000)
+    add("--seed", "N", type=int, default=0)
     return parser
 
 
@@ -333,6 +345,19 @@ def run_export(arguments: Sequence[str]) -> ExitCode:
         image=options.space_of,
     )
     echo(f"{options.folder}: {len(paths)} files")
+    return ExitCode.OK
+
+
+def run_correlate(arguments: Sequence[str]) -> ExitCode:
+    """Correlate two maps of the group level."""
+    options = correlate_parser().parse_intermixed_args(arguments)
+    from hipsta_bids.group.questions.correlate import correlate  # noqa: PLC0415  (heavy)
+
+    first, second = options.maps
+    numbers = {"permutations": options.permutations, "seed": options.seed}
+    row = correlate(first, second, options.surface, **numbers, out=options.out)
+    echo(f"r = {row['pearson']:.3f}, p = {row['pearson_p']:.3g}, {row['n']} points")
+    echo(f"results: {options.out}")
     return ExitCode.OK
 
 

@@ -97,7 +97,8 @@ def add_segmentations(parser: Parser) -> None:
 def _add_signals(parser: Parser) -> None:
     add = adder(parser.add_argument_group("what else to bring to the sheet"), _HELP)
     add("--map", "NAME=PATTERN...", type=named_pattern)
-    add("--map-sampling", "[NAME=]depth|mid...", type=_choice("depth", "mid"))
+    places = ("depth", "mid", "interior", "exterior")
+    add("--map-sampling", "[NAME=]" + "|".join(places) + "...", type=_choice(*places))
     add("--map-interpolation", "[NAME=]linear|nearest...", type=_choice("linear", "nearest"))
     add("--map-transform", "NAME=PATTERN...", type=named_pattern)
     add("--map-reference", "NAME=PATTERN...", type=named_pattern)
@@ -152,7 +153,7 @@ def _choice(*values: str) -> Callable[[str], tuple[str | None, str]]:
         name, equals, value = text.rpartition("=")
         if value not in values or (equals and not name):
             raise argparse.ArgumentTypeError(
-                f"{text!r} is not {' or '.join(values)}, alone or after NAME="
+                f"{text!r} is not {', '.join(values[:-1])} or {values[-1]}, alone or after NAME="
             )
         return name or None, value
 

@@ -51,13 +51,13 @@ def sample_on_sheet(
     sampling: str,
     interpolation: str,
 ) -> SampledMap:
-    """Read a volume on the mid-surface (``mid``) or averaged over the sheet's ``depth``.
+    """Read a volume averaged over the sheet's ``depth``, or on its mid-surface or a wall.
 
     The field of view ends at the outer faces of the outermost voxels; from their centers outward
     the value is the voxel's.
     """
-    level = sheet.middle
-    points = sheet.points if sampling == "depth" else sheet.points[:, :, level : level + 1]
+    levels = {"mid": [sheet.middle], "interior": [0], "exterior": [-1]}
+    points = sheet.points if sampling == "depth" else sheet.points[:, :, levels[sampling]]
     index, inside = _locate(volume, points.reshape(-1, 3))
     read = _linear if interpolation == "linear" else _nearest
     values = read(volume.values, index, settings.min_known)

@@ -100,7 +100,7 @@ class MapSource:
     pattern: str = ""
     """Path with placeholders, absolute or relative to the BIDS dataset; may have wildcards."""
     sampling: str
-    """``depth`` or ``mid``, see :func:`~hipsta_bids.geometry.sampling.sample_on_sheet`."""
+    """As of :func:`~hipsta_bids.geometry.sampling.sample_on_sheet`: surface, or ``depth``."""
     interpolation: str
     """``linear`` or ``nearest``."""
     path: Path | None = None

@@ -13,6 +13,7 @@ from hipsta_bids import __version__
 from hipsta_bids.cli import main
 from hipsta_bids.cli.commands import (
     compare_parser,
+    correlate_parser,
     meta_parser,
     phantom_parser,
     resample_parser,
@@ -228,6 +229,7 @@ def test_spellings_of_other_bids_apps(alias, field, value):
         ("meta", meta_parser),
         ("compare", compare_parser),
         ("resample", resample_parser),
+        ("correlate", correlate_parser),
     ],
 )
 def test_the_texts_of_the_help_have_no_leftovers(command, make):

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from measured_phantoms import measured, spiral
 
 from hipsta_bids.geometry.sampling import Regions, ScalarVolume, sample_on_sheet, summarize_regions
 from hipsta_bids.settings import MapSettings
@@ -82,6 +83,45 @@ def test_the_mean_over_depth_is_the_integral_from_wall_to_wall():
     found = sample(linear(centers()), sheet=sheet, sampling="depth").values[..., 0]
     # Columns are straight and evenly spaced: the mean of a linear field is that of their middle.
     np.testing.assert_allclose(found, linear(middle(sheet)), atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("sampling", "radius"), [("interior", 1.7), ("mid", 2.5), ("exterior", 3.3)]
+)
+def test_a_surface_is_sampled_where_it_is(sampling, radius):
+    found = sample(linear(centers()), sampling=sampling).values[..., 0]
+    turn, y = np.linspace(0.2, np.pi - 0.2, 12)[:, None], np.linspace(-1.5, 1.5, 7)
+    place = np.broadcast_arrays(radius * np.cos(turn), y, radius * np.sin(turn) - 1.5)
+    # A linear field is exact; what is left is rounding.
+    np.testing.assert_allclose(found, linear(np.stack(place, axis=-1)), atol=1e-12)
+
+
+@pytest.fixture(scope="module")
+def depth_of_phantom():
+    """A measured phantom of 2 mm, and the distance from its true mid-surface in fine voxels."""
+    case = measured(spiral())
+    low = case.maps.sheet.points.reshape(-1, 3).min(axis=0) - 1.0
+    span = case.maps.sheet.points.reshape(-1, 3).max(axis=0) + 1.0 - low
+    affine = np.diag([0.3, 0.3, 0.3, 1.0])
+    affine[:3, 3] = low
+    index = np.moveaxis(np.indices(np.ceil(span / 0.3).astype(int)), 0, -1)
+    places = case.phantom.body.locate((index * 0.3 + low).reshape(-1, 3), reach=1.8)
+    values = places[:, 2].reshape(*index.shape[:3], 1)
+    return case, ScalarVolume(values=values, affine=affine, start=(0, 0, 0), shape=index.shape[:3])
+
+
+@pytest.mark.parametrize(
+    ("sampling", "depth"), [("interior", -1.0), ("mid", 0.0), ("exterior", 1.0), ("depth", 0.0)]
+)
+def test_depth_in_a_phantom_is_that_of_the_surface(depth_of_phantom, sampling, depth):
+    case, volume = depth_of_phantom
+    sampled = sample_on_sheet(
+        volume, case.maps.sheet, MapSettings(), sampling=sampling, interpolation="linear"
+    )
+    found = sampled.values[4:-4, :, 0]
+    # Labels of 0.4 mm voxels place the walls to a tenth of a voxel.
+    assert np.nanmedian(np.abs(found - depth)) < 0.04
+    assert np.nanmean(found) == pytest.approx(depth, abs=0.04)
 
 
 def test_the_mean_over_depth_counts_walls_by_half():

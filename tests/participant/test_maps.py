@@ -338,7 +338,7 @@ def test_bad_regions_harm_nothing_else(bids_dir, tmp_path):
         (["--map", "a=sub-{sub}.nii"], "'sub' is not understood"),
         (["--map", "a=sub-{.nii"], "is not understood"),
         (["--map", "a=x", "--map-sampling", "b=mid"], "there is no --map b="),
-        (["--map", "a=x", "--map-sampling", "top"], "is not depth or mid"),
+        (["--map", "a=x", "--map-sampling", "top"], "is not depth, mid, interior or exterior"),
         (["--map", "a=x", "--map-interpolation", "a=cubic"], "is not linear or nearest"),
     ],
 )

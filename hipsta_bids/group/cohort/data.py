@@ -178,15 +178,22 @@ def asymmetry_maps(cohort: Cohort, measures: Sequence[str], relative: Sequence[s
         raise ModelError("asymmetry: no participant has both hemispheres")
     names = tuple(dict.fromkeys((*left.names, *right.names)))
     codes = np.array([*(names.index(name) for name in left.names), -1], dtype=np.int8)
-    maps = {}
-    for name in measures:
-        of_left, of_right = left.maps[name][a], right.maps[name][b]
+
+    def difference(name: str, of_left: Float, of_right: Float) -> Float:
         mean = (of_left + of_right) / 2
         unit = np.where(mean > 0, mean, np.nan) if name in relative else 1.0
-        maps[asymmetry_name(name)] = (of_left - of_right) / unit
+        return np.asarray((of_left - of_right) / unit)
+
     return SideMaps(
         rows=rows,
-        maps=maps,
+        maps={
+            asymmetry_name(name): difference(name, left.maps[name][a], right.maps[name][b])
+            for name in measures
+        },
+        covariates={
+            name: difference(name, values[a], right.covariates[name][b])
+            for name, values in left.covariates.items()
+        },
         subfield=codes[left.subfield[a]],
         names=names,
         summary=pd.DataFrame(index=range(len(rows))),

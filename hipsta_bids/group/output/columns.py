@@ -1,7 +1,7 @@
 """Columns of the tables of tests: places of points, tests, effects, clusters and peaks."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -31,6 +31,8 @@ class Frame:
     ``surface_z`` on a mesh."""
     subfield: NDArray[np.str_]
     """(points,) names."""
+    average: Mapping[str, Float] = field(default_factory=dict)
+    """``x_mm``, ``y_mm`` and ``z_mm`` on the average surface, for tables of peaks."""
 
     @property
     def columns(self) -> dict[str, Any]:
@@ -38,10 +40,8 @@ class Frame:
         return {**self.number, **self.position, "subfield": self.subfield}
 
     def at(self, point: int) -> dict[str, Any]:
-        """Locate a point, in tables of peaks; a node of the sheet by its coordinates."""
-        number = self.number if "vertex" in self.number else {}
-        position = {**number, **self.position, "subfield": self.subfield}
-        return {name: values[point] for name, values in position.items()}
+        """Locate a point, in tables of peaks."""
+        return {name: values[point] for name, values in {**self.columns, **self.average}.items()}
 
     @classmethod
     def of_sheet(cls, x: Float, y: Float, subfield: NDArray[np.str_]) -> "Frame":
@@ -52,11 +52,18 @@ class Frame:
         return cls({"node_x": i + 1, "node_y": j + 1}, position, subfield.ravel())
 
 
-def frame_of(cohort: Cohort, fitted: FittedMaps) -> Frame:
-    """Locate points, and name the subfield in which most participants have them."""
+def frame_of(cohort: Cohort, fitted: FittedMaps, average: Float | None = None) -> Frame:
+    """Locate points, and name the subfield in which most participants have them.
+
+    ``average`` (points, 3) is where they are on the average surface.
+    """
     subfield = np.array([*fitted.maps.names, MISSING])[fitted.subfield]
     if (mesh := fitted.maps.mesh) is None:
-        return Frame.of_sheet(cohort.x, cohort.y, subfield)
+        frame = Frame.of_sheet(cohort.x, cohort.y, subfield)
+        points = {} if average is None else zip("xyz", average.T.round(3), strict=True)
+        return replace(
+            frame, average={f"{axis}_mm": values for axis, values in dict(points).items()}
+        )
     position = {f"surface_{axis}": mesh.points[:, i] for i, axis in enumerate("xyz")}
     return Frame({"vertex": np.arange(len(mesh.points))}, position, subfield.ravel())
 

@@ -26,6 +26,8 @@ from hipsta_bids.types import PARTICIPANT, SESSION
 Named = tuple[str, pd.DataFrame]
 """File name without extension, and table."""
 Columns = Mapping[str, Any]
+Averages = Mapping[str, Float]
+"""(points, 3) of average surfaces in RAS mm, by hemisphere."""
 CurveOf = Callable[[ClassifierResult], Columns]
 
 _MEANINGS = tomllib.loads((files("hipsta_bids.group.output") / "columns.toml").read_text("utf-8"))
@@ -37,15 +39,21 @@ META_COLUMNS: Mapping[str, str] = COLUMNS | _MEANINGS["meta"]
 COMPARISON_COLUMNS: Mapping[str, str] = COLUMNS | _MEANINGS["comparison"]
 #: The same of measures that are tested together.
 JOINT_COLUMNS: Mapping[str, str] = COLUMNS | _MEANINGS["joint"]
+#: The same of a correlation of maps.
+CORRELATION_COLUMNS: Mapping[str, str] = _MEANINGS["correlation"]
 
 
 def result_tables(
-    surface: str, cohort: Cohort, analysis: results.Analysis, settings: GroupSettings
+    surface: str,
+    cohort: Cohort,
+    analysis: results.Analysis,
+    settings: GroupSettings,
+    averages: Averages,
 ) -> Iterator[Named]:
     """Make all tables of one model of the maps of one surface."""
     prefix = f"{surface}_" if surface else ""
     if analysis.fitted:
-        yield f"{prefix}peaks", _stacked(_peaks(cohort, analysis, settings))
+        yield f"{prefix}peaks", _stacked(_peaks(cohort, analysis, settings, averages))
         yield f"{prefix}means", _stacked(_means(cohort, analysis))
     if analysis.registrations:
         yield from _registration_tables(cohort, analysis)
@@ -104,12 +112,13 @@ def _statistics(cohort: Cohort, analysis: results.Analysis) -> Iterator[Named]:
 
 
 def _peaks(
-    cohort: Cohort, analysis: results.Analysis, settings: GroupSettings
+    cohort: Cohort, analysis: results.Analysis, settings: GroupSettings, averages: Averages
 ) -> Iterator[Columns]:
     for key, test, discoveries in results.tested_maps(analysis):
         fitted = analysis.fitted[key.hemi]
         edges = edges_of(fitted.maps, settings.multiplicity.neighbors)
-        peaks = columns.peak_table(test, discoveries, columns.frame_of(cohort, fitted), edges)
+        frame = columns.frame_of(cohort, fitted, averages.get(key.hemi))
+        peaks = columns.peak_table(test, discoveries, frame, edges)
         yield {"measure": key.measure, "hemi": key.hemi, **peaks}
 
 
@@ -422,12 +431,12 @@ def joint_points(joint_map: JointMap) -> pd.DataFrame:
     return pd.DataFrame(columns)
 
 
-def joint_peaks(joint: Sequence[JointMap], neighbors: int) -> pd.DataFrame:
+def joint_peaks(joint: Sequence[JointMap], neighbors: int, averages: Averages) -> pd.DataFrame:
     """List clusters with their peaks; of a map without findings its strongest point."""
     rows = []
     for joint_map in joint:
         frame, tests, z = (
-            frame_of(joint_map.cohort, joint_map.fitted),
+            frame_of(joint_map.cohort, joint_map.fitted, averages.get(joint_map.key.hemi)),
             joint_map.tests,
             joint_map.test.statistic,
         )

@@ -11,6 +11,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -32,7 +33,7 @@ from hipsta_bids.io import files, gifti
 from hipsta_bids.progress import tell
 from hipsta_bids.reports.cells import JOINT
 from hipsta_bids.reports.group_tables import GroupResults
-from hipsta_bids.types import PARTICIPANT, SESSION
+from hipsta_bids.types import FAMILY, PARTICIPANT, SESSION
 
 _LOGGER = logging.getLogger(__name__)
 
@@ -78,6 +79,7 @@ def write_results(
     settings: GroupSettings,
     exclusions: Sequence[Exclusion],
     *,
+    averages: tables.Averages,
     joint: Sequence[JointMap] = (),
     region: str = "body",
     ratings: Mapping[str, int] | None = None,
@@ -88,7 +90,7 @@ def write_results(
     cohort, analysis = cohorts[SHEET], analyses[SHEET]
     for surface, surface_cohort in cohorts.items():
         for name, table in tables.result_tables(
-            surface, surface_cohort, analyses[surface], settings
+            surface, surface_cohort, analyses[surface], settings, averages
         ):
             write_table(folder, name, table)
     if analysis.found:
@@ -114,10 +116,10 @@ def write_results(
             files.write_json(folder / "harmonization.json", effects.model_dump(by_alias=True))
     for surface, one in analyses.items():
         _write_surfaces(folder, cohorts[surface], one)
-        write_stats(folder, stats_of(results.tested_maps(one)))
+        write_stats(folder, stats_of(results.tested_maps(one)), _about_tests(one, settings))
         table, sheets = one.compared.table, bool(one.registered)
         write_scores(folder, cohorts[surface], table, one.scored, letter="w", sheets=sheets)
-    _write_joint(folder, joint, settings)
+    _write_joint(folder, joint, settings, averages)
     text = methods_text(
         cohort,
         analysis,
@@ -253,8 +255,44 @@ def stats_of(
     }
 
 
-def write_stats(folder: Path, maps: Mapping[MapKey, _Stats]) -> None:
-    """Write maps of statistics as GIFTI, and maps of both sides as one CIFTI file."""
+#: ``StatMapType``, in the letters of NeuroVault, and description by the value of ``stat-``.
+_MAP_TYPES = {
+    "t": ("T", "t statistic"),
+    "F": ("F", "F statistic"),
+    "d": ("Other", "Cohen's d"),
+    "eta2": ("Other", "partial eta squared"),
+    "pcorrected": ("P", "p-value, corrected for the number of points"),
+}
+_About = Mapping[MapKey, Mapping[str, Any]]
+
+
+def _about_tests(analysis: results.Analysis, settings: GroupSettings) -> _About:
+    """Describe tests for the sidecars of their maps."""
+    rules, about = settings.multiplicity, {}
+    names = [*analysis.design.columns, *(f"map({name})" for name in analysis.model.maps)]
+    for key, test, discoveries in results.tested_maps(analysis):
+        fitted = np.isfinite(test.df)
+        df, n = test.df[fitted], analysis.fitted[key.hemi].fits[key.measure].n[fitted]
+        about[key] = {
+            "Measure": key.measure,
+            "Contrast": key.contrast,
+            "ContrastWeights": dict(zip(names, test.contrast.weights.T.tolist(), strict=True)),
+            "Model": analysis.model.text,
+            "Mixed": analysis.comparison.longitudinal,
+            "DegreesOfFreedom": [float(df.min()), float(df.max())] if len(df) else None,
+            "DegreesOfFreedomNumerator": test.contrast.n_rows if test.kind == "F" else None,
+            "NumberOfParticipants": analysis.n_participants,
+            "NumberOfRows": [int(n.min()), int(n.max())] if len(n) else None,
+            "Correction": rules.method,
+            "Level": discoveries.alpha,
+            "Family": f"all points of equal {', '.join(FAMILY[rules.scope])}",
+            "NumberOfTests": discoveries.n_tests,
+        }
+    return about
+
+
+def write_stats(folder: Path, maps: Mapping[MapKey, _Stats], about: _About | None = None) -> None:
+    """Write maps of statistics as GIFTI, with sidecars if described, and of both sides as CIFTI."""
     grouped: dict[str, dict[str, _Stats]] = {}
     for key, stats in maps.items():
         for stat, values in stats.items():
@@ -264,6 +302,9 @@ def write_stats(folder: Path, maps: Mapping[MapKey, _Stats]) -> None:
             hemi = key.hemi if key.hemi in {"L", "R"} else "L"
             content = gifti.shape_bytes(values, hemi=hemi, name=stem, unit="1")
             files.write_bytes(folder / f"{stem}.shape.gii", content)
+            if about is not None and key in about:
+                words = dict(zip(("StatMapType", "Description"), _MAP_TYPES[stat], strict=True))
+                files.write_json(folder / f"{stem}.json", words | dict(about[key]))
         if key.hemi in {"L", "R"}:
             name = tables.map_name("", key.measure, key.contrast)
             grouped.setdefault(name, {})[key.hemi] = stats
@@ -273,14 +314,16 @@ def write_stats(folder: Path, maps: Mapping[MapKey, _Stats]) -> None:
         files.write_bytes(folder / f"{name}.dscalar.nii", gifti.cifti_bytes(stacked, names))
 
 
-def _write_joint(folder: Path, joint: Sequence[JointMap], settings: GroupSettings) -> None:
+def _write_joint(
+    folder: Path, joint: Sequence[JointMap], settings: GroupSettings, averages: tables.Averages
+) -> None:
     """Write tests of several measures together."""
     if not joint:
         return
     write_table(
         folder,
         f"{JOINT}_peaks",
-        joint_peaks(joint, settings.multiplicity.neighbors),
+        joint_peaks(joint, settings.multiplicity.neighbors, averages),
         meaning=tables.JOINT_COLUMNS,
     )
     for joint_map in joint:

@@ -206,12 +206,8 @@ def _check_covariates(
     if not model.maps:
         return
     excluded = {
-        "--longitudinal": comparison.longitudinal,
-        "--asymmetry": comparison.asymmetry,
         "--normative": comparison.normative is not None,
         "--harmonize": is_harmonized or bool(settings.harmonization.column),
-        "--joint": bool(settings.joint.measures),
-        "--fdr with permutations": settings.multiplicity.method in inference.PERMUTATIONS,
         "summary measures alone": not measures.maps,
     }
     if problems := [name for name, is_asked in excluded.items() if is_asked]:

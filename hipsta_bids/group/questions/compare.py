@@ -122,6 +122,7 @@ def _analyze(options: studies.GroupOptions, settings: GroupSettings) -> studies.
             analyses,
             settings,
             exclusions,
+            averages={hemi: one.middle.points for hemi, one in shapes.items()},
             joint=tested,
             region=options.sheets.region,
             ratings=study.collection.ratings,

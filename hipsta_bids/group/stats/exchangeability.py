@@ -105,19 +105,23 @@ def _order(key: Float) -> Int:
 
 
 def split(matrix: Float, contrast: Contrast) -> tuple[Float, Float]:
-    """Orthonormal columns that are tested, and that are not, (rows, columns) each.
+    """Orthonormal columns that are tested, and that are not, (..., rows, columns) each.
 
     The product of the former with the data is the estimated contrast.
     """
-    tested = matrix @ np.linalg.solve(matrix.T @ matrix, contrast.weights.T)
-    is_single = contrast.n_rows == 1
-    tested = tested / np.linalg.norm(tested) if is_single else np.linalg.qr(tested)[0]
+    tested = matrix @ np.linalg.solve(np.swapaxes(matrix, -1, -2) @ matrix, contrast.weights.T)
+    length = np.linalg.norm(tested, axis=-2, keepdims=True)
+    tested = tested / length if contrast.n_rows == 1 else np.linalg.qr(tested)[0]
     return tested, np.linalg.qr(matrix @ null_space(contrast.weights))[0]
 
 
 def spans_constant(matrix: Float, contrast: Contrast) -> bool:
-    """Check whether the columns that are not tested can make a constant; else a mean is tested."""
-    return spans(split(matrix, contrast)[1], np.ones(len(matrix)))
+    """Check whether the columns that are not tested can make a constant; else a mean is tested.
+
+    Further weights are of maps as covariates, which are centered.
+    """
+    columns = matrix @ null_space(contrast.weights[:, : matrix.shape[1]])
+    return spans(np.linalg.qr(columns)[0], np.ones(len(matrix)))
 
 
 def spans(columns: Float, vector: Float) -> bool:

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,7 +14,8 @@ from hipsta_bids.errors import ModelError
 from hipsta_bids.group.design.contrasts import Contrast
 from hipsta_bids.group.design.model import Design
 from hipsta_bids.group.design.settings import GlmSettings
-from hipsta_bids.group.stats.arrays import Bool, Float, Int, SideMaps, parts_of_sheets, sheets_of
+from hipsta_bids.group.stats import arrays
+from hipsta_bids.group.stats.arrays import Bool, Float, Int, SideMaps
 from hipsta_bids.group.stats.exchangeability import Visits
 
 #: Points are left out where the missing values take away all but this fraction of what the data
@@ -163,26 +163,11 @@ def fit_points(
     doi:10.1016/j.neuroimage.2006.09.011). Contrasts have weights of ``covariates`` after the
     weights of the matrix, or none.
     """
-    n_maps = 0 if covariates is None else len(covariates)
-    columns = matrix.shape[1] + n_maps
-    contrasts = [_padded(contrast, columns) for contrast in contrasts] if n_maps else contrasts
-    check_design(maps, matrix, contrasts, columns)
-    basis, triangle = np.linalg.qr(matrix)
-    inverse = np.linalg.inv(triangle)
-    if covariates is not None:
-        scales = np.nanstd(covariates, axis=1).mean(axis=1, where=np.isfinite(maps).any(axis=0))
-        scales = np.maximum(scales, np.finfo(np.float64).tiny) * np.sqrt(len(maps))
-        covariates = covariates / scales[:, None, None]
-        inverse = block_diag(inverse, np.diag(1 / scales))
-    blocks = []
-    for part in chunks(maps.shape, columns):
-        values = np.asarray(maps[:, part], dtype=np.float64)
-        if covariates is None:
-            blocks.append(fit_block(values, basis, settings))
-        else:
-            blocks.append(_fit_covariates(values, basis, covariates[:, :, part], settings))
+    contrasts, basis, inverse, covariates = orthonormal(maps, matrix, contrasts, covariates)
+    columns = len(inverse)
+    fits = [fit_block(*part, settings) for part in parts_of_points(maps, basis, covariates)]
     names = ("scores", "covariance", "sigma", "n")
-    fit = PointBlock(*(np.concatenate([getattr(one, name) for one in blocks]) for name in names))
+    fit = PointBlock(*(np.concatenate([getattr(one, name) for one in fits]) for name in names))
     df = np.where(np.isfinite(fit.sigma), fit.n - columns, np.nan)
     tests = tuple(
         _test(contrast, contrast.weights @ inverse, fit, df, settings.confidence)
@@ -191,11 +176,54 @@ def fit_points(
     return PointwiseFit(inverse @ fit.scores.T, fit.sigma, fit.n, tests)
 
 
-def _padded(contrast: Contrast, columns: int) -> Contrast:
-    """Return a contrast with weights of further columns, which are zero."""
-    rows, size = contrast.weights.shape
-    weights = np.hstack([contrast.weights, np.zeros((rows, max(columns - size, 0)))])
-    return Contrast(contrast.name, weights)
+def orthonormal(
+    maps: Float, matrix: Float, contrasts: Sequence[Contrast], covariates: Float | None = None
+) -> tuple[Sequence[Contrast], Float, Float, Float | None]:
+    """Check a design, and make its columns orthonormal and its covariates of like size.
+
+    Returns contrasts with a weight per column, the columns, the matrix from their
+    coefficients to coefficients of the design, and the covariates.
+    """
+    if covariates is None:
+        check_design(maps, matrix, contrasts)
+        basis, triangle = np.linalg.qr(matrix)
+        return contrasts, basis, np.linalg.inv(triangle), None
+    columns = matrix.shape[1] + len(covariates)
+    widths = [(0, 0), (0, len(covariates))]
+    contrasts = [
+        one
+        if one.weights.shape[1] != matrix.shape[1]
+        else Contrast(one.name, np.pad(one.weights, widths))
+        for one in contrasts
+    ]
+    check_design(maps, matrix, contrasts, columns)
+    basis, triangle = np.linalg.qr(matrix)
+    scales = np.nanstd(covariates, axis=1).mean(axis=1, where=np.isfinite(maps).any(axis=0))
+    scales = np.maximum(scales, np.finfo(np.float64).tiny) * np.sqrt(len(maps))
+    inverse = block_diag(np.linalg.inv(triangle), np.diag(1 / scales))
+    return contrasts, basis, inverse, covariates / scales[:, None, None]
+
+
+def parts_of_points(
+    maps: Float, basis: Float, covariates: Float | None
+) -> Iterator[tuple[Float, Float]]:
+    """Return maps and designs of some points at a time.
+
+    With covariates, designs are (points, rows, columns): covariates are centered at each point, and
+    rows without them have no value.
+    """
+    count = 0 if covariates is None else len(covariates)
+    for part in chunks(maps.shape, basis.shape[1] + count):
+        values = np.asarray(maps[:, part], dtype=np.float64)
+        if covariates is None:
+            yield values, basis
+            continue
+        added = covariates[:, :, part]
+        values = np.where(np.isfinite(added).all(axis=0), values, np.nan)
+        added = np.where(np.isfinite(values), added, np.nan)
+        centered = np.nan_to_num(added - arrays.mean_of_known(added, 1)[:, None])
+        fixed = np.broadcast_to(basis, (values.shape[1], *basis.shape))
+        yield values, np.concatenate([fixed, centered.transpose(2, 1, 0)], axis=2)
 
 
 def check_design(
@@ -228,6 +256,19 @@ def products_of(matrix: Float) -> Float:
     return (matrix[:, :, None] * matrix[:, None, :]).reshape(len(matrix), -1)
 
 
+def information(present: Bool, basis: Float) -> Float:
+    """Sum the products of columns over the rows with a value, (points, columns, columns)."""
+    if basis.ndim == 2:  # noqa: PLR2004 -- one design for all points
+        sums = present.T.astype(np.float64) @ products_of(basis)
+        return np.asarray(sums.reshape(-1, *basis.shape[1:] * 2))
+    return np.asarray(np.swapaxes(basis, 1, 2) @ (basis * present.T[:, :, None]))
+
+
+def by_row(basis: Float) -> Float:
+    """(rows, points or 1, columns) of a design, or of one for each point."""
+    return basis[:, None] if basis.ndim == 2 else basis.swapaxes(0, 1)  # noqa: PLR2004
+
+
 def sum_by(numbers: Int, values: Float) -> Float:
     """Sum rows of values (rows, ...) by numbers from 0 on, each of which occurs."""
     order = np.argsort(numbers, kind="stable")
@@ -245,92 +286,36 @@ def fit_block(maps: Float, basis: Float, settings: GlmSettings) -> PointBlock:
     """Solve least squares at some points, by normal equations in orthonormal coordinates.
 
     There the equations of a complete point are the identity, and the equations of other points stay
-    well conditioned unless the missing subjects really carried a column.
+    well conditioned unless the missing subjects really carried a column. ``basis`` is (rows,
+    columns), or (points, rows, columns) where designs differ.
     """
     present = np.isfinite(maps)
-    values = np.where(present, maps, 0.0)
-    n = present.sum(axis=0)
-    columns = basis.shape[1]
-    if present.all():
-        inverse = np.repeat(np.eye(columns)[None], maps.shape[1], axis=0)
-        usable = n - columns >= settings.min_residual_df
-    else:
-        information = present.astype(np.float64).T @ products_of(basis)
-        information = information.reshape(-1, columns, columns)
-        usable = np.linalg.eigvalsh(information)[:, 0] > MIN_INFORMATION
-        usable &= n - columns >= settings.min_residual_df
-        information[~usable] = np.eye(columns)
-        inverse = np.asarray(np.linalg.inv(information), dtype=np.float64)
-    scores = np.einsum("pij,jp->pi", inverse, basis.T @ values)
-    residuals = np.where(present, values - basis @ scores.T, 0.0)
-    squares = np.einsum("sp,sp->p", residuals, residuals)
-    total = np.einsum("sp,sp->p", values, values)
-    usable &= squares > total * np.finfo(np.float64).eps  # else the model leaves rounding only
-    sigma = np.sqrt(squares / np.where(usable, n - columns, 1))
-    sigma[~usable] = np.nan
-    if settings.covariance == "hc3":
-        covariance = _hc3(residuals, basis, inverse, present)
-    else:
-        covariance = inverse * (sigma**2)[:, None, None]
-    return PointBlock(
-        scores=np.where(usable[:, None], scores, np.nan),
-        covariance=np.where(usable[:, None, None], covariance, np.nan),
-        sigma=sigma,
-        n=n,
-    )
-
-
-def _fit_covariates(
-    maps: Float, basis: Float, covariates: Float, settings: GlmSettings
-) -> PointBlock:
-    """Solve least squares at some points whose designs differ; as :func:`fit_block`."""
-    present = np.isfinite(maps) & np.isfinite(covariates).all(axis=0)
-    n = present.sum(axis=0)
-    centered = np.where(present, covariates, 0.0)
-    means = centered.sum(axis=1, keepdims=True) / np.maximum(n, 1)
-    centered = np.where(present, centered - means, 0.0)
-    fixed = np.where(present.T[:, :, None], basis, 0.0)
-    designs = np.concatenate([fixed, centered.transpose(2, 1, 0)], axis=2)
-    values = np.where(present, maps, 0.0).T[:, :, None]
-    columns = designs.shape[2]
-    information = designs.transpose(0, 2, 1) @ designs
-    usable = np.linalg.eigvalsh(information)[:, 0] > MIN_INFORMATION
+    values, has_value = np.where(present, maps, 0.0).T[:, :, None], present.T[:, :, None]
+    n, columns = present.sum(axis=0), basis.shape[-1]
+    equations = information(present, basis)
+    usable = np.linalg.eigvalsh(equations)[:, 0] > MIN_INFORMATION
     usable &= n - columns >= settings.min_residual_df
-    information[~usable] = np.eye(columns)
-    inverse = np.linalg.inv(information)
-    scores = inverse @ (designs.transpose(0, 2, 1) @ values)
-    residuals = (values - designs @ scores)[:, :, 0]
-    squares = np.einsum("ps,ps->p", residuals, residuals)
-    usable &= squares > np.sum(values**2, axis=(1, 2)) * np.finfo(np.float64).eps
+    safe = np.where(usable[:, None, None], equations, np.eye(columns))
+    inverse = np.asarray(np.linalg.inv(safe), dtype=np.float64)
+    scores = inverse @ (np.swapaxes(basis, -1, -2) @ values)
+    residuals = np.where(has_value, values - basis @ scores, 0.0)
+    squares, total = np.sum(residuals**2, axis=(1, 2)), np.sum(values**2, axis=(1, 2))
+    usable &= squares > total * np.finfo(np.float64).eps  # else the model leaves rounding only
     sigma = np.where(usable, np.sqrt(squares / np.where(usable, n - columns, 1)), np.nan)
     covariance = inverse * (sigma**2)[:, None, None]
     if settings.covariance == "hc3":
-        leverage = np.einsum("psi,pij,psj->ps", designs, inverse, designs)
-        is_saturated = (1 - leverage < np.sqrt(np.finfo(np.float64).eps)) & present.T
-        weights = residuals / np.where(is_saturated, np.nan, 1 - leverage)
-        weighted = designs * weights[:, :, None]
-        covariance = inverse @ (weighted.transpose(0, 2, 1) @ weighted) @ inverse
+        # Residuals over (1 - leverage) (MacKinnon and White 1985); NaN where one subject alone
+        # determines a coefficient.
+        left = 1 - np.sum((basis @ inverse) * basis, axis=2, keepdims=True)
+        is_saturated = (left < np.sqrt(np.finfo(np.float64).eps)) & has_value
+        weighted = basis * (residuals / np.where(is_saturated, np.nan, left))
+        covariance = inverse @ (np.swapaxes(weighted, 1, 2) @ weighted) @ inverse
     return PointBlock(
         scores=np.where(usable[:, None], scores[:, :, 0], np.nan),
         covariance=np.where(usable[:, None, None], covariance, np.nan),
         sigma=sigma,
         n=n,
     )
-
-
-def _hc3(residuals: Float, basis: Float, inverse: Float, present: Bool) -> Float:
-    """Sandwich covariance with residuals over (1 - leverage) (MacKinnon and White 1985).
-
-    NaN where one subject alone determines a coefficient.
-    """
-    leverage = np.einsum("psi,si->sp", basis @ inverse, basis)
-    is_saturated = (1 - leverage < np.sqrt(np.finfo(np.float64).eps)) & present
-    weights = (
-        np.where(is_saturated, np.nan, residuals / np.where(is_saturated, 1.0, 1 - leverage)) ** 2
-    )
-    meat = (weights.T @ products_of(basis)).reshape(inverse.shape)
-    sandwich: Float = inverse @ meat @ inverse
-    return sandwich
 
 
 def _test(
@@ -447,14 +432,14 @@ class RowModel:
         """Whose each row is, where participants have several."""
         return None
 
-    def fit(self, values: Float, rows: Int, contrasts: tuple[Contrast, ...]) -> PointwiseFit:
-        """Fit some rows of the design at each point."""
-        return fit_points(values, self.design.matrix[rows], contrasts, self.settings)
-
-    def fit_on_maps(
-        self, values: Float, rows: Int, contrasts: tuple[Contrast, ...], covariates: Float
+    def fit(
+        self,
+        values: Float,
+        rows: Int,
+        contrasts: tuple[Contrast, ...],
+        covariates: Float | None = None,
     ) -> PointwiseFit:
-        """Fit some rows of the design at each point, with maps as covariates."""
+        """Fit some rows of the design at each point, perhaps with maps as covariates."""
         return fit_points(values, self.design.matrix[rows], contrasts, self.settings, covariates)
 
     def fit_measures(
@@ -491,15 +476,20 @@ class FittedMaps:
     fits: Mapping[str, PointwiseFit]
     """By measure."""
 
+    @property
+    def covariates(self) -> Float | None:
+        """(maps, sheets, points) of the sheets used that are covariates; ``None`` without."""
+        return _covariates(self.maps, self.used)
+
     def values(self, measure: str) -> Float:
         """(sheets, points) of one measure, of all sheets used."""
         if len(self.used) == len(self.maps.rows):
             return _values(self.maps.maps[measure], self.used)
-        return sheets_of(self.maps.maps, measure, self.used).reshape(len(self.used), -1)
+        return arrays.sheets_of(self.maps.maps, measure, self.used).reshape(len(self.used), -1)
 
     def parts(self, measure: str, keep: Bool) -> Iterator[Float]:
         """(sheets, points) of one measure, of some of the sheets used, a part at a time."""
-        for part in parts_of_sheets(self.maps.maps, measure, self.used[keep]):
+        for part in arrays.parts_of_sheets(self.maps.maps, measure, self.used[keep]):
             yield part.reshape(len(part), -1)
 
 
@@ -515,16 +505,13 @@ def fit_maps(
         side.rows, model.design.rows, assume_unique=True, return_indices=True
     )
     tested = model.design.contrasts if contrasts is None else contrasts
-    maps = [_values(values, positions) for values in side.covariates.values()]
-    fit_rows: Callable[[Float, Int, tuple[Contrast, ...]], PointwiseFit] = model.fit
-    if maps:
-        fit_rows = partial(model.fit_on_maps, covariates=np.stack(maps).astype(np.float64))
+    covariates = _covariates(side, positions)
     fits = {}
     try:
         for name in side.maps:
             # Maps of a large cohort are made here: without a name, one is gone before the next.
             values = _values(side.maps[name], positions)
-            fits[name] = fit_rows(values, rows, tested)
+            fits[name] = model.fit(values, rows, tested, covariates)
             del values
     except ModelError as error:
         raise ModelError(f"hemisphere {hemi}: {error}") from error
@@ -546,6 +533,11 @@ def fit_maps(
         subfield=most_frequent(side.subfield[positions], len(side.names)),
         fits=fits,
     )
+
+
+def _covariates(side: SideMaps, positions: Int) -> Float | None:
+    maps = [_values(values, positions) for values in side.covariates.values()]
+    return np.stack(maps).astype(np.float64) if maps else None
 
 
 def _values(maps: Float, positions: Int) -> Float:

@@ -14,10 +14,10 @@ from hipsta_bids.errors import ModelError
 from hipsta_bids.group.design.contrasts import Contrast
 from hipsta_bids.group.design.formula import check_names, listed
 from hipsta_bids.group.design.settings import GlmSettings, MultiplicitySettings
-from hipsta_bids.group.stats import exchangeability
+from hipsta_bids.group.stats import arrays, exchangeability, glm
 from hipsta_bids.group.stats.arrays import Bool, Float, Int
 from hipsta_bids.group.stats.clusters import edges_of, enhance
-from hipsta_bids.group.stats.glm import FittedMaps, RowModel, fit_points
+from hipsta_bids.group.stats.glm import FittedMaps, RowModel
 from hipsta_bids.progress import tell
 from hipsta_bids.types import FAMILY
 
@@ -28,6 +28,8 @@ PERMUTATIONS = ("permutation-tfce", "permutation-max")
 #: Permutations whose maps a processor has in memory at once, and random numbers for them, if these
 #: are more; does not change a result.
 _BATCH, _KEYS = 50, 1_000_000
+#: Permuted residuals in memory at once where designs differ by point; does not change a result.
+_VALUES = 4_000_000
 #: Processors that permute; does not change a result.
 PROCESSORS: ContextVar[int] = ContextVar("processors", default=1)
 #: Sums in another order differ by less, relatively.
@@ -65,6 +67,8 @@ class PermutationPart:
     """(edges, 2) neighbors among the points."""
     visits: exchangeability.Visits | None = None
     """Whose each row is, where they are visits of which participants have several."""
+    covariates: Float | None = None
+    """(maps, subjects, points) further columns of the design at each point."""
 
 
 def permute(
@@ -139,6 +143,24 @@ def combine_evidence(p: Float, method: str) -> Float:
     return np.asarray(np.abs(special.ndtri(np.clip(joined, limits.tiny, 1) / 2)), dtype=np.float64)
 
 
+def _designs(part: PermutationPart, contrast: Contrast) -> tuple[Float, Float, Contrast]:
+    """Return maps, the design, (points, subjects, columns) with covariates, and its contrast.
+
+    Points at which the model cannot be fitted are missing, and have the design of another point.
+    """
+    if part.covariates is None:
+        return part.maps, part.matrix, contrast
+    prepared = glm.orthonormal(part.maps, part.matrix, [contrast], part.covariates)
+    (padded,), basis, inverse, covariates = prepared
+    parts = list(glm.parts_of_points(part.maps, basis, covariates))
+    maps = np.hstack([values for values, _ in parts])
+    designs = np.concatenate([design for _, design in parts])
+    is_fitted = np.isfinite(glm.fit_block(maps, designs, GlmSettings()).sigma)
+    designs[~is_fitted] = designs[is_fitted.argmax()]
+    weights = Contrast(contrast.name, padded.weights @ inverse)
+    return np.where(is_fitted, maps, np.nan), designs, weights
+
+
 class _Member:
     """One map of a run, with the design split into what is tested and what is not."""
 
@@ -149,18 +171,24 @@ class _Member:
         settings: MultiplicitySettings,
         blocks: Int | None,
     ) -> None:
-        maps, matrix = part.maps, part.matrix
-        tested, nuisance = exchangeability.split(matrix, contrast)
+        maps, designs, contrast = _designs(part, contrast)
+        tested, nuisance = exchangeability.split(designs, contrast)
         present = np.isfinite(maps)
         residuals = np.where(present, maps, 0.0)
-        if nuisance.shape[1]:
-            fitted = nuisance @ fit_points(maps, nuisance, (), GlmSettings()).coefficients
+        if nuisance.shape[-1]:
+            scores = glm.fit_block(maps, nuisance, GlmSettings()).scores
+            fitted = (nuisance @ scores[:, :, None])[:, :, 0].T
             residuals = np.nan_to_num(np.where(present, maps - fitted, 0.0))
         self._subjects, self._rows = part.subjects, contrast.n_rows
         # Columns are orthonormal, tested ones first; residuals are what the others leave.
-        self.basis, self._residuals = np.column_stack([tested, nuisance]), residuals
+        self.basis, self._residuals = np.concatenate([tested, nuisance], axis=-1), residuals
+        self._designs = None
+        matrix = designs
+        if part.covariates is not None:  # numbers of rows are shuffled in place of rows
+            self._designs, self.basis = self.basis, np.arange(1.0, len(maps) + 1)[:, None]
+            matrix, nuisance = designs[0], nuisance[0]
         self._squares = np.einsum("sp,sp->p", residuals, residuals)
-        df = present.sum(axis=0) - matrix.shape[1]
+        df = present.sum(axis=0) - designs.shape[-1]
         self._df = np.where((df > 0) & (self._squares > 0), df, np.nan)
         self._blocks = None if blocks is None else blocks[part.subjects]
         self._visits = part.visits and replace(part.visits, blocks=self._blocks)
@@ -200,14 +228,30 @@ class _Member:
 
     def statistics(self, bases: Float) -> Float:
         """Signed t, or square root of F, (batch, points) of bases (batch, columns, subjects)."""
-        # One product of large matrices is many times as fast as one for each basis.
-        scores = (bases.reshape(-1, bases.shape[2]) @ self._residuals).reshape(*bases.shape[:2], -1)
+        if self._designs is None:
+            # One product of large matrices is many times as fast as one for each basis.
+            flat = bases.reshape(-1, bases.shape[2]) @ self._residuals
+            scores = flat.reshape(*bases.shape[:2], -1)
+        else:
+            scores = self._scores(bases[:, 0], self._designs)
         noise = self._squares - np.einsum("bcp,bcp->bp", scores, scores)
         tested = scores[:, : self._rows]
         gained = np.einsum("bcp,bcp->bp", tested, tested) / self._rows
         # Rounding only may take the noise below zero, where the model fits perfectly.
         t = np.sqrt(gained * self._df / np.maximum(noise, np.finfo(np.float64).eps * self._squares))
         return np.asarray(np.copysign(t, tested[:, 0]) if self._rows == 1 else t, dtype=np.float64)
+
+    def _scores(self, numbers: Float, designs: Float) -> Float:
+        """Scores (batch, columns, points) of designs that differ by point.
+
+        ``numbers`` (batch, subjects) are of shuffled rows, from 1, negative where they are flipped.
+        """
+        rows = np.argsort(np.abs(numbers), axis=1)
+        signs = np.sign(np.take_along_axis(numbers, rows, axis=1))
+        parts = arrays.blocks(len(rows), max(_VALUES // self._residuals.size, 1))
+        residuals = self._residuals.T
+        scores = [(residuals[:, rows[part]] * signs[part]) @ designs for part in parts]
+        return np.concatenate(scores, axis=1).transpose(1, 2, 0)
 
     def p_values(self, t: Float) -> Float:
         """Two-sided p-values of these statistics."""
@@ -415,6 +459,7 @@ def _part(
         subjects=fitted.rows,
         edges=edges_of(fitted.maps, rules.neighbors),
         visits=None if model.visits is None else model.visits.take(fitted.rows),
+        covariates=fitted.covariates,
     )
 
 

@@ -102,8 +102,8 @@ def collect_sums(maps: Float, basis: Float, participants: Int) -> Sums:
     """Sum over sessions and participants."""
     present = np.isfinite(maps)
     counts = glm.sum_by(participants, present.astype(np.float64))
-    columns = np.empty((*maps.shape, basis.shape[1] + 1))
-    columns[..., :-1] = present[:, :, None] * basis[:, None, :]
+    columns = np.empty((*maps.shape, basis.shape[-1] + 1))
+    columns[..., :-1] = present[:, :, None] * glm.by_row(basis)
     columns[..., -1] = np.where(present, maps, 0.0)
     sums = glm.sum_by(participants, columns)
     sizes = np.unique(np.maximum(counts, 1.0))
@@ -158,6 +158,7 @@ def fit_mixed(
     settings: LongitudinalSettings,
     *,
     times: Float | None = None,
+    covariates: Float | None = None,
 ) -> glm.PointwiseFit:
     """Fit ``value = matrix @ coefficients + participant + residual`` at each point.
 
@@ -172,8 +173,9 @@ def fit_mixed(
     (Kuznetsova et al. 2017); where no variance between participants is found they are the linear
     model's. Several rows are tested by F: the mean of the squared t of combinations that are
     independent, with the degrees of freedom that give F its expectation (Fai and Cornelius 1996).
+    Covariates (maps, rows, points) are as of :func:`~hipsta_bids.group.stats.glm.fit_points`.
     """
-    glm.check_design(maps, matrix, contrasts)
+    contrasts, basis, inverse, covariates = glm.orthonormal(maps, matrix, contrasts, covariates)
     _, numbers, counts = np.unique(
         np.asarray(participants), return_inverse=True, return_counts=True
     )
@@ -184,15 +186,12 @@ def fit_mixed(
             "longitudinal model: no participant has three sessions, so that slopes cannot be"
             " separated from noise; use random intercepts"
         )
-    basis, triangle = np.linalg.qr(matrix)
-    inverse = np.linalg.inv(triangle)
     rotated = tuple(contrast.weights @ inverse for contrast in contrasts)
     parts = []
-    for points in glm.chunks(maps.shape, matrix.shape[1]):
-        values = np.asarray(maps[:, points], dtype=np.float64)
-        part = _fit(values, basis, numbers, rotated)
+    for values, columns in glm.parts_of_points(maps, basis, covariates):
+        part = _fit(values, columns, numbers, rotated)
         if times is not None:
-            full = _fit_slopes(values, basis, numbers, rotated, times=times)
+            full = _fit_slopes(values, columns, numbers, rotated, times=times)
             part = _larger_where_better(part, full)
         parts.append(part)
     whole = {name: np.concatenate([part[name] for part in parts], axis=-1) for name in parts[0]}
@@ -283,7 +282,7 @@ def _fit(
 ) -> dict[str, Float]:
     """Fit intercepts at some points; points last."""
     sums = collect_sums(maps, basis, participants)
-    columns = basis.shape[1]
+    columns = basis.shape[-1]
     usable = np.linalg.eigvalsh(sums.squares[:, :-1, :-1])[:, 0] > glm.MIN_INFORMATION
     usable &= (sums.n > columns + 1) & sums.repeated
     sums = sums.where(usable)
@@ -319,17 +318,17 @@ def _fit_slopes(
     sums = random_slope.collect_slope_sums(maps, basis, participants, standard)
     usable = np.linalg.eigvalsh(sums.squares)[:, 0] > glm.MIN_INFORMATION
     usable &= sums.moments[0].max(axis=1) >= _SLOPE_SESSIONS
-    usable &= sums.n > basis.shape[1] + _SLOPE_SESSIONS
+    usable &= sums.n > basis.shape[-1] + _SLOPE_SESSIONS
     subset = sums.take(np.flatnonzero(usable))
     triangles = random_slope.best_triangles(subset)
     scores, inverse, residual, penalty = random_slope.solve_slopes(subset, triangles)
-    variance = residual / (subset.n - basis.shape[1])
+    variance = residual / (subset.n - basis.shape[-1])
     turned, values_of = _tested(rotated, scores, inverse, variance)
     values_of |= {
         "participant": variance * triangles[:, 0] ** 2,
         "slope": variance * np.sum(triangles[:, 1:] ** 2, axis=1) / unit**2,
         "df": random_slope.slope_freedom(subset, triangles, turned),
-        "loss": (subset.n - basis.shape[1]) * np.log(residual) + penalty,
+        "loss": (subset.n - basis.shape[-1]) * np.log(residual) + penalty,
     }
 
     def spread(values: Float) -> Float:
@@ -378,8 +377,14 @@ class RepeatedRows(glm.RowModel):
         people = np.unique(self.participants, return_inverse=True)[1]
         return Visits(np.asarray(people, dtype=np.int64), self.times, self.slopes)
 
-    def fit(self, values: Float, rows: Int, contrasts: tuple[Contrast, ...]) -> glm.PointwiseFit:
-        """Fit some rows of the design at each point."""
+    def fit(
+        self,
+        values: Float,
+        rows: Int,
+        contrasts: tuple[Contrast, ...],
+        covariates: Float | None = None,
+    ) -> glm.PointwiseFit:
+        """Fit some rows of the design at each point, perhaps with maps as covariates."""
         return fit_mixed(
             values,
             self.design.matrix[rows],
@@ -387,6 +392,7 @@ class RepeatedRows(glm.RowModel):
             contrasts,
             self.longitudinal,
             times=self.times[rows] if self.times is not None and self.slopes else None,
+            covariates=covariates,
         )
 
     def fit_measures(

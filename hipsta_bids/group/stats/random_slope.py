@@ -13,7 +13,7 @@ from itertools import product
 import numpy as np
 
 from hipsta_bids.group.stats.arrays import Float, Int
-from hipsta_bids.group.stats.glm import products_of, sum_by
+from hipsta_bids.group.stats.glm import by_row, information, sum_by
 
 #: Most steps of the fit with random slopes.
 SLOPE_STEPS = 60
@@ -72,24 +72,20 @@ def collect_slope_sums(maps: Float, basis: Float, participants: Int, times: Floa
     weight = present.astype(np.float64)
     values = np.where(present, maps, 0.0)
     powers = np.stack([np.ones_like(times), times, times**2])
-    columns = basis.shape[1]
 
     def per_person(table: Float) -> Float:
         return np.moveaxis(sum_by(participants, table), 0, 1)
 
-    weight_shown = weight[:, :1] if present.all() else weight
+    is_shared = basis.ndim == 2 and present.all()  # noqa: PLR2004 -- one design for all points
+    weight_shown = weight[:, :1] if is_shared else weight
+    weighted = weight_shown[:, :, None] * by_row(basis)
     return SlopeSums(
         n=present.sum(axis=0),
-        squares=(weight.T @ products_of(basis)).reshape(-1, columns, columns),
-        products=values.T @ basis,
+        squares=information(present, basis),
+        products=(np.swapaxes(basis, -1, -2) @ values.T[:, :, None])[:, :, 0],
         total=np.einsum("sp,sp->p", values, values),
         moments=np.stack([per_person(weight_shown * power[:, None]) for power in powers]),
-        own_columns=np.stack(
-            [
-                per_person((weight_shown * power[:, None])[:, :, None] * basis[:, None, :])
-                for power in powers[:2]
-            ]
-        ),
+        own_columns=np.stack([per_person(weighted * power[:, None, None]) for power in powers[:2]]),
         own_values=np.stack([per_person(values * power[:, None]) for power in powers[:2]]),
     )
 

@@ -2,6 +2,7 @@
 
 import nibabel as nib
 import numpy as np
+import pandas as pd
 import pytest
 from small_cohorts import NODES, PLAN, place_of, write_dataset
 
@@ -50,6 +51,10 @@ def test_average_surface_is_that_of_all_and_takes_the_maps(results):
     assert chord == pytest.approx(np.sqrt(2) * RADII[1] * size, rel=1e-4)
     values = nib.load(results / "hemi-L_contrast-CNAD_stat-t_desc-thickness_statmap.shape.gii")
     assert len(values.darrays[0].data) == len(points)
+    peaks = pd.read_table(results / "peaks.tsv").query("hemi == 'L'")
+    at = (peaks.node_x - 1) * NODES[1] + peaks.node_y - 1
+    np.testing.assert_allclose(peaks[["x_mm", "y_mm", "z_mm"]], points[at], atol=6e-4)  # rounded
+    assert pd.read_table(results / "peaks.tsv").query("hemi == 'R'").x_mm.isna().all()
     corners = points[triangles]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     outward = (corners.mean(axis=1) - _center(flat)) * [1, 0, 1]

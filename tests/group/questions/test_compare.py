@@ -126,6 +126,25 @@ def test_tables_say_what_their_columns_are(results):
         assert not unknown, path.name
 
 
+def test_maps_of_statistics_have_sidecars(results):
+    """As of NeuroVault and BIDS Stats Models: kind of map, contrast, model, degrees of freedom."""
+    record = json.loads((results / "analysis.json").read_text())
+    for stat, kind in (("t", "T"), ("d", "Other"), ("pcorrected", "P")):
+        stem = f"hemi-L_contrast-CNAD_stat-{stat}_desc-thickness_statmap"
+        assert (results / f"{stem}.shape.gii").exists()
+        about = json.loads((results / f"{stem}.json").read_text())
+        assert about["StatMapType"] == kind
+        assert (about["Contrast"], about["Measure"]) == ("CN-AD", "thickness")
+        assert about["Model"] == record["formula"]
+        assert list(about["ContrastWeights"]) == record["columns"]
+        df = statmap(results, "L").df
+        assert about["DegreesOfFreedom"] == [df.min(), df.max()]
+        assert about["NumberOfParticipants"] == record["participants"]
+        rules = record["settings"]["multiplicity"]
+        assert (about["Correction"], about["Level"]) == (rules["method"], rules["alpha"])
+        assert about["Family"] == "all points of equal measure, contrast, hemi"
+
+
 def test_findings_are_counted_with_and_without_registration(results):
     with_it = pd.read_table(results / "alignment.tsv")
     maps = pd.read_table(results / "maps.tsv")

@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+import statsmodels.api as sm
 import statsmodels.formula.api as smf
 from small_cohorts import (
     NODES,
@@ -18,6 +19,7 @@ from small_cohorts import (
 
 from hipsta_bids.cli.main import main
 from hipsta_bids.errors import ExitCode
+from hipsta_bids.group.stats.inference import combine_evidence
 
 FAST = ("--align", "none", "--no-classification", "--no-reports")
 
@@ -27,9 +29,9 @@ def study(tmp_path_factory):
     return write_dataset(tmp_path_factory.mktemp("maps"))
 
 
-def sheets(out, measure):
-    """(participants, points) of the left sheets, as they were written."""
-    places = [place_of(out, f"{i + 1:02d}", "L") for i in range(sum(PLAN.sizes))]
+def sheets(out, measure, hemi="L"):
+    """(participants, points) of the sheets of a side, as they were written."""
+    places = [place_of(out, f"{i + 1:02d}", hemi) for i in range(sum(PLAN.sizes))]
     return np.array([table(place.path("sheet"))[measure].to_numpy() for place in places])
 
 
@@ -62,6 +64,40 @@ def test_a_map_is_a_covariate_at_each_point(study):
     assert "summary measures are not tested: map(curvature) has values at points only" in notes
 
 
+def test_permutations_and_asymmetry_have_the_map(study):
+    """Left minus right is explained by the covariate's left minus right; p are permuted."""
+    data, out = study
+    command = [str(data), str(out), "group", "--formula", "thickness ~ group + map(curvature)"]
+    options = ["--correction", "permutation-max", "--permutations", "200", "--asymmetry"]
+    options += ["--joint", "thickness", "--joint-sides"]
+    assert main([*command, *options, "--name", "permuted", *FAST]) == ExitCode.OK
+    folder = out / "group" / "permuted"
+    people = table(data / "participants.tsv")
+    maps = {
+        measure: [sheets(out, measure, hemi) for hemi in "LR"]
+        for measure in ("thickness", "curvature")
+    }
+    left, right = maps["thickness"]
+    asymmetry = 2 * (left - right) / (left + right)
+    bend = maps["curvature"][0] - maps["curvature"][1]
+    found = table(folder / "contrast-MapCurvature_desc-thicknessAsymmetry_statmap.tsv")
+    for point in (0, 70, 146):
+        rows = people.assign(y=asymmetry[:, point], c=bend[:, point])
+        fit = smf.ols("y ~ C(group, Treatment('CN')) + c", rows).fit()
+        assert found["estimate"][point] == pytest.approx(fit.params.iloc[2], rel=1e-4)
+        assert found["p"][point] == pytest.approx(fit.pvalues.iloc[2], rel=1e-3)
+    left_group = table(folder / "hemi-L_contrast-CNAD_desc-thickness_statmap.tsv")
+    assert left_group["p_corrected"].min() >= 1 / 200
+    # The largest t has the smallest p: the correction is monotone.
+    order = left_group["statistic"].abs().argsort()
+    assert (np.diff(left_group["p_corrected"].to_numpy()[order]) <= 0).all()
+    assert "200 permutations" in (folder / "methods.md").read_text()
+    joint = table(folder / "contrast-MapCurvature_desc-joint_statmap.tsv")
+    sides = [f"hemi-{hemi}_contrast-MapCurvature_desc-thickness_statmap.tsv" for hemi in "LR"]
+    p = np.stack([table(folder / name)["p"] for name in sides])
+    np.testing.assert_allclose(joint["statistic"], combine_evidence(p, "fisher"), rtol=1e-4)
+
+
 def test_change_by_the_map_at_baseline(tmp_path):
     """A change that depends on the baseline is found where it does; other maps have no effect."""
     data, out = begin_dataset(tmp_path)
@@ -86,6 +122,22 @@ def test_change_by_the_map_at_baseline(tmp_path):
     np.testing.assert_allclose(slope["estimate"][medial].mean(), -0.4, atol=0.03)
     assert (slope["p"][medial] < 0.05).mean() > 0.95
     assert (slope["p"][~medial] < 0.05).mean() < 0.15
+    command = [str(data), str(out), "group", "--longitudinal", "intercept", "--name", "long", *FAST]
+    assert main([*command, "--formula", "thickness ~ age + map(curvature)"]) == ExitCode.OK
+    found = table(
+        out / "group" / "long" / "hemi-L_contrast-MapCurvature_desc-thickness_statmap.tsv"
+    )
+    places = [place_of(out, f"{i + 1:02d}", "L", session=s) for i in range(40) for s in "12"]
+    sheet = [table(place.path("sheet")) for place in places]
+    for point in (3, 120):
+        y, bend = (
+            np.array([one[name][point] for one in sheet]) for name in ("thickness", "curvature")
+        )
+        people = np.repeat(np.arange(40), 2)
+        design = np.column_stack([np.ones(80), 60 + people % 20, bend])
+        model = sm.MixedLM(y, design, people).fit(reml=True, method="lbfgs")
+        # The accuracy of that optimizer, and maps in single precision.
+        assert found["estimate"][point] == pytest.approx(model.fe_params[2], rel=1e-3, abs=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -96,13 +148,9 @@ def test_change_by_the_map_at_baseline(tmp_path):
         (["thickness ~ group + map(curvatur)"], 65, "did you mean curvature?"),
         (["thickness ~ group + map(volume)"], 65, "map(volume) in the formula: it is no map"),
         (["volume ~ group + map(curvature)"], 65, "not with summary measures alone"),
-        (["thickness ~ group + map(curvature)", "--asymmetry"], 65, "not with --asymmetry"),
+        (["thickness ~ group + map(curvature)", "--normative", "group=CN"], 65, "--normative"),
         (["thickness ~ group + map(curvature)", "--export-summary", "a"], 65, "map()"),
-        (
-            ["thickness ~ group + map(curvature)", "--correction", "permutation-tfce"],
-            65,
-            "not with --fdr with permutations",
-        ),
+        (["thickness ~ group + map(curvature)", "--harmonize", "sex"], 65, "not with --harmonize"),
     ],
 )
 def test_what_maps_cannot_do_is_one_line(study, capsys, options, code, said):

@@ -174,7 +174,7 @@ def test_results_without_sheets_are_complete(alone):
     np.testing.assert_allclose(shape.darrays[0].data, statmap(alone, "L").statistic, rtol=1e-5)
     assert not (alone / "warps.tsv").exists()
     assert {path.stem for path in (alone / "figures").glob("*.svg")} == {"hipp_maps"}
-    for path in alone.glob("*_statmap.json"):
+    for path in alone.glob("*_contrast-CNAD_desc-*_statmap.json"):
         assert "vertex" in json.loads(path.read_text())
     page = group_page(alone)
     assert "could not be made" not in page

@@ -183,6 +183,8 @@ def test_rows_of_a_table_of_peaks_are_exact():
     first, second = peak_table(test, found, frame, sheet_edges(3, 2)).to_dict("records")
     common = {"contrast": "patients", "test": "t", "effect": "cohen_d"}
     assert first == common | {
+        "node_x": 1,
+        "node_y": 1,
         "x": -1.0,
         "y": -0.5,
         "subfield": "a",
@@ -197,6 +199,8 @@ def test_rows_of_a_table_of_peaks_are_exact():
         "shares": "a 50%; b 50%",
     }
     assert second == common | {
+        "node_x": 3,
+        "node_y": 1,
         "x": 1.0,
         "y": -0.5,
         "subfield": "c",
