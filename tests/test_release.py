@@ -54,7 +54,7 @@ def test_the_paper_has_the_sections_of_the_journal():
         "Software design",
         "Research impact statement",
         "AI usage disclosure",
-        "Acknowledgements",
+        "Acknowledgments",
         "References",
     ]
     assert len(text.split()) < 1750
