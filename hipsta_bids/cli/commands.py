@@ -49,7 +49,7 @@ def meta_parser() -> Parser:
     parser, add = parser_of("meta")
     add("sites", "SITE", nargs="+")
     add("out", "OUT", type=Path)
-    add("--random", choices=["reml", "dl"])
+    add("--random", choices=["reml", "reml-adhoc", "dl"])
     add("--correction", choices=["fdr2", "bh"])
     add("--fdr-scope", choices=["map", "hemispheres", "all"])
     add("--settings", "FILE.toml")

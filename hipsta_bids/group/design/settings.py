@@ -298,14 +298,11 @@ class ExchangeSettings(toml.SettingsTable):
 class MetaSettings(toml.SettingsTable):
     """Summaries of several sites become one result."""
 
-    model: Literal["joint", "two-stage"] = "joint"
-    """``joint``: the model of all participants with a constant per site, from coefficients and
-    covariances (Becker and Wu 2007). ``two-stage``: the mean of the sites' estimates. Each site
-    then has its own residual variance and slopes of covariates."""
-    random: Literal["reml", "dl"] = "reml"
-    """Variance between sites: ``reml`` (restricted maximum likelihood, t tests), or ``dl``
-    (DerSimonian and Laird 1986, normal tests in two stages). ``reml`` in two stages: t tests of
-    Knapp and Hartung 2003, with no standard error below the uncorrected one."""
+    random: Literal["reml", "reml-adhoc", "dl"] = "reml"
+    """Random effects. ``reml``: variance between sites by restricted maximum likelihood, limits by
+    Knapp and Hartung 2003 (``knha`` in metafor). ``reml-adhoc``: the same, but no standard error
+    below the uncorrected one, which is conservative. ``dl``: DerSimonian and Laird 1986, with
+    normal tests."""
     min_sites: Annotated[int, Field(ge=2)] = 2
     """Fewest sites with an estimate at a point."""
     confidence: toml.OpenFraction = 0.95

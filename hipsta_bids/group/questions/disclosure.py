@@ -1,8 +1,8 @@
 """Which summary may leave a site: a summary that holds no number about a few participants.
 
-Whoever has a summary has the sum of each product of two columns of the model, and of each column
-with each measure. So no cell of the factors, and no combination of the sums, may rest on fewer
-participants than ``exchange.min_cell``.
+Contrasts that a site chooses can hold the sum of each product of two columns of the model, and of
+each column with each measure. So no cell of the factors, and no combination of the sums, may rest
+on fewer participants than ``exchange.min_cell``.
 """
 
 from collections import Counter
