@@ -101,8 +101,8 @@ class DefaultModelSettings(toml.SettingsTable):
     """Age in the model: as a line, with its square, or as a natural cubic spline of three
     columns."""
     icv_columns: toml.Texts = ("icv", "etiv", "tiv", "intracranial_volume")
-    """The first of these columns is the covariate of volumes; else what FreeSurfer or ASHS
-    estimated."""
+    """The first of these columns is the covariate of volumes, areas and extents; else what
+    FreeSurfer or ASHS estimated."""
 
 
 class GlmSettings(toml.SettingsTable):

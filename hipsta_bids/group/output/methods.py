@@ -10,7 +10,7 @@ import numpy as np
 from hipsta_bids import __version__
 from hipsta_bids.derivatives.dataset import references
 from hipsta_bids.group.cohort.crop import REACH
-from hipsta_bids.group.cohort.data import Cohort
+from hipsta_bids.group.cohort.data import SIZES, Cohort
 from hipsta_bids.group.cohort.read import LEAST_SHARE
 from hipsta_bids.group.design import settings as group_settings
 from hipsta_bids.group.design.model import interactions
@@ -253,7 +253,7 @@ def _harmonization(
     sources = f"{cite('johnson')}, {cite('combat')}"
     preserved = code(plan.formula) if plan.names else "no variable"
     if plan.icv is not None:
-        preserved += f", and for volumes also {escaped(plan.icv)}"
+        preserved += f", and for {SIZES} also {escaped(plan.icv)}"
     text = (
         f"Effects of {column} ({counts} participants) on"
         f"{' registered' if analysis.registered else ''} maps and summary measures were removed by"
@@ -331,14 +331,14 @@ def _models(
     kinds = [f"Cohen's d ({d})"] * any(one.n_rows == 1 for one in contrasts)
     kinds += ["partial eta squared"] * any(one.n_rows > 1 for one in contrasts)
     adjusted = any(formula != analysis.model.formula for _, formula in analysis.measures)
-    volumes = "; volumes were also adjusted for intracranial volume" if adjusted else ""
+    sizes = f"; {SIZES} were also adjusted for intracranial volume" if adjusted else ""
     text += (
         f" Effect sizes are {' or '.join(kinds)}, with {settings.glm.confidence:.0%} confidence"
         f" limits from non-central distributions {cite('steiger')}."
     )
     if analysis.measures:
         text += (
-            f" Summary measures were tested with the same model{volumes}. Their false discovery"
+            f" Summary measures were tested with the same model{sizes}. Their false discovery"
             " rate was controlled over all measures, sides and models of a contrast."
         )
     return f"{text}{_nonlinear(analysis, settings)}"

@@ -46,7 +46,7 @@ class SavedEffects(TomlTable):
     repeated: bool
     """Whether participants had several visits."""
     icv: str | None
-    """Column that volumes kept besides."""
+    """Column that volumes, areas and extents kept besides."""
     labels: dict[str, list[str]] = Field(default_factory=dict)
     """Values of each field of provenance of the labels."""
     templates: dict[str, str]

@@ -18,7 +18,7 @@ from pydantic import Field
 
 from hipsta_bids import __version__
 from hipsta_bids.errors import InputError, ModelError
-from hipsta_bids.group.cohort.data import Cohort, summary_values
+from hipsta_bids.group.cohort.data import Cohort, grows_with_head, summary_values
 from hipsta_bids.group.design.formula import typed
 from hipsta_bids.group.design.grammar import closed_formula
 from hipsta_bids.group.design.model import Design, build_design
@@ -327,7 +327,7 @@ def _models(
         table = summary_values(compared, hemi, analysis.measured.summaries).iloc[rows]
         # Also those that do not vary here, so that all sites have the same measures.
         adjusted = model_formula != formula
-        names = [str(c) for c in table if not adjusted or str(c).startswith("volume")]
+        names = [str(c) for c in table if not adjusted or grows_with_head(str(c))]
         values = table[names].to_numpy(dtype=np.float64)
         yield {
             "kind": "summary",

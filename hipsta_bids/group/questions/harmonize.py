@@ -9,7 +9,7 @@ import pandas as pd
 from formulaic import Formula
 
 from hipsta_bids.errors import ModelError
-from hipsta_bids.group.cohort.data import Cohort, Measures, modeled_table
+from hipsta_bids.group.cohort.data import SIZES, Cohort, Measures, grows_with_head, modeled_table
 from hipsta_bids.group.design import formula as formulas
 from hipsta_bids.group.design.grammar import closed_formula, term_text
 from hipsta_bids.group.design.model import DEPENDENCE, Comparison, Design, build_design
@@ -78,7 +78,7 @@ def plan_sites(
     volume, values = _icv(cohort.table, usable, volume, formula)
     if saved and saved.icv and volume is None:
         raise ModelError(
-            f"{saved.file}: volumes kept {saved.icv} there, which not all have here; complete it"
+            f"{saved.file}: {SIZES} kept {saved.icv} there, which not all have here; complete it"
         )
     return SitePlan(
         column=column,
@@ -305,8 +305,11 @@ def harmonize_cohort(
         for name in summary.columns:
             key = "summary", hemi, name
             values = summary[[name]].to_numpy()
-            adjusted = _with_icv(visits, plan, side.rows) if name.startswith("volume") else visits
-            if plan.saved and (hemi, name) not in plan.saved.effects_on_summaries:
+            saved = plan.saved and plan.saved.effects_on_summaries.get((hemi, name))
+            # Earlier files adjust volumes alone.
+            is_adjusted = len(saved.slopes) > len(plan.names) if saved else grows_with_head(name)
+            adjusted = _with_icv(visits, plan, side.rows) if is_adjusted else visits
+            if plan.saved and not saved:
                 unknown.add(name)
                 summary[name] = np.nan
             elif len(np.unique(values[np.isfinite(values)])) > 1:
