@@ -269,6 +269,9 @@ class NormSettings(toml.SettingsTable):
     """Column of the site or scanner; its values are names."""
     knots: Annotated[int, Field(ge=3)] = 5
     """Knots of the natural cubic spline of age, at equal shares of the participants."""
+    shared_knots: Codes = ()
+    """Knots in years on which sites agree, at least three. Norms are then normal at each age, and
+    ``norms.json`` has the sums by which ``meta --norms`` merges sites."""
     edge: Annotated[int, Field(ge=3)] = 5
     """Norms reach from the age with this rank from below to the age with this rank from above. They
     are rounded to years outward, so that they reveal no single participant's age."""
