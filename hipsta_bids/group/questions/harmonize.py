@@ -197,24 +197,21 @@ def _explained(
 ) -> dict[str, float]:
     """Share of the variance of each column that sites explain; refuses what they explain wholly."""
     dummies = member[:, member.any(axis=0)]
-    basis = np.linalg.qr(dummies)[0]
     shares: dict[str, float] = {}
+    basis = dummies
     for name, values in columns.items():
         around = values - values.mean()
-        total = float(around @ around)
         inside = around - dummies @ np.linalg.lstsq(dummies, around, rcond=None)[0]
+        total = float(around @ around)
         shares[name] = 1 - float(inside @ inside) / total if total > 0 else 0.0
-        residual = values - basis @ (basis.T @ values)
-        residual -= basis @ (basis.T @ residual)
-        length = float(np.linalg.norm(residual))
-        if length <= DEPENDENCE * float(np.linalg.norm(values)):
-            if refuse:
-                raise ModelError(
-                    f"--harmonize {column}: {name} does not vary within {column}s, effects "
-                    "are inseparable; use sites with all groups, or drop --harmonize"
-                )
-            continue
-        basis = np.column_stack([basis, residual / length])
+        left = values - basis @ np.linalg.lstsq(basis, values, rcond=None)[0]
+        if np.linalg.norm(left) > DEPENDENCE * np.linalg.norm(values):
+            basis = np.column_stack([basis, left / np.linalg.norm(left)])
+        elif refuse:
+            raise ModelError(
+                f"--harmonize {column}: {name} does not vary within {column}s, effects "
+                "are inseparable; use sites with all groups, or drop --harmonize"
+            )
     return shares
 
 

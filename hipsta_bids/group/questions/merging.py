@@ -23,21 +23,11 @@ from hipsta_bids.types import PARTICIPANT
 
 #: File of norms, in the folder of an analysis.
 NORMS = "norms.json"
-#: What the norms of sites have in common, and what it is called.
-_COMMON = {
-    "seg": "segmentation protocol",
-    "region": "region",
-    "settings_hash": "hash of the participant level's settings",
-    "registration": "settings of registration",
-    "template": "template of registration",
-    "x": "grid of the sheet",
-    "y": "grid of the sheet",
-    "age": "column of age",
-    "sex": "column of sex",
-    "site": "column of sites",
-    "sexes": "levels of sex",
-    "knots": "knots of age",
-}
+#: Entries that the norms of all sites have in common.
+_COMMON = (
+    *("seg", "region", "settings_hash", "registration", "template", "x", "y"),
+    *("age", "sex", "site", "sexes", "knots"),
+)
 
 
 def with_sums(
@@ -149,9 +139,9 @@ def _check_agreement(paths: Sequence[Path], loaded: Sequence[NormsFile]) -> None
     for path, file in zip(paths, loaded, strict=True):
         if not file.columns:
             raise ModelError(f"{path}: has no sums; fit these norms with norms.shared_knots")
-        for name, words in _COMMON.items():
+        for name in _COMMON:
             if getattr(file, name) != getattr(loaded[0], name):
-                raise ModelError(f"{path}: {words} differs from {paths[0]}; all need the same")
+                raise ModelError(f"{path}: {name} differs from {paths[0]}; all sites need the same")
         if repeated := sorted(names & set(file.sites)):
             raise ModelError(f"{path}: {file.site} {listed(repeated)} is in two files; rename it")
         names |= set(file.sites)

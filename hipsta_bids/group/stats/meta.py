@@ -200,8 +200,8 @@ def meta_analyze(
     without = []
     if leave_out and n_sites > least:
         for site in range(n_sites):
-            others = np.arange(n_sites) != site
-            values = estimates[others], ses[others], sds[others], df[others]
+            kept = np.arange(n_sites) != site
+            values = estimates[kept], ses[kept], sds[kept], df[kept]
             without.append(meta_analyze(*values, settings, leave_out=False))
     with np.errstate(invalid="ignore"):  # of points that no site has
         sd = np.sqrt(np.nansum(freedom * sds**2, axis=0) / np.nansum(freedom, axis=0))

@@ -192,7 +192,7 @@ def test_what_does_not_fit_together_is_refused(sites, tmp_path, capsys):
     refused(capsys, ["meta", "--norms", first, out], "two sites or more", code=64)
     refused(capsys, ["meta", "--norms", first, first, out], "site A is in two files")
     other = edited(knots=[20.0, 51.0, 85.0])
-    refused(capsys, ["meta", "--norms", first, other, out], "knots of age differs from")
+    refused(capsys, ["meta", "--norms", first, other, out], "knots differs from")
     refused(capsys, ["meta", "--norms", first, edited(columns=[]), out], "has no sums")
     refused(capsys, ["meta", "--norms", first, edited(columns=[[[[1.0]]]]), out], "do not fit")
     settings = tmp_path / "many.toml"
