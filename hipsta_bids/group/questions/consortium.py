@@ -253,9 +253,10 @@ def _methods(meta: Meta) -> str:
     if meta.items[0].result.without:
         effects += " All analyses were repeated without each site."
     errors = (
-        f"{discovery_text(meta.settings.multiplicity, cite)}, and over all summary measures of a"
-        " contrast. Effect sizes are Cohen's d: the estimate divided by the residual standard"
-        f" deviation within sites, with {rules.confidence:.0%} confidence limits."
+        f"{discovery_text(meta.settings.multiplicity, cite, meta.discoveries)}, and over all"
+        " summary measures of a contrast by each model. Effect sizes are Cohen's d: the estimate"
+        " divided by the residual standard deviation within sites, with"
+        f" {rules.confidence:.0%} confidence limits."
     )
     paragraphs = [f"{measure_text} {aligned}", effects, errors]
     survivors = [
