@@ -111,7 +111,8 @@ def _check_columns(
     weights: Sequence[Float],
 ) -> None:
     """Refuse few residual degrees of freedom, high leverage, and sums of few participants."""
-    matrix = columns / np.linalg.norm(columns, axis=0)
+    # A level that only other sites have is a column of zeros.
+    matrix = columns / np.maximum(np.linalg.norm(columns, axis=0), _ZERO)
     basis = _span(matrix)
     leverage = float(np.max(np.sum(basis**2, axis=1)))
     first, second = np.triu_indices(basis.shape[1])

@@ -59,6 +59,11 @@ def with_sums(
     columns, limits = summed_norms.columns_of(summed, knots), study.settings.exchange
     for number, site in enumerate(file.sites):
         positions = np.flatnonzero(summed.site == number)
+        if len(positions) < limits.min_cell:
+            raise ModelError(
+                f"--fit-norms, {file.site} {site}: {len(positions)} participants have all maps and"
+                f" hemispheres, at least {limits.min_cell} are needed"
+            )
         people_here = {name: column.iloc[positions] for name, column in variables.items()}
         models, weights = [(columns[positions], names)], [columns[positions, 1]]
         try:

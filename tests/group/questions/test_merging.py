@@ -158,6 +158,18 @@ def test_sixty_participants_are_enough_for_four_knots(tmp_path):
     assert main([str(argument) for argument in small(tmp_path, nothing)]) == 0
 
 
+def test_a_site_of_one_sex_can_send_sums():
+    """Its column of sex is zero, and says nothing."""
+    age = np.random.default_rng(2).uniform(20, 85, 60)
+    people = People(age=age, sex=np.zeros((60, 1)), site=np.zeros(60, dtype=int))
+    columns = columns_of(people, np.array([20.0, 50, 85]))
+    variables = {"sex": pd.Series(["F"] * 60), "age": pd.Series(age)}
+    names = ["constant", "age 1", "age 2", "M"]
+    limits = ExchangeSettings()
+    cells = check_sums([(columns, names)], {"sex"}, variables, limits, weights=[columns[:, 1]])
+    assert [len(rows) for rows in cells] == [60]
+
+
 @pytest.mark.parametrize("n_old", [4, 30])
 def test_few_participants_beyond_a_knot_are_refused(n_old):
     """From five knots on, a combination of columns is zero below the middle knot."""
