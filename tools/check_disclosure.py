@@ -1,9 +1,9 @@
 """Attack summaries for other sites: read small cells, small sums and single values out of them.
 
 Random designs are fitted and exported as ``group --export-summary`` does it. The attack has the
-file alone. Covariances and coefficients hold the sum of each product of two columns, and of each
-column with each measure; the names of columns say which levels a sum is about. From these the
-attack
+file, and all coefficients with their covariance: contrasts that a site chooses can hold these. They
+hold the sum of each product of two columns, and of each column with each measure; the names of
+columns say which levels a sum is about. From these the attack
 
 - solves for counts and sums in all cells of the factors, in whole numbers if these are counts;
 - takes functions with a bend apart into the piece below and the piece above;
@@ -22,6 +22,7 @@ from dataclasses import dataclass, field
 from itertools import combinations, product
 from math import comb
 from typing import Any, NamedTuple
+from unittest.mock import patch
 
 import numpy as np
 import pandas as pd
@@ -32,11 +33,13 @@ from scipy import optimize, sparse
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.cohort.data import Cohort, Measures
 from hipsta_bids.group.design.formula import model_from_shortcut, parse_model
+from hipsta_bids.group.design.model import Design
 from hipsta_bids.group.design.settings import GroupSettings, RegistrationSettings
 from hipsta_bids.group.questions import exchange
 from hipsta_bids.group.questions.analysis import analyze_cohort
 from hipsta_bids.group.stats.arrays import SideMaps
 
+exchange_model = exchange._model  # noqa: SLF001  (its result gets coefficients)
 FEWEST = 5  # participants that a number has to be about
 COUNT, SEED = 1000, 0
 ORDINARY, SIZE, LEAST = 200, 100, 0.97  # cohorts, participants, share to be exported
@@ -192,11 +195,21 @@ def export(table: pd.DataFrame, formula: str, random: np.random.Generator) -> st
         icv="icv" if random.integers(2) else None,
     )
     inputs = {"versions": [], "seg": "demo", "region": "body", "settings_hash": "0"}
-    summary, _ = exchange.summarize(cohort, analysis, settings, site="a", inputs=inputs)
+    with patch.object(exchange, "_model", model_with_coefficients):
+        summary, _ = exchange.summarize(cohort, analysis, settings, site="a", inputs=inputs)
     return json.dumps(summary)
 
 
-# --- the attack, which knows the text of a summary and nothing else ------------------------------
+def model_with_coefficients(values: Floats, design: Design, *rest: Any) -> dict[str, Any]:  # noqa: ANN401  (passed on)
+    """Export a model with what contrasts of each column, and of pairs of columns, would add."""
+    entry = exchange_model(values, design, *rest)
+    inverse = np.linalg.inv(design.matrix.T @ design.matrix)
+    known = np.array([sd is not None for sd in entry["sd"]])
+    fitted = inverse @ design.matrix.T @ np.where(known, values, 0.0)
+    return entry | {"covariance": inverse.tolist(), "coefficients": fitted.tolist()}
+
+
+# --- the attack, which knows the text of a summary with coefficients, and nothing else -----------
 
 
 def read_column(name: str) -> Column:

@@ -119,7 +119,8 @@ CHANGED: Mapping[str, str] = {
     "multiplicity": "method scope alpha permutations blocks",
     "joint": "measures",
     "classification": "base added",
-    "meta": "model random",
+    "norms": "shared_knots",
+    "meta": "random",
 }
 
 REASONS_TEXT = """\

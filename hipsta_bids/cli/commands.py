@@ -49,7 +49,8 @@ def meta_parser() -> Parser:
     parser, add = parser_of("meta")
     add("sites", "SITE", nargs="+")
     add("out", "OUT", type=Path)
-    add("--random", choices=["reml", "dl"])
+    add("--norms")
+    add("--random", choices=["reml", "reml-adhoc", "dl"])
     add("--correction", choices=["fdr2", "bh"])
     add("--fdr-scope", choices=["map", "hemispheres", "all"])
     add("--settings", "FILE.toml")
@@ -255,6 +256,14 @@ def run_meta_analysis(arguments: Sequence[str]) -> ExitCode:
     }
     settings = load_group_settings(options.settings).changed(**given_settings(choices))
     paths = [_site(text) for text in options.sites]
+    if options.norms:
+        from hipsta_bids.group.questions.merging import merge_norms  # noqa: PLC0415  (heavy)
+
+        norms, notes = merge_norms([path for _, path in paths], options.out, settings)
+        for note in notes:
+            echo(f"note: {note}")
+        echo(f"norms: {norms}")
+        return ExitCode.OK
     command = "hipsta-bids", "meta", *arguments
     page, notes = run_meta(paths, options.out, settings, command, figures=options.figures)
     for note in notes:

@@ -3,8 +3,10 @@
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from string import ascii_uppercase
 from typing import Any
 
+import numpy as np
 import pandas as pd
 from scipy import stats
 
@@ -13,13 +15,14 @@ from hipsta_bids.io import files
 from hipsta_bids.reports import cells, group_tables
 from hipsta_bids.reports.group import heading, methods, origin
 from hipsta_bids.reports.group_maps import map_scenes
-from hipsta_bids.reports.group_tables import GroupResults, records
+from hipsta_bids.reports.group_tables import GroupResults, map_unit, records
 from hipsta_bids.reports.page import Section, build_sections, render
 
 _PREFIX = "meta"
 #: Forest plots of summary measures on the page; all are in the table.
 _MOST_FORESTS = 60
-_SITE, _PREDICTION, _RANDOM = "site", "prediction", "random effects"
+_SITE, _PREDICTION = "site", "prediction"
+_FIXED, _RANDOM = "fixed effect", "random effects"
 #: Layout of a forest plot, pixels.
 _NAMES, _PLOT, _TEXTS, _ROW, _TOP = 156, 236, 222, 21, 10
 _LARGEST = 12.0  # side of the square of a site with all of the weight
@@ -122,8 +125,7 @@ def _explained(results: GroupResults) -> Mapping[str, Any]:
     settings = (results.record.get("settings") or {}).get("meta") or {}
     sites = len(results.record.get("sites") or ())
     return {
-        "joint": settings.get("model") == "joint",
-        "reml": settings.get("random") == "reml",
+        "random": settings.get("random"),
         "sites": sites,
         "needed": cells.number_text(float(stats.t.isf(0.0005, max(1, sites - 1)))),
         "confidence": f"{settings.get('confidence', 0.95):.0%}",
@@ -152,16 +154,47 @@ def _summary_forests(results: GroupResults) -> Mapping[str, Any] | None:
     }
 
 
+def _pairs(table: pd.DataFrame, keys: Sequence[str]) -> pd.DataFrame:
+    """Put fixed and random effects of a contrast in one row, as columns with these endings."""
+    halves = []
+    for kind in (_FIXED, _RANDOM):
+        suffix = f" ({kind})"
+        half = table[table["contrast"].str.endswith(suffix)]
+        halves.append(half.assign(contrast=half["contrast"].str.removesuffix(suffix)))
+    return halves[0].merge(halves[1], on=[*keys, "contrast"], suffixes=("_fixed", "_random"))
+
+
 def _heterogeneity(results: GroupResults) -> Mapping[str, Any] | None:
-    """Summarize I squared and Q of maps."""
-    suffix = f" ({_RANDOM})"
-    rows = [row for row in records(results.table("maps")) if suffix in row["contrast"]]
+    """Summarize maps: points that survive, and how much sites differ."""
+    table = results.table("maps")
+    if not len(table):
+        return None
+    rows = records(_pairs(table, ["measure", "hemi"]))
     for row in rows:
-        points = results.table(str(row["file"])).dropna(subset="i2")
-        row["contrast"] = row["contrast"].removesuffix(suffix)
+        points = results.table(str(row["file_random"])).dropna(subset="i2")
         row["median"], row["most"] = points["i2"].quantile([0.5, 0.95])
+        row["tau"] = math.sqrt(points["tau2"].median())
+        row["unit"] = map_unit(results, row["measure"])
         row["share"] = (points["q_p"] < 0.05).mean()  # noqa: PLR2004  (in words)
-    return {"rows": rows} if rows else None
+    return {"rows": rows}
+
+
+def _measures(results: GroupResults) -> Mapping[str, Any] | None:
+    """List summary measures: fixed effect, heterogeneity and random effects in one row."""
+    table = results.table("measures")
+    if not len(table):
+        return None
+    pairs = _pairs(table, ["measure", "hemi", "unit", "model"])
+    # As the filter of limits wants them.
+    pairs.columns = pairs.columns.str.replace(r"_(low|high)_(fixed|random)$", r"_\2_\1", regex=True)
+    pairs["tau"] = np.sqrt(pairs["tau2_random"])
+    pairs = pairs.sort_values(["p_fdr_fixed", "p_fixed"], kind="stable")
+    models = pairs["model"].unique()
+    return {
+        "rows": records(pairs),
+        "families": table["contrast"].nunique(),
+        "letters": dict(zip(models, ascii_uppercase, strict=False)) if len(models) > 1 else {},
+    }
 
 
 def _without(results: GroupResults) -> Mapping[str, Any] | None:
@@ -185,16 +218,16 @@ def _sites(results: GroupResults) -> Mapping[str, Any]:
 
 #: Sections of the page, from top to bottom.
 SECTIONS: tuple[Section[GroupResults], ...] = (
-    Section("found", "What was found", "group/found.html", group_tables.findings),
-    Section("effects", "Fixed and random", "meta/effects.html", _explained),
+    Section("effects", "Fixed and random effects", "meta/effects.html", _explained),
+    Section("summaries", "Summary measures", "meta/summaries.html", _measures),
+    Section("between", "Maps: points and heterogeneity", "meta/heterogeneity.html", _heterogeneity),
+    Section("found", "Findings in maps", "group/found.html", group_tables.findings),
     Section("sites", "Sites", "meta/sites.html", _sites),
     Section("forests", "Peaks by site", "meta/forests.html", _peak_forests),
     Section("measures", "Summary measures by site", "meta/forests.html", _summary_forests),
     Section("maps", "Maps", "group/maps.html", _maps),
-    Section("between", "Heterogeneity", "meta/heterogeneity.html", _heterogeneity),
     Section("without", "Without a site", "meta/without.html", _without),
     Section("peaks", "Clusters and peaks", "group/peaks.html", group_tables.peaks),
-    Section("summaries", "Summary measures", "group/summaries.html", group_tables.summaries),
     Section("methods", "Methods paragraph", "group/methods.html", methods),
     Section("origin", "Origin", "group/origin.html", origin),
 )

@@ -138,7 +138,9 @@ def test_head_volumes_of_the_default_model_are_checked_too(study, capsys):
     call = [str(study.data), str(study.out), "group", "--align", "none", "--no-reports"]
     assert main([*call, "--no-classification"]) == 0
     said = capsys.readouterr().out
-    assert "volumes are not adjusted for TIV: model: 'TIV' has 9 values to" in said
+    assert (
+        "volumes, areas and extents are not adjusted for TIV: model: 'TIV' has 9 values to" in said
+    )
 
 
 def test_head_volumes_that_differ_as_heads_do_pass(study, capsys):

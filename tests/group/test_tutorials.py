@@ -252,7 +252,7 @@ def check_consortium(folder):
         cells += [f"{row.statistic:.1f}", f"{row.df:.0f}", f"{row.p_corrected:.0e}"]
         assert f"| {' | '.join([*cells, f'{row.effect_size:.2f}', str(row.extent)])} |" in page
     thinned = table(folder / "berlin" / "phantom_effect.tsv").in_region.to_numpy() == 1
-    maps, counts, between = {}, {}, []
+    maps, counts, between, away = {}, {}, [], []
     for hemi in "LR":
         for kind, path in (
             ("fixed", meta / f"hemi-{hemi}_contrast-ControlPatientFixedEffect"),
@@ -265,20 +265,15 @@ def check_consortium(folder):
             counts[kind, hemi] = int(found[thinned].sum()), int(found[~thinned].sum())
         between.append(f"{maps['random', hemi].i2.median():.0%}".replace("%", " %"))
         sd = (maps["pooled", hemi].estimate / maps["pooled", hemi].cohen_d).to_numpy()
-        away = {
-            kind: np.nanmax(np.abs(maps[kind, hemi].estimate - maps["pooled", hemi].estimate) / sd)
-            for kind in ("fixed", "random")
-        }
-        assert away["fixed"] < 1e-6
-        assert away["random"] < 0.02
+        moved = maps["fixed", hemi].estimate - maps["pooled", hemi].estimate
+        away.append(np.nanmax(np.abs(moved) / sd))
     for kind in ("fixed", "random"):
         (left, more), (right, beside) = counts[kind, "L"], counts[kind, "R"]
         assert (
             f"{left} and {right} of its {THINNED} points, and {more} and {beside} beside it" in page
         )
     assert f"{between[0]} on the left and {between[1]} on the right" in page
-    assert counts["pooled", "L"] == counts["fixed", "L"]
-    assert counts["pooled", "R"] == counts["fixed", "R"]
+    assert f"differ by at most {max(away):.1f} SD" in page
     total = [sum(counts["harmonized", hemi]) for hemi in "LR"]
     assert f"{total[0]} and {total[1]} points survive" in page
     left_out = table(meta / "leave_one_out.tsv").set_index("contrast").n_significant

@@ -1,5 +1,6 @@
 """Values passed between reading, analyzing and writing at the group level."""
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -199,6 +200,17 @@ def asymmetry_maps(cohort: Cohort, measures: Sequence[str], relative: Sequence[s
         summary=pd.DataFrame(index=range(len(rows))),
         mesh=left.mesh,
     )
+
+
+#: Summary measures that grow with the head.
+_SIZES = re.compile(r"(volume|area|section_area|extent)(?!_ratio)")
+#: What these are in texts.
+SIZES = "volumes, areas and extents"
+
+
+def grows_with_head(measure: str) -> bool:
+    """Check whether a summary measure is also tested with intracranial volume."""
+    return _SIZES.match(measure) is not None
 
 
 #: Surfaces: the sheet, and that of summary measures, which is one point. Those of other programs'

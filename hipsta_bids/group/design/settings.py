@@ -101,8 +101,8 @@ class DefaultModelSettings(toml.SettingsTable):
     """Age in the model: as a line, with its square, or as a natural cubic spline of three
     columns."""
     icv_columns: toml.Texts = ("icv", "etiv", "tiv", "intracranial_volume")
-    """The first of these columns is the covariate of volumes; else what FreeSurfer or ASHS
-    estimated."""
+    """The first of these columns is the covariate of volumes, areas and extents; else what
+    FreeSurfer or ASHS estimated."""
 
 
 class GlmSettings(toml.SettingsTable):
@@ -269,6 +269,9 @@ class NormSettings(toml.SettingsTable):
     """Column of the site or scanner; its values are names."""
     knots: Annotated[int, Field(ge=3)] = 5
     """Knots of the natural cubic spline of age, at equal shares of the participants."""
+    shared_knots: Codes = ()
+    """Knots in years on which sites agree, at least three. Norms are then normal at each age, and
+    ``norms.json`` has the sums by which ``meta --norms`` merges sites."""
     edge: Annotated[int, Field(ge=3)] = 5
     """Norms reach from the age with this rank from below to the age with this rank from above. They
     are rounded to years outward, so that they reveal no single participant's age."""
@@ -298,14 +301,11 @@ class ExchangeSettings(toml.SettingsTable):
 class MetaSettings(toml.SettingsTable):
     """Summaries of several sites become one result."""
 
-    model: Literal["joint", "two-stage"] = "joint"
-    """``joint``: the model of all participants with a constant per site, from coefficients and
-    covariances (Becker and Wu 2007). ``two-stage``: the mean of the sites' estimates. Each site
-    then has its own residual variance and slopes of covariates."""
-    random: Literal["reml", "dl"] = "reml"
-    """Variance between sites: ``reml`` (restricted maximum likelihood, t tests), or ``dl``
-    (DerSimonian and Laird 1986, normal tests in two stages). ``reml`` in two stages: t tests of
-    Knapp and Hartung 2003, with no standard error below the uncorrected one."""
+    random: Literal["reml", "reml-adhoc", "dl"] = "reml"
+    """Random effects. ``reml``: variance between sites by restricted maximum likelihood, limits by
+    Knapp and Hartung 2003 (``knha`` in metafor). ``reml-adhoc``: the same, but no standard error
+    below the uncorrected one, which is conservative. ``dl``: DerSimonian and Laird 1986, with
+    normal tests."""
     min_sites: Annotated[int, Field(ge=2)] = 2
     """Fewest sites with an estimate at a point."""
     confidence: toml.OpenFraction = 0.95

@@ -2,7 +2,7 @@
 
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,15 +10,15 @@ import numpy as np
 from hipsta_bids import __version__
 from hipsta_bids.derivatives.dataset import references
 from hipsta_bids.group.cohort.crop import REACH
-from hipsta_bids.group.cohort.data import Cohort
+from hipsta_bids.group.cohort.data import SIZES, Cohort
 from hipsta_bids.group.cohort.read import LEAST_SHARE
 from hipsta_bids.group.design import settings as group_settings
 from hipsta_bids.group.design.model import interactions
 from hipsta_bids.group.output.results import Analysis
 from hipsta_bids.group.output.tables import summary_tests
+from hipsta_bids.group.stats import inference
 from hipsta_bids.group.stats.clusters import TFCE_EXTENT, TFCE_HEIGHT
 from hipsta_bids.group.stats.exchangeability import exchange_text, spans_constant
-from hipsta_bids.group.stats.inference import PERMUTATIONS, control_fdr, row_blocks
 from hipsta_bids.protocols import EXPERIMENTAL
 from hipsta_bids.reports.group_tables import opposite_changes
 from hipsta_bids.types import PARTICIPANT
@@ -253,7 +253,7 @@ def _harmonization(
     sources = f"{cite('johnson')}, {cite('combat')}"
     preserved = code(plan.formula) if plan.names else "no variable"
     if plan.icv is not None:
-        preserved += f", and for volumes also {escaped(plan.icv)}"
+        preserved += f", and for {SIZES} also {escaped(plan.icv)}"
     text = (
         f"Effects of {column} ({counts} participants) on"
         f"{' registered' if analysis.registered else ''} maps and summary measures were removed by"
@@ -331,15 +331,18 @@ def _models(
     kinds = [f"Cohen's d ({d})"] * any(one.n_rows == 1 for one in contrasts)
     kinds += ["partial eta squared"] * any(one.n_rows > 1 for one in contrasts)
     adjusted = any(formula != analysis.model.formula for _, formula in analysis.measures)
-    volumes = "; volumes were also adjusted for intracranial volume" if adjusted else ""
+    sizes = f"; {SIZES} were also adjusted for intracranial volume" if adjusted else ""
     text += (
         f" Effect sizes are {' or '.join(kinds)}, with {settings.glm.confidence:.0%} confidence"
         f" limits from non-central distributions {cite('steiger')}."
     )
     if analysis.measures:
+        tests = [test for _, fit, _ in analysis.measures.values() for test in fit.tests]
+        n_families = len({test.contrast.name for test in tests})
         text += (
-            f" Summary measures were tested with the same model{volumes}. Their false discovery"
-            " rate was controlled over all measures, sides and models of a contrast."
+            f" Summary measures were tested with the same model{sizes}. Their false discovery"
+            " rate was controlled over all measures, sides and models of a contrast (families of"
+            f" tests: {n_families})."
         )
     return f"{text}{_nonlinear(analysis, settings)}"
 
@@ -377,7 +380,7 @@ def _nonlinear(analysis: Analysis, settings: group_settings.GroupSettings) -> st
         for test in fit.tests
         if test.contrast.name in names
     ]
-    result = control_fdr(np.concatenate(p or [np.empty(0)]), settings.multiplicity.alpha)
+    result = inference.control_fdr(np.concatenate(p or [np.empty(0)]), settings.multiplicity.alpha)
     return (
         f" Age was modeled with {curve}. The contrast {escaped(names[0])} tested the departure from"
         f" a line; it was significant in {int(result.rejected.sum())} of {result.n_tests} tests of"
@@ -388,20 +391,20 @@ def _nonlinear(analysis: Analysis, settings: group_settings.GroupSettings) -> st
 def _correction(
     rules: group_settings.MultiplicitySettings, cite: Callable[[str], str], analysis: Analysis
 ) -> str:
-    if rules.method not in PERMUTATIONS:
-        return f"{discovery_text(rules, cite)}."
+    if rules.method not in inference.PERMUTATIONS:
+        return f"{discovery_text(rules, cite, analysis.found)}."
     inside = f" within levels of {escaped(rules.blocks)}" if rules.blocks else ""
     visits, design = analysis.row_model.visits, analysis.design
     kind = "model" if visits is None else "linear model"
     text = (
         f"The family-wise error rate was controlled at {rules.alpha:g} over"
-        f" {_FAMILIES[rules.scope]}, by {rules.permutations} permutations{inside} (seed"
+        f" {_families(rules, analysis.found)}, by {rules.permutations} permutations{inside} (seed"
         f" {rules.seed}) {cite('permutation')}. Residuals of the {kind} without the contrast were"
         f" permuted {cite('freedman')}."
     )
     if visits is not None:
         visits = replace(
-            visits, blocks=row_blocks(analysis.row_model, analysis.compared.table, rules)
+            visits, blocks=inference.row_blocks(analysis.row_model, analysis.compared.table, rules)
         )
         exchanged = exchange_text(design.matrix, design.contrasts, visits, rules.visits)
         text += f" {escaped(exchanged)} {cite('repeated')}."
@@ -417,11 +420,21 @@ def _correction(
     return f"{text} The statistic was the largest absolute statistic of all points."
 
 
-def discovery_text(rules: group_settings.MultiplicitySettings, cite: Callable[[str], str]) -> str:
+def _families(rules: group_settings.MultiplicitySettings, maps: Iterable[inference.MapKey]) -> str:
+    """Return which points are one family of tests, and the number of families."""
+    n = len(inference.families(maps, rules.scope))
+    return f"{_FAMILIES[rules.scope]} ({n} {'family' if n == 1 else 'families'} of tests)"
+
+
+def discovery_text(
+    rules: group_settings.MultiplicitySettings,
+    cite: Callable[[str], str],
+    maps: Iterable[inference.MapKey],
+) -> str:
     """Return how the false discovery rate was controlled."""
     return (
         f"The false discovery rate was controlled at {rules.alpha:g} by {PROCEDURES[rules.method]}"
-        f" {cite(rules.method)}, over {_FAMILIES[rules.scope]}"
+        f" {cite(rules.method)}, over {_families(rules, maps)}"
     )
 
 

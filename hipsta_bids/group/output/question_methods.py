@@ -46,11 +46,21 @@ def norms_text(
         "The mean at each point, and of each summary measure, was a natural cubic spline of age"
         f" ({len(file.knots)} knots) with constants for{sexes} site. The logarithm of the"
         f" standard deviation was linear in age, with a constant for each site {cite('gamlss')}."
-        f" Where a likelihood-ratio test rejected normality (p < {SHAPE_LEVEL:g}), residuals had a"
-        f" sinh-arcsinh distribution {cite('shash')}, as in warped normative models"
-        f" {cite('warped')}. Deviations (z) are normal quantiles of the probability of a value."
-        " This probability was Student's, which allows for the uncertainty of the shift and scale"
-        " of each site."
+    )
+    if file.columns:
+        model += (
+            " Distributions were normal, and all numbers followed from sums of products over the"
+            " participants of each site; no value of a participant left its site."
+        )
+    else:
+        model += (
+            f" Where a likelihood-ratio test rejected normality (p < {SHAPE_LEVEL:g}), residuals"
+            f" had a sinh-arcsinh distribution {cite('shash')}, as in warped normative models"
+            f" {cite('warped')}."
+        )
+    model += (
+        " Deviations (z) are normal quantiles of the probability of a value. This probability was"
+        " Student's, which allows for the uncertainty of the shift and scale of each site."
     )
     paragraphs = [first, model]
     if coverage is not None:

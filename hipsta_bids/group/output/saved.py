@@ -14,7 +14,7 @@ from pydantic import AfterValidator, ConfigDict, Field, model_validator
 from hipsta_bids import __version__
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.design.grammar import closed_formula
-from hipsta_bids.group.stats.arrays import Key
+from hipsta_bids.group.stats.arrays import Float, Key
 from hipsta_bids.group.stats.combat import ARRAYS, SiteEffects
 from hipsta_bids.group.stats.norms import LEVELS, NORM_ARRAYS, Norms, People
 from hipsta_bids.group.stats.warps import DEGREE, Template
@@ -46,7 +46,7 @@ class SavedEffects(TomlTable):
     repeated: bool
     """Whether participants had several visits."""
     icv: str | None
-    """Column that volumes kept besides."""
+    """Column that volumes, areas and extents kept besides."""
     labels: dict[str, list[str]] = Field(default_factory=dict)
     """Values of each field of provenance of the labels."""
     templates: dict[str, str]
@@ -172,6 +172,12 @@ class NormsFile(TomlTable):
     participants: Annotated[int, Field(ge=1)]
     norms: dict[Literal["L", "R", "LR"], dict[files.Text, NormArrays]]
     """By hemisphere and measure; summary measures are single points."""
+    columns: list[list[list[list[files.Number]]]] = Field(default_factory=list)
+    """Sums of products of columns, for merging (:func:`sum_columns`); empty without."""
+    sums: dict[Literal["L", "R", "LR"], dict[files.Text, list[list[list[files.FileNumbers]]]]] = (
+        Field(default_factory=dict)
+    )
+    """Sums of products with values by hemisphere and measure (:func:`sum_values`)."""
 
     @property
     def middle(self) -> People:
@@ -210,14 +216,27 @@ class NormsFile(TomlTable):
                 norms[str(hemi), measure] = Norms(
                     knots=knots, **{**values, "n": values["n"].astype(int)}
                 )
-        if self.hash != _digest(self.model_dump()):
+        if self.hash != _digest(self.model_dump(exclude_unset=True)):
             raise ValueError("changed after it was written")
         return norms
+
+    def site_sums(self) -> dict[Key, Float]:
+        """Return sums by hemisphere and measure as arrays; ValueError if these do not fit."""
+        n_sites, n_columns = len(self.sites), len(self.knots) + max(len(self.sexes) - 1, 0)
+        if np.shape(self.columns) != (n_sites, 2, n_columns, n_columns):
+            raise ValueError("sums of columns that do not fit")
+        sums = {}
+        for hemi, measures in self.sums.items():
+            for measure, values in measures.items():
+                sums[str(hemi), measure] = np.array(values, dtype=np.float64)
+                if sums[hemi, measure].shape[:3] != (n_sites, 2, n_columns + 1):
+                    raise ValueError(f"sums of {measure}, {hemi}, that do not fit")
+        return sums
 
 
 def save_norms(path: Path, file: NormsFile, norms: Mapping[Key, Norms]) -> None:
     """Write norms, to be read by :func:`load_norms`."""
-    content = {**file.model_dump(), "norms": files.as_nested(norms, NORM_ARRAYS)}
+    content = {**file.model_dump(exclude_unset=True), "norms": files.as_nested(norms, NORM_ARRAYS)}
     files.write_json(path, {**content, "hash": _digest(content)})
 
 
@@ -233,6 +252,7 @@ def load_norms(path: Path) -> tuple[NormsFile, dict[Key, Norms]]:
     """
     try:
         file = files.read_foreign(path, NormsFile, max_bytes=_LARGEST)
+        _ = file.site_sums() if file.columns else None
         return file, file.arrays()
     except (ValueError, RecursionError) as error:
         raise ModelError(

@@ -70,7 +70,7 @@ def analyze_cohort(
     time : str, optional
         Column of the time of visits, for random slopes.
     icv : str, optional
-        Column of intracranial volume, for volumes.
+        Column of intracranial volume, for volumes, areas and extents.
     templates : mapping of str to Template, optional
         By hemisphere; else they are made from this cohort.
     site_effects : SavedEffects, optional

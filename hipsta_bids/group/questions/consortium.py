@@ -24,7 +24,7 @@ from hipsta_bids.group.output.tables import META_COLUMNS
 from hipsta_bids.group.questions.exchange import SiteSummary, read_summary, shown_counts
 from hipsta_bids.group.questions.sites import Meta, analyze_sites, check_agreement, meta_tables
 from hipsta_bids.group.stats.arrays import SideMaps
-from hipsta_bids.group.stats.glm import MEAN, FittedMaps
+from hipsta_bids.group.stats.glm import FittedMaps
 from hipsta_bids.group.stats.inference import PERMUTATIONS
 from hipsta_bids.group.stats.meta import FIXED, RANDOM
 from hipsta_bids.io import files
@@ -96,7 +96,7 @@ def _write_maps(folder: Path, meta: Meta) -> None:
     """Write maps of both models as GIFTI and CIFTI, and the sheets to draw them on."""
     tests = (one for item in meta.of("map") for one in meta.tests(item))
     write.write_stats(
-        folder, write.stats_of((key, test, meta.found[key]) for key, test, _ in tests)
+        folder, write.stats_of((key, test, meta.discoveries[key]) for key, test, _ in tests)
     )
     cohort = _cohort(meta)
     for hemi in dict.fromkeys(item.model.hemi for item in meta.of("map")):
@@ -118,7 +118,7 @@ def _figures(meta: Meta) -> Iterator[tuple[str, Drawing]]:
     for item in maps:
         measures = tests.setdefault(item.model.hemi, {})
         for key, test, _ in meta.tests(item):
-            result = meta.found[key]
+            result = meta.discoveries[key]
             measures.setdefault(item.model.measures[0], {})[key.contrast] = ContrastMap(
                 kind=test.kind,
                 effect=test.effect,
@@ -222,32 +222,21 @@ def _methods(meta: Meta) -> str:
     method_text = cite("method")
     if sites[0].template is not None:
         aligned += f" Registration used monotone B-spline warps {cite('registr')}."
-    joint = rules.model == "joint"
-    fixed = "The fixed effect was the mean of the sites' estimates, weighted by inverse variances."
-    if joint:
-        fixed = (
-            "The fixed effect was estimated in the model of all participants with a constant per"
-            f" site {cite('join')}. This needs only the sites' coefficients and their covariances."
-        )
-        if any(item.contrast == MEAN for item in meta.items):
-            fixed += " Means, which include the constant, were combined by inverse variances."
     if rules.random == "dl":
         random = (
             f"estimated by the moments of DerSimonian and Laird {cite('dl')}. Tests used the normal"
             " distribution"
         )
-    elif joint:
-        random = (
-            f"estimated by restricted maximum likelihood {cite('reml')} in the same model with a"
-            " random slope of the site. Tests and limits used t, with one degree of freedom less"
-            " than the number of sites"
-        )
     else:
         random = (
             f"estimated by restricted maximum likelihood {cite('reml')}. Tests and limits followed"
-            f" Knapp and Hartung {cite('knapp-hartung')}, with standard errors not smaller"
-            f" than without their correction {cite('modified')}"
+            f" Knapp and Hartung {cite('knapp-hartung')}"
         )
+        if rules.random == "reml-adhoc":
+            random += (
+                f", with standard errors not smaller than without their correction"
+                f" {cite('modified')}"
+            )
     measure_text = (
         f"Measures of the hippocampal body {method_text} of {meta.people} participants{groups} at"
         f" {len(sites)} sites were combined with hipsta_bids {__version__}. No value of a"
@@ -256,22 +245,24 @@ def _methods(meta: Meta) -> str:
         " measure."
     )
     effects = (
-        f"{fixed} In the random-effects model, true effects differ between sites. Their variance"
+        "The fixed effect was the mean of the sites' estimates, weighted by inverse variances. In"
+        " the random-effects model, true effects differ between sites. Their variance"
         f" (tau²) was {random}. Heterogeneity was described by Cochran's Q, by I² {cite('i2')}, and"
         f" by limits of the effect at a further site {cite('prediction')}."
     )
     if meta.items[0].result.without:
         effects += " All analyses were repeated without each site."
     errors = (
-        f"{discovery_text(meta.settings.multiplicity, cite)}, and over all summary measures of a"
-        " contrast. Effect sizes are Cohen's d: the estimate divided by the residual standard"
-        f" deviation within sites, with {rules.confidence:.0%} confidence limits."
+        f"{discovery_text(meta.settings.multiplicity, cite, meta.discoveries)}, and over all"
+        " summary measures of a contrast by each model. Effect sizes are Cohen's d: the estimate"
+        " divided by the residual standard deviation within sites, with"
+        f" {rules.confidence:.0%} confidence limits."
     )
     paragraphs = [f"{measure_text} {aligned}", effects, errors]
     survivors = [
         f"- {escaped(f'{key.measure}, {key.contrast}, {key.hemi}')}: {int(found.rejected.sum())} of"
         f" {found.n_tests} points"
-        for key, found in meta.found.items()
+        for key, found in meta.discoveries.items()
     ]
     if survivors:
         paragraphs.append("\n".join(["Significant points after correction:", "", *survivors]))

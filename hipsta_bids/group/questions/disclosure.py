@@ -1,12 +1,12 @@
 """Which summary may leave a site: a summary that holds no number about a few participants.
 
-Whoever has a summary has the sum of each product of two columns of the model, and of each column
-with each measure. So no cell of the factors, and no combination of the sums, may rest on fewer
-participants than ``exchange.min_cell``.
+Contrasts that a site chooses can hold the sum of each product of two columns of the model, and of
+each column with each measure. So no cell of the factors, and no combination of the sums, may rest
+on fewer participants than ``exchange.min_cell``.
 """
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from itertools import combinations, product
 from typing import NoReturn
 
@@ -29,11 +29,25 @@ _STEPS = np.geomspace(0.3, 1e-3, 12)
 def check_people(
     designs: Sequence[Design], people: Mapping[str, pd.Series], limits: ExchangeSettings
 ) -> list[Int]:
-    """Refuse models of which sums are about few participants; return the rows of each cell.
+    """Refuse designs of which sums are about few participants; return the rows of each cell.
 
     ``people`` are the variables of the models, the groups first.
     """
     factors = {name for design in designs for name in design.references}
+    return check_sums([(one.matrix, one.columns) for one in designs], factors, people, limits)
+
+
+def check_sums(
+    models: Sequence[tuple[Float, Sequence[str]]],
+    factors: Container[str],
+    people: Mapping[str, pd.Series],
+    limits: ExchangeSettings,
+    weights: Sequence[Float] = (),
+) -> list[Int]:
+    """Refuse columns, with their names, if sums are about few participants; return rows by cell.
+
+    Sums are of the products of two columns, also with each of the ``weights`` of rows.
+    """
     numbers = {
         name: values.to_numpy(dtype=np.float64)
         for name, values in people.items()
@@ -41,13 +55,20 @@ def check_people(
     }
     least = limits.min_cell
     cells = check_cells({n: v for n, v in people.items() if n not in numbers}, least)
-    cells = cells or {"": np.arange(len(designs[0].matrix))}
+    cells = cells or {"": np.arange(len(models[0][0]))}
     for (name, values), (cell, rows) in product(numbers.items(), cells.items()):
         if _nearly_alike(values[rows, None], least).any():
             place = f" in {cell}" if cell else ""
             _refuse(f"fewer than {least} participants{place} differ in {name}", name)
-    for design in designs:
-        _check_columns(design, list(cells.values()), list(numbers.values()), limits)
+    for matrix, names in models:
+        _check_columns(
+            matrix,
+            names,
+            list(cells.values()),
+            list(numbers.values()),
+            limits=limits,
+            weights=weights,
+        )
     return list(cells.values())
 
 
@@ -81,14 +102,22 @@ def _nearly_alike(values: Float, least: int) -> Bool:
 
 
 def _check_columns(
-    design: Design, cells: Sequence[Int], numbers: Sequence[Float], limits: ExchangeSettings
+    columns: Float,
+    names: Sequence[str],
+    cells: Sequence[Int],
+    numbers: Sequence[Float],
+    *,
+    limits: ExchangeSettings,
+    weights: Sequence[Float],
 ) -> None:
     """Refuse few residual degrees of freedom, high leverage, and sums of few participants."""
-    matrix = design.matrix / np.linalg.norm(design.matrix, axis=0)
+    # A level that only other sites have is a column of zeros.
+    matrix = columns / np.maximum(np.linalg.norm(columns, axis=0), _ZERO)
     basis = _span(matrix)
     leverage = float(np.max(np.sum(basis**2, axis=1)))
     first, second = np.triu_indices(basis.shape[1])
-    sums = [basis, basis[:, first] * basis[:, second]]
+    pairs = basis[:, first] * basis[:, second]
+    sums = [basis, pairs, *(weight[:, None] * pairs for weight in weights)]
     sums += [np.stack([x, x**2], axis=1) for x in numbers]  # means and standard deviations
     products = _span(np.hstack(sums))
     (n, count), n_sums = matrix.shape, products.shape[1]
@@ -108,7 +137,7 @@ def _check_columns(
             continue
         spread = (matrix - np.median(matrix, axis=0)) ** 2
         shares = spread[rows].sum(axis=0) / np.maximum(spread.sum(axis=0), _ZERO)
-        name = design.columns[int(np.argmax(shares))]
+        name = names[int(np.argmax(shares))]
         _refuse(f"sums of {name} are about fewer than {limits.min_cell} participants", name)
 
 

@@ -9,7 +9,6 @@ import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -19,7 +18,7 @@ from pydantic import Field
 
 from hipsta_bids import __version__
 from hipsta_bids.errors import InputError, ModelError
-from hipsta_bids.group.cohort.data import Cohort, summary_values
+from hipsta_bids.group.cohort.data import Cohort, grows_with_head, summary_values
 from hipsta_bids.group.design.formula import typed
 from hipsta_bids.group.design.grammar import closed_formula
 from hipsta_bids.group.design.model import Design, build_design
@@ -28,7 +27,6 @@ from hipsta_bids.group.output.results import Analysis, templates_of
 from hipsta_bids.group.questions.disclosure import check_cells, check_people, is_traceable
 from hipsta_bids.group.stats.arrays import Float, Int
 from hipsta_bids.group.stats.glm import FittedMaps, PointTest, fit_points, with_mean
-from hipsta_bids.group.stats.meta import SiteFit
 from hipsta_bids.io import files
 from hipsta_bids.io.files import FileNumbers, Number, Text, read_foreign, rounded
 from hipsta_bids.protocols.toml import TomlTable
@@ -36,15 +34,12 @@ from hipsta_bids.protocols.toml import TomlTable
 #: File of a summary, in the folder of an analysis.
 SUMMARY = "summary.json"
 #: Changes when readers of earlier versions would misread a summary.
-_FORMAT = 1
+_FORMAT = 2
 _AXES = "x from medial to lateral, y from posterior to anterior, on both sides"
 #: Summaries larger than this many bytes are not read.
 _MOST_BYTES = 50_000_000
-#: Sums in another order, and rounding to these digits, differ by less.
-_ROUNDING = 1e-5
 #: Smaller counts are not shown.
 _FEWEST = 5
-_LEAST = 1e-15  # eigenvalue of a covariance, relative to the largest
 #: Functions whose columns depend on who is in the table.
 _OF_THE_SAMPLE = re.compile(r"(?<![\w.])(bs|center|cr|poly|scale)\s*\(")
 Word = Annotated[str, Field(min_length=1, max_length=60, pattern=r"^[\w][\w .+-]*$")]
@@ -65,14 +60,10 @@ class ModelSummary(TomlTable):
     columns: Annotated[list[Text], Field(min_length=1, max_length=200)]
     df: Annotated[int, Field(ge=1)]
     """Residual degrees of freedom."""
-    covariance: list[Numbers]
-    """(columns, columns) of the coefficients, over the residual variance."""
     contrasts: Annotated[dict[Text, Numbers], Field(min_length=1)]
     """Weights of the columns."""
-    coefficients: list[FileNumbers]
-    """(columns, points); null where a participant lacks a value."""
     sd: FileNumbers
-    """(points,) residual standard deviation."""
+    """(points,) residual standard deviation; null where a participant lacks a value."""
     estimate: dict[Text, FileNumbers]
     """(points,) by contrast."""
     se: dict[Text, FileNumbers]
@@ -86,63 +77,35 @@ class ModelSummary(TomlTable):
         subject = self.measures[0] if self.kind == "map" else f"summary measures ({self.formula})"
         return f"{subject}, {self.hemi}"
 
-    @property
-    def intercept(self) -> int | None:
-        """Position of the constant."""
-        return self.columns.index("Intercept") if "Intercept" in self.columns else None
-
-    @cached_property
-    def fit(self) -> SiteFit:
-        """The numbers as arrays."""
-        return SiteFit(
-            coefficients=np.array(self.coefficients, dtype=np.float64),
-            covariance=np.array(self.covariance, dtype=np.float64),
-            sd=np.array(self.sd, dtype=np.float64),
-            df=self.df,
-        )
-
     def check(self, points: int, participants: int) -> str | None:
         """Raise the first disagreement, if there is one."""
-        count = len(self.columns)
         points = points if self.kind == "map" else len(self.measures)
-        rows: list[Sequence[object]] = [self.sd, *self.coefficients]
-        rows += [*self.estimate.values(), *self.se.values()]
+        rows: list[Sequence[object]] = [self.sd, *self.estimate.values(), *self.se.values()]
         rows += [] if self.subfield is None else [self.subfield]
-        if any(len(row) != points for row in rows) or len(self.coefficients) != count:
-            return f"numbers of points that are not {points}"
-        square: list[Sequence[object]] = [self.covariance, *self.covariance]
-        square += self.contrasts.values()
-        if any(len(row) != count for row in square) or len(self.units) != len(self.measures):
-            return f"numbers of columns that are not {count}"
-        if self.df != participants - count:
-            return "other degrees of freedom than participants"
-        if not self.contrasts.keys() == self.estimate.keys() == self.se.keys():
-            return "contrasts without estimates"
-        fit = self.fit
-        sizes = np.linalg.eigvalsh(fit.covariance)
-        if not (np.allclose(fit.covariance, fit.covariance.T) and sizes[0] > _LEAST * sizes[-1]):
-            return "a covariance of coefficients that is none"
-        return self._wrong_contrast(fit)
-
-    def _wrong_contrast(self, fit: SiteFit) -> str | None:
-        for name, row in self.contrasts.items():
-            weights = np.array(row, dtype=np.float64)
-            for saved, computed in (
-                (self.estimate[name], fit.estimate(weights)),
-                (self.se[name], fit.se(weights)),
-            ):
-                size = _ROUNDING * float(np.abs(np.nan_to_num(computed)).max(initial=0.0))
-                expected = np.array(saved, dtype=np.float64)
-                if not np.allclose(expected, computed, rtol=_ROUNDING, atol=size, equal_nan=True):
-                    return f"estimates of {name} that do not follow from its coefficients"
-        return None
+        count = len(self.columns)
+        sizes = [value for row in (self.sd, *self.se.values()) for value in row]
+        problems = {
+            f"numbers of points that are not {points}": any(len(row) != points for row in rows),
+            f"weights of columns that are not {count}": any(
+                len(row) != count for row in self.contrasts.values()
+            ),
+            "measures without units": len(self.units) != len(self.measures),
+            "other degrees of freedom than participants": self.df != participants - count,
+            "contrasts without estimates": not (
+                self.contrasts.keys() == self.estimate.keys() == self.se.keys()
+            ),
+            "standard deviations or errors that are not positive": any(
+                value is not None and value <= 0 for value in sizes
+            ),
+        }
+        return next((text for text, is_wrong in problems.items() if is_wrong), None)
 
 
 class SiteSummary(TomlTable):
     """The content of a summary."""
 
     description: Text
-    format: Literal[1]
+    format: Literal[2]
     site: Word
     version: Text
     """Of hipsta_bids, at the group level."""
@@ -364,7 +327,7 @@ def _models(
         table = summary_values(compared, hemi, analysis.measured.summaries).iloc[rows]
         # Also those that do not vary here, so that all sites have the same measures.
         adjusted = model_formula != formula
-        names = [str(c) for c in table if not adjusted or str(c).startswith("volume")]
+        names = [str(c) for c in table if not adjusted or grows_with_head(str(c))]
         values = table[names].to_numpy(dtype=np.float64)
         yield {
             "kind": "summary",
@@ -401,9 +364,7 @@ def _model(
     return {
         "columns": list(design.columns),
         "df": len(design.matrix) - len(design.columns),
-        "covariance": rounded(np.linalg.inv(design.matrix.T @ design.matrix)),
         "contrasts": {one.name: one.weights[0].tolist() for one in contrasts},
-        "coefficients": known(fit.coefficients),
         "sd": known(fit.sigma),
         "estimate": {test.contrast.name: known(test.estimate[0]) for test in fit.tests},
         "se": {test.contrast.name: known(test.se[0]) for test in fit.tests},

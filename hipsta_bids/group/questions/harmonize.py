@@ -9,7 +9,7 @@ import pandas as pd
 from formulaic import Formula
 
 from hipsta_bids.errors import ModelError
-from hipsta_bids.group.cohort.data import Cohort, Measures, modeled_table
+from hipsta_bids.group.cohort.data import SIZES, Cohort, Measures, grows_with_head, modeled_table
 from hipsta_bids.group.design import formula as formulas
 from hipsta_bids.group.design.grammar import closed_formula, term_text
 from hipsta_bids.group.design.model import DEPENDENCE, Comparison, Design, build_design
@@ -78,7 +78,7 @@ def plan_sites(
     volume, values = _icv(cohort.table, usable, volume, formula)
     if saved and saved.icv and volume is None:
         raise ModelError(
-            f"{saved.file}: volumes kept {saved.icv} there, which not all have here; complete it"
+            f"{saved.file}: {SIZES} kept {saved.icv} there, which not all have here; complete it"
         )
     return SitePlan(
         column=column,
@@ -197,24 +197,21 @@ def _explained(
 ) -> dict[str, float]:
     """Share of the variance of each column that sites explain; refuses what they explain wholly."""
     dummies = member[:, member.any(axis=0)]
-    basis = np.linalg.qr(dummies)[0]
     shares: dict[str, float] = {}
+    basis = dummies
     for name, values in columns.items():
         around = values - values.mean()
-        total = float(around @ around)
         inside = around - dummies @ np.linalg.lstsq(dummies, around, rcond=None)[0]
+        total = float(around @ around)
         shares[name] = 1 - float(inside @ inside) / total if total > 0 else 0.0
-        residual = values - basis @ (basis.T @ values)
-        residual -= basis @ (basis.T @ residual)
-        length = float(np.linalg.norm(residual))
-        if length <= DEPENDENCE * float(np.linalg.norm(values)):
-            if refuse:
-                raise ModelError(
-                    f"--harmonize {column}: {name} does not vary within {column}s, effects "
-                    "are inseparable; use sites with all groups, or drop --harmonize"
-                )
-            continue
-        basis = np.column_stack([basis, residual / length])
+        left = values - basis @ np.linalg.lstsq(basis, values, rcond=None)[0]
+        if np.linalg.norm(left) > DEPENDENCE * np.linalg.norm(values):
+            basis = np.column_stack([basis, left / np.linalg.norm(left)])
+        elif refuse:
+            raise ModelError(
+                f"--harmonize {column}: {name} does not vary within {column}s, effects "
+                "are inseparable; use sites with all groups, or drop --harmonize"
+            )
     return shares
 
 
@@ -305,8 +302,11 @@ def harmonize_cohort(
         for name in summary.columns:
             key = "summary", hemi, name
             values = summary[[name]].to_numpy()
-            adjusted = _with_icv(visits, plan, side.rows) if name.startswith("volume") else visits
-            if plan.saved and (hemi, name) not in plan.saved.effects_on_summaries:
+            saved = plan.saved and plan.saved.effects_on_summaries.get((hemi, name))
+            # Earlier files adjust volumes alone.
+            is_adjusted = len(saved.slopes) > len(plan.names) if saved else grows_with_head(name)
+            adjusted = _with_icv(visits, plan, side.rows) if is_adjusted else visits
+            if plan.saved and not saved:
                 unknown.add(name)
                 summary[name] = np.nan
             elif len(np.unique(values[np.isfinite(values)])) > 1:

@@ -1,6 +1,6 @@
 """Norms from files to files: fitted to a reference cohort, or for the scores of new people."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -27,10 +27,12 @@ from hipsta_bids.group.output.results import ScoredMaps
 from hipsta_bids.group.output.saved import NormsFile, load_norms, save_norms, templates_from_json
 from hipsta_bids.group.output.style import Drawing
 from hipsta_bids.group.questions import study as studies
+from hipsta_bids.group.questions.merging import with_sums
 from hipsta_bids.group.questions.mixing import with_mixes
 from hipsta_bids.group.questions.scores import map_rows, score_rows
 from hipsta_bids.group.questions.trials import points_of
 from hipsta_bids.group.stats import norms as normative
+from hipsta_bids.group.stats import summed_norms
 from hipsta_bids.group.stats.arrays import Bool, Float, Int, Key
 from hipsta_bids.group.stats.glm import most_frequent
 from hipsta_bids.group.stats.warps import Template
@@ -94,6 +96,8 @@ def run_norms(
     )
     tell("norms")
     file = file.model_copy(update={"template": template, "labels": dict(study.labels)})
+    if settings.norms.shared_knots:
+        file, people, values = with_sums(study, file, people, values)
     norms, tables["coverage"] = _fit(values, people, file, settings.norms)
     n_sites = len(file.sites)
     scoring = _Made(None, None, file, norms, people, cohorts, values, tables, n_sites)
@@ -254,7 +258,11 @@ def _planned(study: studies.Study) -> tuple[NormsFile, normative.People]:
     sexes = level_labels(table[rules.sex]) if rules.sex in table else None
     for labels in (sites, sexes):
         complete &= True if labels is None else labels.notna().to_numpy()
-    knots = normative.choose_knots(_ages(table, rules.age)[complete], rules)
+    knots = np.array(rules.shared_knots, dtype=np.float64)
+    if not len(knots):
+        knots = normative.choose_knots(_ages(table, rules.age)[complete], rules)
+    elif len(knots) < 3 or not (np.diff(knots) > 0).all():  # noqa: PLR2004 -- of a spline
+        raise ModelError("--fit-norms: norms.shared_knots needs three ages or more that rise")
     file = NormsFile(
         description="norms of maps and summary measures by age, sex and site",
         format=1,
@@ -402,6 +410,10 @@ def _fit(
 ) -> tuple[dict[Key, normative.Norms], pd.DataFrame]:
     """Fit all norms, and tell by cross-validation how many lie below each centile."""
     n_sites, knots = len(file.sites), np.array(file.knots)
+    fit: Callable[[Float, normative.People, int, Float], normative.Norms]
+    fit = partial(normative.fit_norms, settings=rules)
+    if file.columns:
+        fit = summed_norms.fit_values
     # Folds are spread evenly over sites.
     order = np.lexsort((np.random.default_rng(rules.seed).random(len(people.site)), people.site))
     fold = np.empty(len(order), dtype=np.int64)
@@ -409,7 +421,7 @@ def _fit(
     norms, rows = {}, []
     for (hemi, measure), (visits, numbers) in values.items():
         people_here = people.take(visits)
-        fitted = normative.fit_norms(numbers, people_here, n_sites, knots, rules)
+        fitted = fit(numbers, people_here, n_sites, knots)
         is_fitted = np.isfinite(fitted.mean).all(axis=0)
         if not is_fitted.any():
             continue  # constant, or of too few people
@@ -418,9 +430,7 @@ def _fit(
         z = np.full(sampled.shape, np.nan)
         for left in range(normative.CENTILE_FOLDS):
             out = fold[visits] == left
-            fold_norms = normative.fit_norms(
-                sampled[~out], people_here.take(~out), n_sites, knots, rules
-            )
+            fold_norms = fit(sampled[~out], people_here.take(~out), n_sites, knots)
             z[out] = fold_norms.score(sampled[out], people_here.take(out))
         scores = z[np.isfinite(z)]
         below = {

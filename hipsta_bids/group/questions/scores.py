@@ -153,15 +153,15 @@ def fit_summaries(
     icv: str | None,
     rows_of: Callable[[Design], RowModel],
 ) -> tuple[dict[tuple[str, str], tuple[list[str], PointwiseFit, Int]], list[str]]:
-    """Fit the model of the maps to all summary measures; volumes also with intracranial volume."""
+    """Fit the model of the maps to all summary measures; sizes also with intracranial volume."""
     fits: dict[tuple[str, str], tuple[list[str], PointwiseFit, Int]] = {}
 
-    def fit(formula: str, model: RowModel, start: str = "") -> None:
+    def fit(formula: str, model: RowModel, is_included: Callable[[str], bool]) -> None:
         rows = model.design.rows
         for hemi in data.hemispheres(cohort):
             values = data.summary_values(cohort, hemi, names).iloc[rows]
-            named = values.columns.astype(str).str.startswith(start)
-            values = values.loc[:, named & (values.max() > values.min()).to_numpy()]
+            included = [is_included(str(name)) for name in values]
+            values = values.loc[:, included & (values.max() > values.min()).to_numpy()]
             if not values.columns.size:
                 continue
             present = np.flatnonzero(values.notna().any(axis=1).to_numpy())
@@ -173,11 +173,11 @@ def fit_summaries(
                 data.participants_with(np.isfinite(maps), participants),
             )
 
-    fit(model.formula, rows_of(design))
+    fit(model.formula, rows_of(design), lambda _: True)
     if not fits:
         return fits, []
     if icv is None:
-        return fits, ["volumes are not adjusted: no intracranial volume is known"]
+        return fits, [f"{data.SIZES} are not adjusted: no intracranial volume is known"]
     if icv in closed_formula(model.formula).names:
         return fits, []
     try:
@@ -185,9 +185,9 @@ def fit_summaries(
         larger = build_design(cohort.table, adjusted, settings, references)
         larger = replace(larger, contrasts=_same_names(larger, design))
     except ModelError as error:
-        return fits, [f"volumes are not adjusted for {icv}: {error}"]
-    fit(adjusted.formula, rows_of(larger), "volume")
-    return fits, []
+        return fits, [f"{data.SIZES} are not adjusted for {icv}: {error}"]
+    fit(adjusted.formula, rows_of(larger), data.grows_with_head)
+    return fits, [f"{data.SIZES} are also tested with head size ({icv})"]
 
 
 def _same_names(larger: Design, design: Design) -> tuple[Contrast, ...]:

@@ -1,7 +1,7 @@
 """The results of several sites together: what survives, tables, and forest plots as numbers."""
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from textwrap import shorten
 from typing import Any
@@ -19,8 +19,9 @@ from hipsta_bids.group.stats.arrays import Float
 from hipsta_bids.group.stats.clusters import sheet_edges
 from hipsta_bids.group.stats.glm import MEAN, PointTest
 from hipsta_bids.group.stats.inference import Discoveries, MapKey, discover
-from hipsta_bids.group.stats.meta import Combined, MetaResult, combine, meta_analyze
+from hipsta_bids.group.stats.meta import Combined, MetaResult, meta_analyze
 from hipsta_bids.io import files
+from hipsta_bids.io.files import FileNumbers
 
 #: Peaks of a map that get a forest plot.
 _MOST_PEAKS = 6
@@ -57,7 +58,7 @@ class Meta:
 
     sites: list[SiteSummary]
     items: list[Item]
-    found: Mapping[MapKey, Discoveries]
+    discoveries: Mapping[MapKey, Discoveries]
     frame: Mapping[str, columns.Frame]
     """Points by hemisphere."""
     settings: GroupSettings
@@ -191,9 +192,10 @@ def analyze_sites(sites: list[SiteSummary], settings: GroupSettings) -> Meta:
             model=model,
             contrast=contrast,
             result=meta_analyze(
-                [site.models[number].fit for site in sites],
-                [np.array(site.models[number].contrasts[contrast]) for site in sites],
-                model.intercept,
+                _stack(site.models[number].estimate[contrast] for site in sites),
+                _stack(site.models[number].se[contrast] for site in sites),
+                _stack(site.models[number].sd for site in sites),
+                np.array([site.models[number].df for site in sites]),
                 settings.meta,
             ),
         )
@@ -208,7 +210,11 @@ def analyze_sites(sites: list[SiteSummary], settings: GroupSettings) -> Meta:
     frames: dict[str, columns.Frame] = {
         item.model.hemi: _frame(sites, item.number) for item in reversed(maps)
     }
-    return Meta(sites=sites, items=items, found=discoveries, frame=frames, settings=settings)
+    return Meta(sites=sites, items=items, discoveries=discoveries, frame=frames, settings=settings)
+
+
+def _stack(rows: Iterable[FileNumbers]) -> Float:
+    return np.array(list(rows), dtype=np.float64)
 
 
 def _frame(sites: Sequence[SiteSummary], number: int) -> columns.Frame:
@@ -237,7 +243,7 @@ def meta_tables(meta: Meta) -> Iterator[tuple[str, pd.DataFrame]]:
         frame = meta.frame[item.model.hemi]
         tables_of_side = []
         for key, test, combined in meta.tests(item):
-            discoveries = meta.found[key]
+            discoveries = meta.discoveries[key]
             stem = tables.map_name(key.hemi, key.measure, key.contrast)
             rows.append(columns.overview_row(stem, key, discoveries))
             low, high = combined.limits(confidence)
@@ -359,11 +365,10 @@ def _row(combined: Combined, point: int, confidence: float) -> dict[str, float]:
 
 
 def _summaries(meta: Meta) -> pd.DataFrame:
-    """List summary measures by fixed and random effects; the latter also by DerSimonian-Laird."""
-    confidence, least = meta.settings.meta.confidence, meta.settings.meta.min_sites
+    """List summary measures by fixed and random effects."""
+    confidence = meta.settings.meta.confidence
     parts = []
     for item in meta.of("summary"):
-        two_stage = combine(item.result.estimates, item.result.ses**2, "dl", least=least)
         for key, test, combined in meta.tests(item):
             low, high = combined.limits(confidence)
             parts.append(
@@ -384,9 +389,6 @@ def _summaries(meta: Meta) -> pd.DataFrame:
                         "estimate_high": high,
                         **columns.effect_columns(test),
                         **_between(item),
-                        "estimate_dl": two_stage.estimate,
-                        "se_dl": two_stage.se,
-                        "p_dl": two_stage.p,
                     }
                 )
             )
@@ -411,7 +413,7 @@ def _left_out(meta: Meta) -> Iterator[dict[str, Any]]:
             for name, all_sites in item.result.models.items():
                 key = item.key(name)
                 moved = np.abs(without[key].estimate - all_sites.estimate) / item.result.sd
-                overlap = discoveries[key].rejected & meta.found[key].rejected
+                overlap = discoveries[key].rejected & meta.discoveries[key].rejected
                 yield {
                     "measure": key.measure,
                     "contrast": key.contrast,

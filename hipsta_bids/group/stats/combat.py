@@ -196,10 +196,10 @@ def solve_weighted(values: Float, weight: Float, design: Float, least: float = 0
     grams = np.zeros((values.shape[1], columns**2))
     for rows in chunks((columns**2, len(design)), 1):
         grams += weight[rows].T @ products_of(design[rows])
-    return _solve_points(grams.reshape(-1, columns, columns), (weight * values).T @ design, least)
+    return solve_points(grams.reshape(-1, columns, columns), (weight * values).T @ design, least)
 
 
-def _solve_points(grams: Float, right: Float, least: float) -> Float:
+def solve_points(grams: Float, right: Float, least: float) -> Float:
     """Solve the normal equations of each point: (columns, points), NaN where none is unique.
 
     ``grams`` (points, columns, columns) is overwritten; ``right`` is (points, columns). A column

@@ -1,18 +1,14 @@
 """Logistic models: by maximum likelihood, or by Firth's method where they separate the groups."""
 
-import warnings
 from dataclasses import dataclass
 
 import numpy as np
 from scipy import optimize, special
-from statsmodels.discrete.discrete_model import Logit
 
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.stats.arrays import Bool, Float
 from hipsta_bids.group.stats.glm import products_of
 
-#: Most steps of a fit.
-FIT_STEPS = 100
 #: Most steps of a fit by Firth's method, which takes hundreds where groups are far apart.
 FIRTH_STEPS = 2000
 #: Steps end when they promise to raise the log likelihood by less than this.
@@ -25,8 +21,6 @@ _NO_MARGIN = 1e-7
 _NEWTON_STEPS, _SETTLED = 25, 1e-8
 #: Members of sets that are worked on together, which the processor's cache holds.
 _BLOCK = 100_000
-#: Maximum likelihood has converged when coefficients of unit columns change by less.
-_CONVERGED = 1e-10
 #: Longest step of Firth's method, in standard deviations of a column, as in ``logistf``.
 _LONGEST_STEP = 5.0
 #: A step must gain at least this share of what the slope promises, or it is halved.
@@ -50,8 +44,6 @@ class LogisticFit:
 
     coefficients: Float
     """Log odds per unit of each column."""
-    se: Float
-    """From the inverse of Fisher's information at the estimate."""
     log_likelihood: float
     """With Firth the penalized one: half the log determinant of the information comes on top."""
     firth: bool
@@ -79,40 +71,24 @@ def fit_logistic(
     firth: bool,
     free: Bool | None = None,
 ) -> LogisticFit:
-    """Fit a logistic regression by maximum likelihood (statsmodels), or by Firth's method.
+    """Fit a logistic regression by maximum likelihood, or by Firth's method.
 
     Of Firth's, columns that are not ``free`` stay zero but count in the penalty, as the penalized
     likelihood-ratio test needs it (Heinze and Schemper 2002).
     """
-    scale = _scales(matrix)
-    scaled = matrix / scale
+    members = np.ones((1, len(case)))
     if firth:
-        weights = np.ones((1, len(case)))
-        beta, value = firth_maxima(scaled, case, weights, free)
-        covariance = np.linalg.inv(_Penalized(scaled, case).information(weights, beta)[0])
-        return LogisticFit(
-            coefficients=beta[0] / scale,
-            se=np.sqrt(np.diagonal(covariance)) / scale,
-            # The penalty is that of the columns as given.
-            log_likelihood=float(value[0]) + float(np.log(scale).sum()),
-            firth=True,
-        )
-    model = Logit(case.astype(np.float64), scaled, check_rank=False)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of separation, which the caller looks for
-        try:
-            fit = model.fit(
-                method="newton",
-                maxiter=FIT_STEPS,
-                tol=_CONVERGED,
-                disp=False,
-                warn_convergence=False,
-            )
-        except np.linalg.LinAlgError as error:
-            raise _no_convergence(FIT_STEPS) from error
-    if not fit.mle_retvals["converged"]:
-        raise _no_convergence(FIT_STEPS)
-    return LogisticFit(fit.params / scale, fit.bse / scale, float(fit.llf), firth=False)
+        scale = _scales(matrix)
+        beta, value = firth_maxima(matrix / scale, case, members, free)
+        # The penalty is that of the columns as given.
+        return LogisticFit(beta[0] / scale, float(value[0] + np.log(scale).sum()), firth=True)
+    basis = orthonormal(matrix)
+    beta, settled = maxima(basis, case, members)
+    if not settled[0]:
+        raise _no_convergence(_NEWTON_STEPS)
+    score = basis @ beta[0]
+    value = special.log_expit(np.where(case, score, -score)).sum()
+    return LogisticFit(np.linalg.lstsq(matrix, score)[0], float(value), firth=False)
 
 
 def fit_overlapping_or_firth(matrix: Float, case: Bool) -> LogisticFit:

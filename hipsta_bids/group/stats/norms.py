@@ -104,7 +104,7 @@ class Norms:
             n = np.maximum(norms_here.n[people_known.site], 1)  # without any, the shift is missing
             # Mean of the leverage of the spline and of sex.
             mean_leverage = (len(norms_here.mean) - 1) / np.maximum(norms_here.n.sum(axis=0), 1)
-            tail = special.stdtr(n - 1, -np.abs(z) / np.sqrt(1 + 1 / n + mean_leverage))
+            tail = _tail(z, n - 1, 1 / n + mean_leverage)
             scores[rows, part] = -np.sign(z) * special.ndtri(tail)
         return scores
 
@@ -372,40 +372,29 @@ def w_scores(maps: Float, matrix: Float, reference: Bool, settings: GlmSettings)
         )
     basis, triangle = np.linalg.qr(reference_matrix)
     rotated = matrix @ np.linalg.inv(triangle)
-    parts = [
-        _score(np.asarray(maps[:, part], dtype=np.float64), rotated, basis, reference, settings)
-        for part in chunks(maps.shape, matrix.shape[1])
-    ]
-    return NormativeScores(*map(np.hstack, zip(*parts, strict=True)))
-
-
-def _score(
-    maps: Float,
-    rotated: Float,
-    basis: Float,
-    reference: Bool,
-    settings: GlmSettings,
-) -> tuple[Float, Float]:
-    fit = fit_block(maps[reference], basis, settings)
-    inverse = fit.covariance / (fit.sigma**2)[:, None, None]
-    leverage = np.einsum("psi,si->sp", rotated @ inverse, rotated)
-    residuals = maps - rotated @ fit.scores.T
-    df = np.broadcast_to(
-        np.where(np.isfinite(fit.sigma), fit.n - basis.shape[1], np.nan), maps.shape
-    )
-    variance = np.broadcast_to(fit.sigma**2, maps.shape)
     member = reference[:, None]
-    # A subject that alone determines a coefficient cannot be told without it.
-    one_minus_leverage = np.where(member, 1 - leverage, 1.0)
-    one_minus_leverage = np.where(
-        one_minus_leverage > np.sqrt(np.finfo(np.float64).eps), one_minus_leverage, np.nan
-    )
-    without = (variance * df - residuals**2 / one_minus_leverage) / (df - 1)
-    sigma = np.sqrt(np.where(member, np.maximum(without, 0.0), variance))
-    error = residuals / one_minus_leverage
-    w = error / np.where(sigma > 0, sigma, np.nan)
-    # Variance of the expectation, with the subject itself left out: h / (1 - h).
-    spread = np.where(member, leverage / one_minus_leverage, leverage)
-    freedom = np.where(member, df - 1, df)
-    p = 2 * special.stdtr(freedom, -np.abs(w) / np.sqrt(1 + spread))
-    return w, np.asarray(p, dtype=np.float64)
+    w, p = np.full((2, *maps.shape), np.nan)
+    for part in chunks(maps.shape, matrix.shape[1]):
+        values = np.asarray(maps[:, part], dtype=np.float64)
+        fit = fit_block(values[reference], basis, settings)
+        inverse = fit.covariance / (fit.sigma**2)[:, None, None]
+        leverage = np.einsum("psi,si->sp", rotated @ inverse, rotated)
+        residuals = values - rotated @ fit.scores.T
+        df = np.where(np.isfinite(fit.sigma), fit.n - basis.shape[1], np.nan) - member
+        # A subject that alone determines a coefficient cannot be told without it.
+        left = np.where(member, 1 - leverage, 1.0)
+        left[left <= np.sqrt(np.finfo(np.float64).eps)] = np.nan
+        # Of members, the variance without themselves.
+        squares = fit.sigma**2 * (df + member) - np.where(member, residuals**2 / left, 0.0)
+        sigma = np.sqrt(np.maximum(squares, 0.0) / df)
+        w[:, part] = residuals / left / np.where(sigma > 0, sigma, np.nan)
+        p[:, part] = 2 * _tail(w[:, part], df, np.where(member, leverage / left, leverage))
+    return NormativeScores(w, p)
+
+
+def _tail(z: Float, df: Float, variance: Float) -> Float:
+    """Probability of a deviation of this size to one side, by Student's distribution.
+
+    ``variance`` is that of the expectation, over the variance of values.
+    """
+    return np.asarray(special.stdtr(df, -np.abs(z) / np.sqrt(1 + variance)))

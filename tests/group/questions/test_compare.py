@@ -193,7 +193,10 @@ def test_record_and_methods_have_the_numbers(results, dataset, quick):
     assert f"thickness, CN-AD, L: {significant} of" in text
     assert "sheet (reference levels: group CN, sex F). The contrast was CN-AD." in text
     procedure = "the two-stage procedure of Benjamini, Krieger and Yekutieli [3]"
-    assert f"by {procedure}, over the points of each map." in text
+    n_maps = len(table(results / "maps.tsv"))
+    assert f"by {procedure}, over the points of each map ({n_maps} families of tests)." in text
+    n_families = table(results / "measures.tsv").contrast.nunique()
+    assert f"models of a contrast (families of tests: {n_families})." in text
     assert "B-spline warps were estimated alternately [2]" in text
     assert "with a penalty" not in text
     assert f"{explained[0]:.0%} before and {explained[1]:.0%} after registration (left)" in text
@@ -276,10 +279,12 @@ def test_formula_contrast_reference_and_options(dataset, quick):
     assert not (folder / "template.json").exists()
     text = methods_of(folder)
     assert "Maps were not registered to each other." in text
-    assert "Benjamini and Hochberg [2], over the points of both hemispheres." in text
     assert "Wrobel" not in text  # who is not referred to
     maps = table(folder / "maps.tsv")
     assert set(maps.n_tests) == {2 * NODES[0] * NODES[1]}
+    n_families = len(maps[["measure", "contrast"]].drop_duplicates())
+    procedure = "Benjamini and Hochberg [2], over the points of both hemispheres"
+    assert f"{procedure} ({n_families} families of tests)." in text
     again = [*(str(data), str(out), "group", *quick), "--model", str(folder / "model.json")]
     assert main([*again, "--align", "none", "--name", "again"]) == 0
     first, second = (table(out / "group" / name / "peaks.tsv") for name in ("mine", "again"))

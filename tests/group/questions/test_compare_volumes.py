@@ -131,7 +131,12 @@ def test_volumes_by_pattern_are_measures_like_others(study):
 
 
 @pytest.mark.parametrize("source", ["column", "freesurfer", "ashs"])
-def test_volumes_are_adjusted_for_intracranial_volume_of_each_source(study, source):
+def test_sizes_are_adjusted_for_intracranial_volume_of_each_source(study, source, capsys):
+    for path in (study / "out").rglob("*_desc-summary_morph.tsv"):
+        header, row = path.read_text().splitlines()
+        volume = float(row.split()[1])
+        sizes = f"{volume ** (2 / 3)}\t{1 + volume / 1e4}\t{volume ** (1 / 3)}"
+        path.write_text(f"{header}\tarea_CA1\tarea_ratio\textent_y\n{row}\t{sizes}\n")
     if source == "column":
         people = read_participants(study / "bids")
         rows = [[*row, f"{1.4e6 + 1e4 * k}"] for k, row in enumerate(people)]
@@ -157,7 +162,9 @@ def test_volumes_are_adjusted_for_intracranial_volume_of_each_source(study, sour
     rows = measures(study)
     name = "eTIV" if source == "column" else "icv"
     adjusted = rows[rows.model == f"group + age + sex + {name}"]
-    expected = {"volume", "volume_CA1"}  # the participant level's own
+    # The participant level's own, but for thickness and the ratio of areas.
+    expected = {"volume", "volume_CA1", "area_CA1", "extent_y"}
+    assert set(rows.measure) >= {*expected, "area_ratio", "thickness_mean"}
     if source == "freesurfer":
         expected |= {"volume_freesurfer_CA1_body", "volume_freesurfer_Whole_hippocampus"}
     if source == "ashs":
@@ -165,6 +172,11 @@ def test_volumes_are_adjusted_for_intracranial_volume_of_each_source(study, sour
     assert set(adjusted.measure) == expected
     # One degree of freedom goes to it.
     assert (adjusted.df == COUNT - 5).all()
+    note = f"volumes, areas and extents are also tested with head size ({name})"
+    assert note in capsys.readouterr().out
+    folder = study / "out" / "group" / "group-age-sex"
+    assert note in group_page(folder)
+    assert "volumes, areas and extents were also adjusted" in (folder / "methods.md").read_text()
 
 
 @pytest.mark.parametrize(
