@@ -110,7 +110,8 @@ def analyze_cohort(
         )
     rows = make_rows(design)
     joint = bool(settings.joint.measures)
-    inference.check_permutations(settings.multiplicity, settings.glm, joint=joint)
+    _check_margins(design, cohort, measures)
+    inference.check_permutations(settings.multiplicity, settings.glm, design.contrasts, joint=joint)
     sides = {
         hemi: register_side(cohort, hemi, groups=groups, settings=settings, templates=templates)
         for hemi in each("registration", list(cohort.sides) if measures.maps else [])
@@ -215,6 +216,19 @@ def _check_covariates(
     if comparison.pair is None and (outcomes := [m for m in model.maps if m in measures.maps]):
         raise ModelError(
             f"map({outcomes[0]}) in the formula explains itself; choose other maps by --measures"
+        )
+
+
+def _check_margins(design: designs.Design, cohort: data.Cohort, measures: data.Measures) -> None:
+    """Refuse one margin for measures of several units."""
+    names = [one.name for one in design.contrasts if one.margin]
+    columns = {str(name) for side in cohort.sides.values() for name in side.summary.columns}
+    summaries = columns if measures.summaries is None else columns & {*measures.summaries}
+    units = {cohort.units[name] for name in (*measures.maps, *summaries) if name in cohort.units}
+    if names and len(units) > 1:
+        raise ModelError(
+            f"contrast {names[0]!r}: a margin has one unit, but the measures have"
+            f" {listed(sorted(units))}; choose some by --measures"
         )
 
 
