@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 _POWER_ONLY = ("power_level", "dropout", "visits")
 _TRIALS, _NORMS = ("retest", "power"), ("fit_norms", "norms")
 _COMPARISON_ONLY = (
-    *("longitudinal", "paired", "asymmetry", "normative", "model", "contrast"),
+    *("longitudinal", "endpoint", "paired", "asymmetry", "normative", "model", "contrast"),
     *("permutations", "blocks", "fdr_scope", "base", "no_classification"),
     *("joint", "joint_sides"),
     *("harmonize", "harmonize_model", "export_summary"),

@@ -514,6 +514,8 @@ def fit_maps(
         for name in side.maps:
             # Maps of a large cohort are made here: without a name, one is gone before the next.
             values = _values(side.maps[name], positions)
+            if side.first is not None:
+                covariates = _values(side.first.maps[name], positions)[None]
             fits[name] = model.fit(values, rows, tested, covariates)
             del values
     except ModelError as error:

@@ -405,20 +405,15 @@ class VisitRows(glm.RowModel):
         values: Float,
         rows: Int,
         contrasts: tuple[Contrast, ...],
-        baseline: Float | None = None,
+        covariates: Float | None = None,
     ) -> glm.PointwiseFit:
-        """Fit some rows of the design at each point."""
+        """Fit some rows of the design at each point, perhaps with the baseline as covariate."""
         matrix, people, numbers = self.design.matrix, self.participants, self.numbers
         visits = people[rows], numbers[rows]
+        baseline = None if covariates is None else covariates[0]
         return fit_visits(
             values, matrix[rows], visits, contrasts, self.longitudinal, baseline=baseline
         )
-
-    def fit_on_maps(
-        self, values: Float, rows: Int, contrasts: tuple[Contrast, ...], covariates: Float
-    ) -> glm.PointwiseFit:
-        """Fit some rows of the design at each point, with the baseline as covariate."""
-        return self.fit(values, rows, contrasts, covariates[0])
 
     def fit_measures(
         self, values: Float, rows: Int, contrasts: tuple[Contrast, ...]
