@@ -452,7 +452,11 @@ def _settings(parsed: argparse.Namespace) -> "GroupSettings":
             "measures": tuple(parsed.joint) or None,
             "sides": parsed.joint_sides or None,
         },
-        "power": {"power": parsed.power_level, "dropout": parsed.dropout},
+        "power": {
+            "power": parsed.power_level,
+            "dropout": parsed.dropout,
+            "allocation": parsed.allocation,
+        },
     }
     settings = load_group_settings(parsed.settings)
     settings = settings.changed(**given_settings(choices))

@@ -249,13 +249,15 @@ class RetestSettings(toml.SettingsTable):
 
 
 class PowerSettings(toml.SettingsTable):
-    """Participants that a trial of two arms of equal size needs."""
+    """Participants that a trial of two arms needs."""
 
     power: toml.OpenFraction = 0.8
     """Chance to find the effect."""
     dropout: Annotated[float, Field(ge=0, lt=1)] = 0.0
     """Share of the enrolled participants lost before the last visit, at a constant hazard. Their
     visits before that are in the mixed model of several visits."""
+    allocation: Annotated[float, Field(ge=1, le=20)] = 1.0
+    """Participants of the larger arm over the smaller arm."""
     alpha: toml.OpenFraction = 0.05
     """Two-sided level of the test of a summary measure, one of which is the end point. Maps hold
     the false discovery rate ``multiplicity.alpha``."""
