@@ -30,6 +30,19 @@ README = {
     "arm[T.TRT]:visit[T.3]": (-0.69369, 1.18765, 158.17),
     "arm[T.TRT]:visit[T.4]": (0.62423, 1.85085, 129.72),
 }
+#: Value, standard error and t of the same model with weights and visit 4 as reference, by nlme's
+#: ``gls`` (``corSymm``, ``varIdent`` and ``varFixed``), in design/R/R_weighted_nlme.txt there.
+GLS = {
+    "race[T.Black]": (1.20299, 0.6291457, 1.91210),
+    "race[T.White]": (5.38075, 0.6707062, 8.02251),
+    "arm[T.TRT]": (4.26139, 1.6899825, 2.52156),
+    "last[T.1]": (-14.79539, 1.3185677, -11.22081),
+    "last[T.2]": (-9.92877, 1.2644282, -7.85238),
+    "last[T.3]": (-4.74778, 1.2490235, -3.80119),
+    "arm[T.TRT]:last[T.1]": (-0.86518, 1.8915049, -0.45740),
+    "arm[T.TRT]:last[T.2]": (-0.84330, 1.8168093, -0.46417),
+    "arm[T.TRT]:last[T.3]": (-0.86850, 1.8316066, -0.47418),
+}
 
 
 def settings(freedom="kenward-roger"):
@@ -42,7 +55,7 @@ def fev():
     return pd.read_table(DATA, comment="#", dtype=text)
 
 
-def fit(fev, formula, freedom, rows=()):
+def fit(fev, formula, freedom, rows=(), root=1.0):
     """Fit one column by name, with further contrasts of several columns."""
     matrix = model_matrix(formula, fev)
     names = list(map(str, matrix.columns))
@@ -53,9 +66,9 @@ def fit(fev, formula, freedom, rows=()):
     ]
     visits = fev["visit"].to_numpy().astype(int) - 1
     people = fev["person"].to_numpy(dtype=np.str_)
-    values = fev[["fev1"]].to_numpy()
+    values = fev[["fev1"]].to_numpy() * root
     result = fit_visits(
-        values, np.asarray(matrix, float), (people, visits), contrasts, settings(freedom)
+        values, np.asarray(matrix, float) * root, (people, visits), contrasts, settings(freedom)
     )
     return {test.contrast.name: test for test in result.tests}
 
@@ -67,6 +80,19 @@ def test_same_as_mmrm(fev):
         # R ends its search a few 1e-4 of a standard error from the optimum.
         np.testing.assert_allclose(test.estimate[0, 0], estimate, atol=2e-4 * se)
         np.testing.assert_allclose([test.se[0, 0], test.df[0]], [se, df], rtol=1e-4)
+
+
+def test_same_as_gls_of_nlme(fev):
+    """Rows times the root of their weight have variances without weights."""
+    last = pd.Categorical(fev["visit"], categories=["4", "1", "2", "3"])
+    root = np.sqrt(fev[["weight"]].to_numpy())
+    tests = fit(fev.assign(last=last), "race + sex + arm * last", "satterthwaite", root=root)
+    for name, (estimate, se, t) in GLS.items():
+        test = tests[name]
+        # optim ends a few 1e-4 of a standard error from the optimum, with a larger loss.
+        np.testing.assert_allclose(test.estimate[0, 0], estimate, atol=2e-4 * se)
+        np.testing.assert_allclose(test.se[0, 0], se, rtol=1.5e-4)
+        np.testing.assert_allclose(test.statistic[0], t, atol=1e-3)
 
 
 def test_same_as_mixed_of_sas(fev):
@@ -287,6 +313,27 @@ def test_baseline_and_equal_arms_agree():
     # One regresses on the baseline within arms, the other knows that arms are alike there.
     np.testing.assert_allclose(clda.estimate, ancova.estimate, atol=0.03 * ancova.se.max())
     assert clda.se.mean() < 1.02 * ancova.se.mean()
+
+
+@pytest.mark.parametrize("kind", ["mmrm", "clda"])
+def test_size_of_end_points(kind):
+    """As :func:`test_size`, with the baseline as a covariate, or with equal arms there."""
+    values, matrix, names, numbers = trials(13, 40, 4, 3000)
+    values[np.random.default_rng(1).random(values.shape) * (numbers > 0)[:, None] > 0.9] = np.nan
+    if kind == "clda":
+        baseline = None
+        matrix = np.delete(matrix, 4, axis=1)
+    else:
+        later = numbers > 0
+        baseline = np.repeat(values[~later], 3, axis=0)
+        matrix = np.delete(matrix[later], [0, 4], axis=1)
+        values, names, numbers = values[later], names[later], numbers[later] - 1
+    contrasts = [Contrast("last", np.eye(matrix.shape[1])[-1])]
+    (test,) = fit_visits(
+        values, matrix, (names, numbers), contrasts, settings(), baseline=baseline
+    ).tests
+    assert np.isfinite(test.p).all()
+    assert abs(np.mean(test.p < 0.05) - 0.05) < 0.01
 
 
 @pytest.mark.parametrize("missing", [0.0, 0.1])
