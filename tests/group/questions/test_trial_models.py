@@ -215,6 +215,11 @@ def test_non_inferiority_in_tables_and_text(trial):
             65,
             "not with --correction permutation",
         ),
+        (
+            ["--longitudinal", "visits", "--formula", "arm * visit + map(curvature)"],
+            65,
+            "not with map() in the formula",
+        ),
         (["--contrast", "arm[active]-arm[placebo] > -0.05 > 1"], 65, "one > or <"),
         (["--contrast", "arm[active]-arm[placebo] >= 0"], 65, "one > or <"),
         (["--contrast", "arm, age > 0"], 65, "no direction"),
