@@ -193,7 +193,8 @@ def _add_model(parser: Parser) -> None:
     add(
         "--contrast",
         "TEXT...",
-        'such as "group[CU]-group[DAT]"; rows of an F test are separated by commas',
+        'such as "group[CU]-group[DAT]", or one-sided "arm[B]-arm[A] > -0.05"; rows of an F '
+        "test are separated by commas",
     )
     add(
         "--age-model",
@@ -217,11 +218,16 @@ def _add_comparison(parser: Parser) -> None:
     add(
         "--longitudinal",
         "",
-        "all sessions, by a mixed model: random intercepts or also slopes (default: auto, "
-        "slopes from 10 participants with three visits)",
+        "all sessions: mixed model with intercepts or slopes (default: slopes from 10 "
+        "participants with three visits), or visits as categories",
         nargs="?",
         const="auto",
-        choices=["auto", "intercept", "slope"],
+        choices=["auto", "intercept", "slope", "visits"],
+    )
+    add(
+        "--endpoint",
+        "MODEL...",
+        "a trial: ancova, mmrm or clda, the session of the baseline, and later sessions",
     )
     add("--paired", "SES1 SES2", "the second session minus the first", type=bids_label("ses-"))
     add("--asymmetry", "", "also maps of left minus right")
@@ -446,7 +452,11 @@ def _settings(parsed: argparse.Namespace) -> "GroupSettings":
             "measures": tuple(parsed.joint) or None,
             "sides": parsed.joint_sides or None,
         },
-        "power": {"power": parsed.power_level, "dropout": parsed.dropout},
+        "power": {
+            "power": parsed.power_level,
+            "dropout": parsed.dropout,
+            "allocation": parsed.allocation,
+        },
     }
     settings = load_group_settings(parsed.settings)
     settings = settings.changed(**given_settings(choices))
@@ -482,8 +492,15 @@ def _options(parsed: argparse.Namespace, arguments: Sequence[str]) -> "GroupOpti
         references=tuple(parsed.reference),
     )
     pair = parsed.paired and (f"ses-{parsed.paired[0]}", f"ses-{parsed.paired[1]}")
+    if parsed.endpoint and (pair or parsed.longitudinal):
+        raise UsageError("give one of --longitudinal, --paired and --endpoint")
+    named = [f"ses-{name.removeprefix('ses-')}" for name in parsed.endpoint[1:]]
     comparison = from_namespace(
-        Comparison, parsed, longitudinal=parsed.longitudinal is not None, pair=pair
+        Comparison,
+        parsed,
+        longitudinal=parsed.longitudinal is not None or bool(parsed.endpoint),
+        endpoint=(*parsed.endpoint[:1], *named),
+        pair=pair,
     )
     return from_namespace(
         GroupOptions,

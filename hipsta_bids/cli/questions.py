@@ -13,10 +13,10 @@ if TYPE_CHECKING:
     from hipsta_bids.group.questions.study import GroupOptions, GroupResult
 
 #: Options that only sample sizes have; questions; and options that only comparisons have.
-_POWER_ONLY = ("power_level", "dropout", "visits")
+_POWER_ONLY = ("power_level", "dropout", "allocation", "visits")
 _TRIALS, _NORMS = ("retest", "power"), ("fit_norms", "norms")
 _COMPARISON_ONLY = (
-    *("longitudinal", "paired", "asymmetry", "normative", "model", "contrast"),
+    *("longitudinal", "endpoint", "paired", "asymmetry", "normative", "model", "contrast"),
     *("permutations", "blocks", "fdr_scope", "base", "no_classification"),
     *("joint", "joint_sides"),
     *("harmonize", "harmonize_model", "export_summary"),
@@ -46,6 +46,12 @@ def add_questions(parser: Parser) -> None:
         "SHARE",
         "share of the enrolled participants who drop out (default: 0)",
         type=float,
+    )
+    add(
+        "--allocation",
+        "A:B",
+        "participants of the arms, as 2:1 (default: 1:1)",
+        type=_allocation,
     )
     add(
         "--visits",
@@ -90,6 +96,14 @@ def _effect(text: str) -> tuple[str, float]:
     if kind not in {"thinning", "slowing"} or not share.endswith("%") or not 0 < value <= 1:
         raise argparse.ArgumentTypeError(f"{text!r} is not of the form thinning=5% or slowing=25%")
     return kind, value
+
+
+def _allocation(text: str) -> float:
+    """Read ``2:1``: participants of the larger arm over the smaller arm."""
+    first, _, second = text.partition(":")
+    if not (first.isdecimal() and second.isdecimal() and int(first) * int(second)):
+        raise argparse.ArgumentTypeError(f"{text!r} is not of the form 2:1")
+    return max(int(first) / int(second), int(second) / int(first))
 
 
 def _months(text: str) -> tuple[float, ...]:

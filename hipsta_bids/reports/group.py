@@ -39,7 +39,7 @@ def design(results: GroupResults) -> Mapping[str, Any] | None:
     table = results.table("design")
     columns = [str(name) for name in record.get("columns") or ()]
     measures = results.table("maps")
-    comparison = record.get("comparison") or {}
+    comparison, sided = record.get("comparison") or {}, record.get("one_sided") or {}
     return {
         "formula": record.get("formula"),
         "measures": [m for m in measures["measure"].unique() if m != cells.JOINT]
@@ -49,7 +49,7 @@ def design(results: GroupResults) -> Mapping[str, Any] | None:
         "references": record.get("references") or {},
         "columns": columns,
         "contrasts": [
-            (name, np.atleast_2d(weights).tolist())
+            (f"{name} ({sided[name]})" if name in sided else name, np.atleast_2d(weights).tolist())
             for name, weights in (record.get("contrasts") or {}).items()
         ],
         "picture": _matrix_picture(table, columns) if len(table) else None,
@@ -58,10 +58,17 @@ def design(results: GroupResults) -> Mapping[str, Any] | None:
 
 def _what(comparison: Mapping[str, Any]) -> str:
     """Describe what a row of the model is."""
+    if endpoint := comparison.get("endpoint"):
+        kinds = {
+            "ancova": "adjusted for the value at {}",
+            "mmrm": "adjusted for the value at {}; visits have any covariance",
+            "clda": "arms are equal at {}; visits have any covariance",
+        }
+        return f"A row is a visit: {kinds[endpoint[0]].format(endpoint[1])}."
     if comparison.get("longitudinal"):
         return (
-            "A row is a visit; the mixed model has a random intercept, perhaps a slope (see "
-            "the methods paragraph)."
+            "A row is a visit; the model has random effects, or a covariance of visits (see the "
+            "methods paragraph)."
         )
     if comparison.get("pair"):
         first, second = comparison["pair"]

@@ -88,6 +88,8 @@ def records(table: pd.DataFrame) -> list[dict[str, Any]]:
 def direction(results: GroupResults, contrast: str, hemi: str, sign: float) -> str:
     """Describe what a contrast above or below zero means."""
     comparison = results.record.get("comparison") or {}
+    if side := (results.record.get("one_sided") or {}).get(contrast):
+        return str(side)
     if contrast == "mean" and hemi == cells.DIFFERENCE:
         return "larger on the left" if sign > 0 else "larger on the right"
     if contrast == "mean" and comparison.get("pair"):

@@ -3,6 +3,7 @@
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import cache
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -13,8 +14,9 @@ import pandas as pd
 from hipsta_bids.derivatives.dataset import linked_path, read_links
 from hipsta_bids.errors import InputError, MissingFileError, ModelError
 from hipsta_bids.group.design.formula import as_factor, check_numbers, level_name, listed, typed
-from hipsta_bids.group.design.model import FIRST_AGE, VisitTime
+from hipsta_bids.group.design.model import FIRST_AGE, Comparison, VisitTime
 from hipsta_bids.group.design.settings import GroupSettings
+from hipsta_bids.group.design.visits import VISIT
 from hipsta_bids.io import files
 from hipsta_bids.io.files import MISSING, is_missing
 from hipsta_bids.opening import SETTINGS, read_bounded
@@ -317,13 +319,15 @@ def _number(text: str) -> float | None:
     return value if value > 0 else None
 
 
-def add_time(table: pd.DataFrame, settings: GroupSettings) -> VisitTime:
+def add_time(
+    table: pd.DataFrame, settings: GroupSettings, comparison: Comparison | None = None
+) -> VisitTime:
     """Find the time of each visit, or make it from dates or ages.
 
     A column of ``longitudinal.time_columns`` that varies between sessions of a participant; else
     ``acq_time``, in years since the participant's first session; else age, likewise. If age
     varies between sessions, the age at the first one is added, since age itself would explain part
-    of the change.
+    of the change. If visits are categories in a comparison, their column ``visit`` is the time.
     """
     covariates = tuple(settings.model.covariates)
     by_name = {str(column).casefold(): str(column) for column in table.columns}
@@ -350,7 +354,23 @@ def add_time(table: pd.DataFrame, settings: GroupSettings) -> VisitTime:
             column, own = TIME, (times - first) / unit
     if column is not None:
         columns[column] = own
-    return VisitTime(table.assign(**columns), column, covariates)
+    time = VisitTime(table.assign(**columns), column, covariates)
+    if comparison and (comparison.endpoint or settings.longitudinal.random == "visits"):
+        return _with_visits(time, comparison)
+    return time
+
+
+def _with_visits(time: VisitTime, comparison: Comparison) -> VisitTime:
+    """Make a factor of the sessions, in the column ``visit``; a single one is none."""
+    labels = (
+        time.table[SESSION].astype(object).map(lambda name: str(name or "").removeprefix("ses-"))
+    )
+    order = [name.removeprefix("ses-") for name in comparison.endpoint[1:]] or sorted(set(labels))
+    if "" in order or len(order) < 2:  # noqa: PLR2004 -- visits to compare
+        raise ModelError("visits as categories need two sessions, with labels (ses-LABEL)")
+    table = time.table.assign(**{VISIT: pd.Categorical(labels, categories=order)})
+    after = tuple(order[1:] if comparison.adjusted else order)
+    return replace(time, table=table, column=VISIT if len(after) > 1 else None, labels=after)
 
 
 def _varies(values: pd.Series, people: pd.Series) -> bool:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.design.formula import listed
 from hipsta_bids.group.design.model import BOTH, Comparison, asymmetry_name
-from hipsta_bids.group.stats.arrays import Bool, Float, Int, SideMaps
+from hipsta_bids.group.stats.arrays import Bool, Float, Int, SideMaps, some_sheets
 from hipsta_bids.types import PARTICIPANT, SESSION
 
 
@@ -84,17 +84,24 @@ def participants_with(finite: Bool, participants: NDArray[np.object_]) -> Int:
 def choose_visits(cohort: Cohort, comparison: Comparison) -> tuple[Cohort, Mapping[str, str]]:
     """Keep the visits that are compared."""
     table = cohort.table
-    if comparison.longitudinal:
+    named = comparison.pair or comparison.endpoint[1:]
+    sessions = sorted(table[SESSION].dropna().unique())
+    if unknown := sorted(set(named) - set(sessions)):
+        raise ModelError(
+            f"there is no session {listed(unknown)}, only {listed(sessions) or 'none'}"
+        )
+    if comparison.endpoint:
+        in_trial = table[SESSION].isin(named).to_numpy()
+        first = table[PARTICIPANT][table[SESSION] == comparison.adjusted]
+        keep = in_trial & (table[PARTICIPANT].isin(first).to_numpy() | (not comparison.adjusted))
+        reasons = pd.Series("the session of the baseline is missing", index=table.index)
+        reasons[~in_trial] = f"sessions {' and '.join(named)} are compared"
+    elif comparison.longitudinal:
         return cohort, {}
-    if comparison.pair is None:
+    elif comparison.pair is None:
         keep = ~table[PARTICIPANT].duplicated().to_numpy()
         reasons = pd.Series("the first session of each participant is analyzed", index=table.index)
     else:
-        sessions = sorted(table[SESSION].dropna().unique())
-        if unknown := sorted(set(comparison.pair) - set(sessions)):
-            raise ModelError(
-                f"there is no session {listed(unknown)}, only {listed(sessions) or 'none'}"
-            )
         in_pair = table[SESSION].isin(comparison.pair)
         complete = in_pair.groupby(table[PARTICIPANT]).transform("sum") == len(comparison.pair)
         keep = (in_pair & complete).to_numpy()
@@ -109,7 +116,12 @@ def choose_visits(cohort: Cohort, comparison: Comparison) -> tuple[Cohort, Mappi
 
 
 def modeled_table(table: pd.DataFrame, comparison: Comparison) -> pd.DataFrame:
-    """Rows of the model: visits, or participants with the covariates of their first session."""
+    """Rows of the model: visits, or participants with the covariates of their first session.
+
+    Without the baseline, if that is a covariate.
+    """
+    if comparison.adjusted:
+        return table[(table[SESSION] != comparison.adjusted).to_numpy()]
     if comparison.pair is None:
         return table
     first = table[table[SESSION] == comparison.pair[0]]
@@ -123,6 +135,8 @@ def compare_sessions(
 
     Maps that are covariates are of the first session, as other covariates are.
     """
+    if comparison.adjusted:
+        return _after_baseline(cohort, comparison)
     if comparison.pair is None:
         sides = {
             hemi: replace(side, covariates={name: side.maps[name] for name in covariates})
@@ -150,6 +164,39 @@ def compare_sessions(
             f"no hemisphere was measured in both sessions {' and '.join(comparison.pair)}"
         )
     return replace(cohort, table=table, sides=sides)
+
+
+def _after_baseline(cohort: Cohort, comparison: Comparison) -> Cohort:
+    """Keep later sessions, with the values of the baseline in ``first``."""
+    table = modeled_table(cohort.table, comparison)
+    row_of = {visit: row for row, visit in enumerate(table.index)}
+    sides = {}
+    for hemi, side in cohort.sides.items():
+        visits = cohort.table.iloc[side.rows]
+        is_first = (visits[SESSION] == comparison.adjusted).to_numpy()
+        sheet_of = dict(zip(visits[PARTICIPANT][is_first], np.flatnonzero(is_first), strict=True))
+        has_first = ~is_first & visits[PARTICIPANT].isin(sheet_of).to_numpy()
+        if has_first.any():
+            rows = np.array([row_of[visit] for visit in visits.index[has_first]])
+            sheets = np.array([sheet_of[one] for one in visits[PARTICIPANT][has_first]])
+            first = replace(
+                side,
+                rows=rows,
+                maps=some_sheets(side.maps, sheets),
+                subfield=side.subfield[sheets],
+                unmasked=None,
+                summary=side.summary.iloc[sheets].reset_index(drop=True),
+            )
+            sides[hemi] = replace(side.sheets(has_first), rows=rows, first=first)
+    if cohort.sides and not sides:
+        raise ModelError(f"no hemisphere was measured in {comparison.adjusted} and later")
+    return replace(cohort, table=table, sides=sides)
+
+
+def baselines(cohort: Cohort) -> Cohort | None:
+    """Return values of the baseline instead of the later values; ``None`` without these."""
+    sides = {hemi: side.first for hemi, side in cohort.sides.items() if side.first is not None}
+    return replace(cohort, sides=sides) if sides else None
 
 
 def _change(side: SideMaps, rows: Int, first: Int, second: Int) -> SideMaps:

@@ -29,6 +29,13 @@ _TOKEN = re.compile(
 #: Outside of brackets: the sign of a name and, after a bar, of a fixed value.
 _EQUALS, _BAR = (re.compile(rf"{sign}(?![^\[]*\])") for sign in ("=", r"\|"))
 _COMMA = re.compile(r",(?![^\[(]*[\])])")
+#: Sign and margin of a one-sided test, at the end or before the bar.
+_SIDED = re.compile(
+    r"(?P<sign>[<>])\s*(?P<margin>[-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?)\s*(?=\||$)"
+)
+_SIGN = re.compile(r"[<>](?![^\[]*\])")
+#: Alternatives of one-sided tests, by their sign.
+_SIDES = {">": "greater", "<": "less"}
 #: Parentheses within parentheses, and products when all are multiplied out.
 _DEEPEST, _MOST_PRODUCTS = 20, 1000
 #: Smallest and largest size of a weight: products of weights and variables have to be finite.
@@ -37,16 +44,25 @@ _WEIGHTS = (1e-9, 1e9)
 
 @dataclass(frozen=True)
 class Contrast:
-    """One hypothesis: that ``weights @ coefficients`` is zero."""
+    """One hypothesis: that ``weights @ coefficients`` is zero, or a margin."""
 
     name: str
     weights: Float
     """(rows, columns of the design); one row is tested by t, several together by F."""
+    side: str = ""
+    """Alternative of a one-sided test, ``greater`` or ``less`` than the margin."""
+    margin: float = 0.0
+    """In units of the measure."""
 
     def __post_init__(self) -> None:
         weights = np.atleast_2d(np.array(self.weights, dtype=np.float64))
         if np.linalg.matrix_rank(weights) < weights.shape[0]:
             raise ModelError(f"contrast {self.name!r}: rows are redundant or zero; remove one")
+        if self.side and len(weights) > 1:
+            raise ModelError(
+                f"contrast {self.name!r}: tests of several rows have no direction; give each row "
+                "with > or < as a contrast"
+            )
         weights.flags.writeable = False
         object.__setattr__(self, "weights", weights)
 
@@ -54,6 +70,12 @@ class Contrast:
     def n_rows(self) -> int:
         """Degrees of freedom of the hypothesis."""
         return int(self.weights.shape[0])
+
+    @property
+    def hypothesis(self) -> str:
+        """What a one-sided test shows, as ``> -0.05``; empty for other tests."""
+        signs = {side: sign for sign, side in _SIDES.items()}
+        return f"{signs[self.side]} {self.margin:g}" if self.side else ""
 
 
 @dataclass(frozen=True)
@@ -67,10 +89,25 @@ class ContrastSpec:
     """Rows; one for t, several for F."""
     test: str
     """``t`` or ``F``."""
+    side: str = ""
+    margin: float = 0.0
 
 
 def contrast_json(text: str) -> dict[str, Any]:
-    """Write a contrast of a command line, such as ``b=group[A]-group[B] | sex=M``, as JSON."""
+    """Write a contrast of a command line, such as ``b=group[A]-group[B] | sex=M``, as JSON.
+
+    A sign and a margin, as in ``arm[B]-arm[A] > -0.05``, are of a one-sided test, which BIDS Stats
+    Models do not have; they are further keys.
+    """
+    sided = _SIDED.search(text)
+    text = text if sided is None else text[: sided.start()] + text[sided.end() :]
+    if _SIGN.search(text):
+        raise ModelError(
+            f"contrast {text!r}: write one-sided tests with one > or < and a number, as"
+            " arm[B]-arm[A] > -0.05"
+        )
+    margin = 0.0 if sided is None else float(sided["margin"])
+    ending_side = f" {sided['sign']} {margin:g}" if sided else ""
     combination, *conditions = _BAR.split(text, 1)
     *names, body = _EQUALS.split(combination)
     ending = "".join(CONDITION + ", ".join(map(str.strip, c.split(","))) for c in conditions)
@@ -81,10 +118,11 @@ def contrast_json(text: str) -> dict[str, Any]:
     combined = list(dict.fromkeys(name for row in rows for name in row))
     weights = [[row.get(name, 0.0) for name in combined] for row in rows]
     return {
-        "Name": "=".join(names).strip() or f"{body.strip()}{ending}",
+        "Name": "=".join(names).strip() or f"{body.strip()}{ending_side}{ending}",
         "ConditionList": combined,
         "Weights": weights[0] if len(rows) == 1 else weights,
         "Test": "t" if len(rows) == 1 else "F",
+        **({"Alternative": _SIDES[sided["sign"]], "Margin": margin} if sided else {}),
     }
 
 
@@ -109,7 +147,14 @@ def parse_contrast(contrast: Mapping[str, Any]) -> ContrastSpec:
         raise refusal(f"has contrast {name!r} with {len(conditions)} conditions and other weights")
     if test == "t" and len(weights) > 1:
         raise refusal(f"has contrast {name!r} with several rows; its test must be F")
-    return ContrastSpec(name, conditions, weights, test)
+    side, margin = str(contrast.get("Alternative", "")), contrast.get("Margin", 0.0)
+    is_number = isinstance(margin, int | float) and abs(margin) < _WEIGHTS[1]
+    if side not in {"", *_SIDES.values()} or not is_number:
+        raise refusal(
+            f"has contrast {name!r} with alternative {side!r} and margin {margin!r}; use greater"
+            " or less, and a number"
+        )
+    return ContrastSpec(name, conditions, weights, test, side, float(margin))
 
 
 def refusal(problem: str) -> ModelError:

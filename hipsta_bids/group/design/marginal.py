@@ -51,20 +51,23 @@ class Terms:
         self._grids: dict[tuple[tuple[str, object], ...], Float] = {}
 
     def contrast(self, spec: ContrastSpec) -> Contrast:
-        """Return the weights of a contrast; ModelError lists unknown names."""
+        """Return a contrast with its weights; ModelError lists unknown names."""
+        return Contrast(spec.name, self._weights(spec), spec.side, spec.margin)
+
+    def _weights(self, spec: ContrastSpec) -> Float:
         variable = re.fullmatch(rf"{NONLINEAR}\(`?([^`]+)`?\)", spec.conditions[0])
         if variable and len(spec.conditions) == 1:
-            return Contrast(spec.name, self._nonlinear(variable[1], spec.name))
+            return self._nonlinear(variable[1], spec.name)
         parts = [self._rows(name, spec.name) for name in spec.conditions]
         width = max(part.shape[1] for part in parts)
         parts = [np.pad(part, ((0, 0), (0, width - part.shape[1]))) for part in parts]
         if len(parts) == len(spec.weights) == 1:
-            return Contrast(spec.name, parts[0] * spec.weights[0][0])
+            return parts[0] * spec.weights[0][0]
         if wide := [name for name, p in zip(spec.conditions, parts, strict=True) if len(p) > 1]:
             raise ModelError(
                 f"contrast {spec.name!r}: {listed(wide)} has several rows; test it by itself"
             )
-        return Contrast(spec.name, np.array(spec.weights) @ np.concatenate(parts))
+        return np.asarray(np.array(spec.weights) @ np.concatenate(parts))
 
     def _structures(self) -> Iterator[tuple[frozenset[str], list[str]]]:
         """List the terms of the formula: their variables, and their columns."""

@@ -18,6 +18,7 @@ from hipsta_bids.group.design.contrasts import Contrast, ContrastSpec
 from hipsta_bids.group.design.grammar import CONTEXT, closed_formula, term_text
 from hipsta_bids.group.design.marginal import NONLINEAR, Terms
 from hipsta_bids.group.design.settings import DefaultModelSettings, DesignSettings, GroupSettings
+from hipsta_bids.group.design.visits import VISIT, check_endpoint, visit_contrasts
 from hipsta_bids.io import files
 from hipsta_bids.types import PARTICIPANT, SESSION, Float, Int64
 
@@ -150,6 +151,8 @@ class VisitTime:
     """Column of the time; None if it is not known."""
     covariates: tuple[str, ...]
     """Names of covariates of the default model, with age at the first visit."""
+    labels: tuple[str, ...] = ()
+    """Visits in their order, if they are categories."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -157,7 +160,9 @@ class Comparison:
     """Which sessions and sides of a participant are compared; by default the first session."""
 
     longitudinal: bool = False
-    """All sessions, by a mixed model."""
+    """All sessions, or those of ``endpoint``, by a model of repeated visits."""
+    endpoint: tuple[str, ...] = ()
+    """``ancova``, ``mmrm`` or ``clda``, the baseline's session, and later ones, with ``ses-``."""
     pair: tuple[str, str] | None = None
     """Two sessions, with ``ses-``: the second minus the first is analyzed."""
     asymmetry: bool = False
@@ -170,15 +175,22 @@ class Comparison:
         """The part of names that distinguishes folders of results of one formula."""
         if self.pair:
             return f"_change-{'-'.join(one.removeprefix('ses-') for one in self.pair)}"
+        if self.endpoint:
+            return f"_{'-'.join(one.removeprefix('ses-') for one in self.endpoint)}"
         return "_longitudinal" if self.longitudinal else ""
+
+    @property
+    def adjusted(self) -> str | None:
+        """Session of the baseline, if it is a covariate."""
+        return self.endpoint[1] if self.endpoint and self.endpoint[0] != "clda" else None
 
     def __post_init__(self) -> None:
         if self.longitudinal and self.pair:
             raise UsageError("give --longitudinal (all sessions) or --paired (two), not both")
-        if self.longitudinal and self.normative:
-            raise UsageError(
-                "w-scores need one visit per participant; remove --longitudinal, or use --paired"
-            )
+        if self.endpoint:
+            check_endpoint(self.endpoint)
+            if self.asymmetry or self.normative:
+                raise UsageError("--endpoint: remove --asymmetry and --normative")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -237,6 +249,8 @@ def choose_model(
         request, table, groups, settings, comparison=comparison, visits=visits
     )
     model = formulas.parse_model(document)
+    if visits is not None and visits.labels and VISIT in closed_formula(model.formula).names:
+        references[VISIT] = visits.labels[0]
     if groups is not None and groups.column in closed_formula(model.formula).names:
         references.setdefault(groups.column, groups.reference)
     return document, model, groups, references
@@ -260,16 +274,15 @@ def model_document(
         if not request.formula.rpartition("~")[2].strip():
             raise UsageError("--formula is empty; write it as group + age")
         formula = request.formula
-        contrasts = list(request.contrasts)
-        plain, maps = formulas.split_maps(formula)
-        if not contrasts and groups is not None and groups.column in plain:
-            contrasts = [*groups.contrasts(), *interactions(plain)]
-            contrasts += [f"map({name})" for name in maps]
+        contrasts = list(request.contrasts) or _formula_contrasts(
+            formula, groups, comparison, visits
+        )
         return formulas.model_from_shortcut(
             formula, contrasts, request.name or folder_name(formula)
         )
     comparison = comparison or Comparison()
-    within = comparison.longitudinal or comparison.pair or comparison.asymmetry
+    has_changes = comparison.longitudinal and not comparison.endpoint
+    within = has_changes or comparison.pair or comparison.asymmetry
     if groups is None and not within:
         columns = [str(name) for name in table.columns if name not in {PARTICIPANT, SESSION}]
         available = (
@@ -282,7 +295,7 @@ def model_document(
             f'{available}; or give --formula "age + sex" --contrast age'
         )
     time = visits.column if visits else None
-    if comparison.longitudinal and time is None:
+    if has_changes and time is None:
         raise ModelError(
             "the default longitudinal model needs the time of each session: a column"
             f" {', '.join(settings.longitudinal.time_columns)}, acq_time or age in sessions.tsv"
@@ -291,8 +304,28 @@ def model_document(
     formula = default_formula(table, groups, settings, covariates=covariates, time=time)
     bent = [name for name in closed_formula(formula).names if name.casefold() in _AGES]
     bent = [] if settings.model.age == "linear" else bent
-    contrasts = list(request.contrasts) or default_contrasts(groups, time, bent)
+    contrasts, endpoint = list(request.contrasts), comparison.endpoint
+    if not contrasts and visits is not None and time == VISIT:
+        contrasts = visit_contrasts(groups.contrasts() if groups else [], visits.labels, endpoint)
+        time, groups = None, None if contrasts else groups
+    contrasts += [] if request.contrasts else default_contrasts(groups, time, bent)
     return formulas.model_from_shortcut(formula, contrasts, request.name or folder_name(formula))
+
+
+def _formula_contrasts(
+    formula: str, groups: Groups | None, comparison: Comparison | None, visits: VisitTime | None
+) -> list[str]:
+    """Contrasts of a formula that a user wrote without any."""
+    plain, maps = formulas.split_maps(formula)
+    endpoint = comparison.endpoint if comparison else ()
+    if groups is not None and groups.column not in plain:
+        groups = None
+    if visits is not None and visits.labels and VISIT in closed_formula(plain).names:
+        return visit_contrasts(groups.contrasts() if groups else [], visits.labels, endpoint)
+    if groups is None:
+        return []
+    terms = (f"map({name})" for name in maps)
+    return [*groups.contrasts(), *interactions(plain), *terms]
 
 
 def interactions(formula: str) -> list[str]:

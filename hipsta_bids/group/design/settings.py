@@ -69,7 +69,8 @@ class DesignSettings(toml.SettingsTable):
     min_residual_df: PositiveInt = 3
     """Fewer subjects beyond the columns are too few."""
     factors: toml.Texts = (
-        *("group", "diagnosis", "dx", "diagnostic_group", "arm", "cohort", "study"),
+        *("group", "diagnosis", "dx", "diagnostic_group", "arm", "treatment"),
+        *("cohort", "study"),
         *("sex", "gender", "ethnicity", "race"),
         *("site", "site_id", "scanner", "scanner_id", "center", "center_id", "vendor"),
     )
@@ -90,9 +91,11 @@ class DesignSettings(toml.SettingsTable):
 class DefaultModelSettings(toml.SettingsTable):
     """The model when none is given."""
 
-    group_columns: toml.Texts = ("group", "diagnosis", "dx", "diagnostic_group")
+    group_columns: toml.Texts = (
+        *("group", "diagnosis", "dx", "diagnostic_group", "arm", "treatment"),
+    )
     """The first of these columns, in any case of letters, has the groups."""
-    reference_levels: toml.Texts = ("CN", "CU", "HC", "NC", "CTRL", "control", "healthy")
+    reference_levels: toml.Texts = ("CN", "CU", "HC", "NC", "CTRL", "control", "healthy", "placebo")
     """The reference level of the groups: the first of these, in any case and number; else the
     most frequent level."""
     covariates: toml.Texts = ("age", "sex", "site")
@@ -120,12 +123,16 @@ class GlmSettings(toml.SettingsTable):
 class LongitudinalSettings(toml.SettingsTable):
     """Repeated sessions of the same participants."""
 
-    random: Literal["auto", "intercept", "slope"] = "auto"
+    random: Literal["auto", "intercept", "slope", "visits"] = "auto"
     """Random effects of participants: an ``intercept``, or also a ``slope`` over time. ``auto``
     takes slopes where ``slope_participants`` have three visits. Without them tests of changes take
-    differences between participants for noise, and find too much."""
+    differences between participants for noise, and find too much. ``visits``: visits are
+    categories, with any covariance, and no random effects."""
     slope_participants: PositiveInt = 10
     """Participants with three visits or more that ``auto`` wants for slopes."""
+    freedom: Literal["satterthwaite", "kenward-roger"] = "kenward-roger"
+    """Degrees of freedom of models with visits as categories. ``kenward-roger`` also corrects
+    standard errors for the estimated covariance (Kenward and Roger 1997)."""
     time_columns: toml.Texts = ("time", "years", "months", "days")
     """The time is the first of these columns, in any case, that varies between sessions. Else it is
     the years since the first session, from ``acq_time`` or age."""
@@ -242,13 +249,15 @@ class RetestSettings(toml.SettingsTable):
 
 
 class PowerSettings(toml.SettingsTable):
-    """Participants that a trial of two arms of equal size needs."""
+    """Participants that a trial of two arms needs."""
 
     power: toml.OpenFraction = 0.8
     """Chance to find the effect."""
     dropout: Annotated[float, Field(ge=0, lt=1)] = 0.0
     """Share of the enrolled participants lost before the last visit, at a constant hazard. Their
     visits before that are in the mixed model of several visits."""
+    allocation: Annotated[float, Field(ge=1, le=20)] = 1.0
+    """Participants of the larger arm over the smaller arm."""
     alpha: toml.OpenFraction = 0.05
     """Two-sided level of the test of a summary measure, one of which is the end point. Maps hold
     the false discovery rate ``multiplicity.alpha``."""

@@ -68,7 +68,7 @@ def frame_of(cohort: Cohort, fitted: FittedMaps, average: Float | None = None) -
     return Frame({"vertex": np.arange(len(mesh.points))}, position, subfield.ravel())
 
 
-def test_columns(test: PointTest) -> dict[str, Float]:
+def test_columns(test: PointTest) -> dict[str, str | Float]:
     """Columns of a test in tables of points; of an F test without estimate."""
     missing = np.full(test.p.shape, np.nan)
     single = test.kind == "t"
@@ -78,6 +78,7 @@ def test_columns(test: PointTest) -> dict[str, Float]:
         "statistic": test.statistic,
         "df": test.df,
         "p": test.p,
+        **({"alternative": test.contrast.hypothesis} if test.contrast.side else {}),
     }
 
 

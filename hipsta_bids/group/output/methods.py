@@ -13,12 +13,14 @@ from hipsta_bids.group.cohort.crop import REACH
 from hipsta_bids.group.cohort.data import SIZES, Cohort
 from hipsta_bids.group.cohort.read import LEAST_SHARE
 from hipsta_bids.group.design import settings as group_settings
+from hipsta_bids.group.design.contrasts import Contrast
 from hipsta_bids.group.design.model import interactions
 from hipsta_bids.group.output.results import Analysis
 from hipsta_bids.group.output.tables import summary_tests
 from hipsta_bids.group.stats import inference
 from hipsta_bids.group.stats.clusters import TFCE_EXTENT, TFCE_HEIGHT
 from hipsta_bids.group.stats.exchangeability import exchange_text, spans_constant
+from hipsta_bids.group.stats.mmrm import VisitRows
 from hipsta_bids.protocols import EXPERIMENTAL
 from hipsta_bids.reports.group_tables import opposite_changes
 from hipsta_bids.types import PARTICIPANT
@@ -294,13 +296,14 @@ def _models(
     analysis: Analysis, settings: group_settings.GroupSettings, cite: Callable[[str], str]
 ) -> str:
     contrasts = analysis.design.contrasts
-    names = escaped(joined([contrast.name for contrast in contrasts]))
     levels = escaped(", ".join(map(" ".join, analysis.design.references.items())))
     kind, subject, d = "linear model", "", "the estimate divided by the residual standard deviation"
     if analysis.comparison.pair:
         first, second = analysis.comparison.pair
         subject = f" to the change from {first} to {second}, with the covariates of {first}"
-    if analysis.comparison.longitudinal:
+    if isinstance(analysis.row_model, VisitRows):
+        d = "the estimate divided by the root of the mean variance of visits"
+    elif analysis.comparison.longitudinal:
         kind = "linear mixed model"
         d = "the estimate divided by the standard deviation of single visits"
     text = (
@@ -317,14 +320,9 @@ def _models(
     if settings.glm.covariance == "hc3":
         text += f" Standard errors allowed for unequal variances (HC3) {cite('hc3')}."
     if analysis.comparison.longitudinal:
-        visits = analysis.row_model.visits
-        effects = "intercepts and slopes" if visits is not None and visits.slopes else "intercepts"
-        text += (
-            f" It had random {effects} of participants, and was estimated by restricted maximum"
-            f" likelihood. Degrees of freedom were Satterthwaite's {cite('mixed')}."
-        )
-    text += f" Contrasts were {names}." if len(contrasts) > 1 else f" The contrast was {names}."
-    if analysis.comparison.longitudinal and any(one.n_rows > 1 for one in contrasts):
+        text += _visits(analysis, settings, cite)
+    text += _tests(contrasts)
+    if "Satterthwaite" in text and any(one.n_rows > 1 for one in contrasts):
         text += f" Contrasts of several rows were tested by F {cite('fai')}."
     text += _slopes(analysis, cite) if analysis.comparison.longitudinal else ""
     text += f" {_correction(settings.multiplicity, cite, analysis)}"
@@ -345,6 +343,54 @@ def _models(
             f" tests: {n_families})."
         )
     return f"{text}{_nonlinear(analysis, settings)}"
+
+
+def _tests(contrasts: Sequence[Contrast]) -> str:
+    """Return the names of contrasts, and the alternatives of one-sided tests."""
+    names = escaped(joined([contrast.name for contrast in contrasts]))
+    text = f" Contrasts were {names}." if len(contrasts) > 1 else f" The contrast was {names}."
+    if sided := [f"{escaped(one.name)} ({one.hypothesis})" for one in contrasts if one.side]:
+        text += f" Tests were one-sided, with this alternative and margin: {joined(sided)}."
+    return text
+
+
+def _visits(
+    analysis: Analysis, settings: group_settings.GroupSettings, cite: Callable[[str], str]
+) -> str:
+    """Return how repeated visits, and the baseline, were modeled."""
+    if not isinstance(analysis.row_model, VisitRows):
+        visits = analysis.row_model.visits
+        effects = "intercepts and slopes" if visits is not None and visits.slopes else "intercepts"
+        return (
+            f" It had random {effects} of participants, and was estimated by restricted maximum"
+            f" likelihood. Degrees of freedom were Satterthwaite's {cite('mixed')}."
+        )
+    kind, *sessions = analysis.comparison.endpoint or ("",)
+    first = escaped(sessions[0] if sessions else "")
+    if kind == "ancova":
+        text = f" The value at {first} was a covariate at each point (analysis of covariance)."
+    else:
+        text = (
+            " Visits were categories with an unstructured covariance, estimated by restricted"
+            f" maximum likelihood {cite('mmrm')}."
+        )
+    if kind == "mmrm":
+        text += f" The value at {first} was a covariate at each point, with a slope for each visit."
+    if kind == "clda":
+        text += (
+            f" {first} was one of the visits, with the same mean in all arms (constrained"
+            f" longitudinal data analysis) {cite('clda')}."
+        )
+    if kind != "ancova" and settings.longitudinal.freedom == "kenward-roger":
+        text += (
+            " Standard errors and degrees of freedom followed Kenward and Roger"
+            f" {cite('kenward-roger')}."
+        )
+    elif kind != "ancova":
+        text += f" Degrees of freedom were Satterthwaite's {cite('mixed')}."
+    fits = [fit for one in analysis.fitted.values() for fit in one.fits.values()]
+    n_missing = sum(int((np.isnan(fit.sigma) & (fit.n > 0)).sum()) for fit in fits)
+    return f"{text} The model could not be fitted at {n_missing} points." if n_missing else text
 
 
 def _slopes(analysis: Analysis, cite: Callable[[str], str]) -> str:

@@ -111,8 +111,9 @@ def power_text(
             f" We assumed that {100 * plan.dropout:g} % drop out at a constant hazard, and that"
             " their earlier visits are analyzed."
         )
+    sizes = f"allocated {plan.allocation:g}:1" if plan.allocation > 1 else "of equal size"
     return (
-        f"Sample sizes are for a trial with two arms of equal size and a power of {plan.power:g}."
+        f"Sample sizes are for a trial with two arms {sizes} and a power of {plan.power:g}."
         f" In this trial, {question}.{dropout} {end} Means, changes and variances were estimated"
         f" from {source(cite)}. Power was computed for Student's two-sided t test, by the"
         f" non-central t distribution. The level was {plan.alpha:g} for summary measures, without"
@@ -120,7 +121,9 @@ def power_text(
         f" {point_level(rules, plan):.2g}. At this level, {PROCEDURES[rules.method]}"
         f" {cite(rules.method)} controls the false discovery rate at {rules.alpha:g}. This assumes"
         f" that {100 * plan.affected:g} % of the points differ and are found with this power on"
-        f" average {cite('jung')} {cite('liu')}. If the measure with the smallest sample size is"
+        f" average {cite('jung')} {cite('liu')}. Limits of sample sizes of summary measures include"
+        " the uncertainty of the mean or change and of the standard deviation"
+        f" {cite('mover')}. If the measure with the smallest sample size is"
         " selected among many, its sample size is underestimated on average."
     )
 

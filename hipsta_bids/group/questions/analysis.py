@@ -24,6 +24,7 @@ from hipsta_bids.group.stats import arrays, inference, registration
 from hipsta_bids.group.stats.clusters import edges_of
 from hipsta_bids.group.stats.glm import FittedMaps, RowModel, fit_maps, with_mean
 from hipsta_bids.group.stats.mixed import longitudinal_model
+from hipsta_bids.group.stats.mmrm import visit_model
 from hipsta_bids.group.stats.warps import Template, warp_labels, warp_values
 from hipsta_bids.progress import each, tell
 from hipsta_bids.reports import cells
@@ -100,7 +101,19 @@ def analyze_cohort(
         design = replace(design, contrasts=with_mean(design))
 
     make_rows: Callable[[designs.Design], RowModel] = partial(RowModel, settings=settings.glm)
-    if comparison.longitudinal:
+    if comparison.endpoint or (
+        comparison.longitudinal and settings.longitudinal.random == "visits"
+    ):
+        _check_visits(comparison, settings, maps=model.maps, is_harmonized=plan is not None)
+        arms = groups.column if groups and comparison.endpoint[:1] == ("clda",) else None
+        make_rows = partial(
+            visit_model,
+            table=table,
+            settings=settings.glm,
+            longitudinal=settings.longitudinal,
+            arms=arms,
+        )
+    elif comparison.longitudinal:
         make_rows = partial(
             longitudinal_model,
             table=table,
@@ -109,8 +122,10 @@ def analyze_cohort(
             longitudinal=settings.longitudinal,
         )
     rows = make_rows(design)
+    design = rows.design
     joint = bool(settings.joint.measures)
-    inference.check_permutations(settings.multiplicity, settings.glm, joint=joint)
+    _check_margins(design, cohort, measures)
+    inference.check_permutations(settings.multiplicity, settings.glm, design.contrasts, joint=joint)
     sides = {
         hemi: register_side(cohort, hemi, groups=groups, settings=settings, templates=templates)
         for hemi in each("registration", list(cohort.sides) if measures.maps else [])
@@ -170,7 +185,8 @@ def analyze_cohort(
         classified = data.compare_sessions(measured, comparison)
     first_visits = classified.take(~table[PARTICIPANT].duplicated().to_numpy())
     classification = settings.classification
-    pairs, more = classify_groups(first_visits, groups, classification) if groups else ([], [])
+    classes = None if comparison.endpoint else groups
+    pairs, more = classify_groups(first_visits, classes, classification) if classes else ([], [])
     return results.Analysis(
         model=model,
         comparison=comparison,
@@ -215,6 +231,37 @@ def _check_covariates(
     if comparison.pair is None and (outcomes := [m for m in model.maps if m in measures.maps]):
         raise ModelError(
             f"map({outcomes[0]}) in the formula explains itself; choose other maps by --measures"
+        )
+
+
+def _check_visits(
+    comparison: designs.Comparison,
+    settings: GroupSettings,
+    *,
+    maps: Sequence[str],
+    is_harmonized: bool,
+) -> None:
+    """Refuse what models of visits as categories cannot do."""
+    excluded = {
+        "--correction permutation": settings.multiplicity.method in inference.PERMUTATIONS,
+        "--joint": bool(settings.joint.measures),
+        "--harmonize": bool(comparison.endpoint) and is_harmonized,
+        "map() in the formula": bool(maps),
+    }
+    if problems := [name for name, is_asked in excluded.items() if is_asked]:
+        raise ModelError(f"visits as categories: not with {listed(problems)}; remove it")
+
+
+def _check_margins(design: designs.Design, cohort: data.Cohort, measures: data.Measures) -> None:
+    """Refuse one margin for measures of several units."""
+    names = [one.name for one in design.contrasts if one.margin]
+    columns = {str(name) for side in cohort.sides.values() for name in side.summary.columns}
+    summaries = columns if measures.summaries is None else columns & {*measures.summaries}
+    units = {cohort.units[name] for name in (*measures.maps, *summaries) if name in cohort.units}
+    if names and len(units) > 1:
+        raise ModelError(
+            f"contrast {names[0]!r}: a margin has one unit, but the measures have"
+            f" {listed(sorted(units))}; choose some by --measures"
         )
 
 

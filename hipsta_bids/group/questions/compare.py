@@ -70,7 +70,8 @@ def _analyze(options: studies.GroupOptions, settings: GroupSettings) -> studies.
     table = modeled_table(cohort.table, options.comparison)
     effects = load_effects(options.harmonize_model) if options.harmonize_model else None
     source = (effects.file, effects.labels) if effects else ("", {})
-    study = with_mixes(study, table, closed_formula(model.formula).names, source=source)
+    mixed = cohort.table if options.comparison.adjusted else table
+    study = with_mixes(study, mixed, closed_formula(model.formula).names, source=source)
     templates = studies.read_templates(options.template, cohort)
     analysis = fitting.analyze_cohort(
         cohort,
@@ -237,6 +238,7 @@ def _record(analysis: Analysis, ratings: Mapping[str, int] | None) -> dict[str, 
         "columns": analysis.design.columns,
         "references": analysis.design.references,
         "contrasts": {c.name: c.weights.tolist() for c in analysis.design.contrasts},
+        "one_sided": {c.name: c.hypothesis for c in analysis.design.contrasts if c.side},
         "comparison": asdict(analysis.comparison),
         "groups": None if analysis.groups is None else asdict(analysis.groups),
         "participants": analysis.n_participants,

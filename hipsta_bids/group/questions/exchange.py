@@ -292,8 +292,8 @@ def _check_model(analysis: Analysis, settings: GroupSettings) -> None:
             f"with {match[1]}() has other columns at each site; write numbers that are the same"
             " everywhere, as I((age - 65) / 10)"
         )
-    elif not any(contrast.n_rows == 1 for contrast in analysis.design.contrasts):
-        problem = "has no contrast of one row; F tests cannot be combined"
+    elif not any(one.n_rows == 1 and not one.side for one in analysis.design.contrasts):
+        problem = "has no two-sided contrast of one row; others cannot be combined"
     if problem is not None:
         raise ModelError(f"--export-summary: a model {problem}")
 
@@ -352,7 +352,9 @@ def _model(
 ) -> dict[str, Any]:
     """Fit the model where all participants have a value, and spell the results."""
     names = [test.contrast.name for test in tests]
-    contrasts = [one for one in design.contrasts if one.n_rows == 1 and one.name in names]
+    contrasts = [
+        one for one in design.contrasts if one.n_rows == 1 and not one.side and one.name in names
+    ]
     complete = np.isfinite(values).all(axis=0)
     fit = fit_points(np.where(complete, values, 0.0), design.matrix, contrasts, settings.glm)
     traceable = is_traceable(values, cells, settings.exchange.min_cell)

@@ -39,7 +39,7 @@ _ARRAYS = {
     "se": ("standard error of the estimate", True),
     "statistic": ("t, or F", False),
     "df": ("residual degrees of freedom", False),
-    "p": ("two-sided, of each point alone", False),
+    "p": ("of each point alone, two-sided unless the contrast has > or <", False),
     "p_corrected": ("corrected for the number of points", False),
     "effect": ("Cohen's d, or of F partial eta squared", False),
 }
@@ -277,7 +277,7 @@ def group(
         note = spelled_note(spelled, formula or "", settings)
         design = replace(design, notes={**design.notes, "missing": note})
     model = RowModel(design, settings.glm)
-    check_permutations(settings.multiplicity, settings.glm)
+    check_permutations(settings.multiplicity, settings.glm, design.contrasts)
     side_maps = {side: _side(values, measure, triangles) for side, values in sides.items()}
     fitted = {side: fit_maps(side, one, model) for side, one in side_maps.items()}
     return GroupFit(

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pandas as pd
@@ -155,6 +156,7 @@ def fit_summaries(
 ) -> tuple[dict[tuple[str, str], tuple[list[str], PointwiseFit, Int]], list[str]]:
     """Fit the model of the maps to all summary measures; sizes also with intracranial volume."""
     fits: dict[tuple[str, str], tuple[list[str], PointwiseFit, Int]] = {}
+    first = data.baselines(cohort)
 
     def fit(formula: str, model: RowModel, is_included: Callable[[str], bool]) -> None:
         rows = model.design.rows
@@ -164,12 +166,19 @@ def fit_summaries(
             values = values.loc[:, included & (values.max() > values.min()).to_numpy()]
             if not values.columns.size:
                 continue
+            fit_values = model.fit_measures
+            if first is not None:
+                baseline = data.summary_values(first, hemi, names).iloc[rows][values.columns]
+                values = values.where(baseline.notna())
             present = np.flatnonzero(values.notna().any(axis=1).to_numpy())
+            if first is not None:
+                covariates = baseline.to_numpy(dtype=np.float64)[None, present]
+                fit_values = partial(model.fit, covariates=covariates)
             maps: Float = values.to_numpy(dtype=np.float64)[present]
             participants = cohort.table[PARTICIPANT].iloc[rows[present]].to_numpy()
             fits[hemi, formula] = (
                 list(values.columns),
-                model.fit_measures(maps, present, model.design.contrasts),
+                fit_values(maps, present, model.design.contrasts),
                 data.participants_with(np.isfinite(maps), participants),
             )
 

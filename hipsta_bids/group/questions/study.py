@@ -335,9 +335,11 @@ def read_study(
     cohort, reasons = choose_visits(all_visits.take(has_maps), options.comparison)
     keep = all_visits.table.index.isin(cohort.table.index)
     table, icv = add_icv(cohort.table, measured.sources, settings)
-    time = add_time(table, settings) if options.comparison.longitudinal else None
+    comparison = options.comparison
+    time = add_time(table, settings, comparison) if comparison.longitudinal else None
     cohort = replace(cohort, table=table if time is None else time.table)
-    reason = "other-session" if options.comparison.pair else "later-session"
+    is_named = comparison.pair or comparison.endpoint
+    reason = "other-session" if is_named else "later-session"
     reasons_of = {visit: (reason, message) for visit, message in reasons.items()}
     study = Study(
         options=options,

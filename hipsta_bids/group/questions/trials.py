@@ -17,7 +17,7 @@ from hipsta_bids.errors import ModelError
 from hipsta_bids.group.cohort.data import SHEET, SUMMARY, Cohort, Layer, layers, participants_with
 from hipsta_bids.group.design import model as designs
 from hipsta_bids.group.design.formula import listed, model_from_shortcut, parse_model
-from hipsta_bids.group.design.settings import GroupSettings
+from hipsta_bids.group.design.settings import GlmSettings, GroupSettings, RetestSettings
 from hipsta_bids.group.output import write
 from hipsta_bids.group.output.columns import frame_of
 from hipsta_bids.group.output.ground import grounds_of
@@ -28,9 +28,9 @@ from hipsta_bids.group.output.style import Drawing
 from hipsta_bids.group.output.tables import entity_label
 from hipsta_bids.group.questions import study as studies
 from hipsta_bids.group.questions.mixing import with_mixes
-from hipsta_bids.group.stats import trials
-from hipsta_bids.group.stats.arrays import Bool, Float, Int, SideMaps, mean_of_known
-from hipsta_bids.group.stats.glm import FittedMaps, PointwiseFit, RowModel, fit_maps, most_frequent
+from hipsta_bids.group.stats import glm, trials
+from hipsta_bids.group.stats.arrays import Bool, Float, Int, SideMaps, describe_known, mean_of_known
+from hipsta_bids.group.stats.glm import FittedMaps, PointwiseFit, RowModel, fit_maps
 from hipsta_bids.group.stats.mixed import longitudinal_model
 from hipsta_bids.io import files, gifti
 from hipsta_bids.progress import tell
@@ -65,7 +65,7 @@ class Described:
 def points_of(side: SideMaps) -> FittedMaps:
     """Locate the points of maps of one hemisphere, to which nothing was fitted."""
     rows = np.arange(len(side.rows))
-    subfield = most_frequent(side.subfield[:], len(side.names))
+    subfield = glm.most_frequent(side.subfield[:], len(side.names))
     return FittedMaps(maps=side, used=rows, rows=rows, subfield=subfield, fits={})
 
 
@@ -119,8 +119,9 @@ class Retested:
     def describe(self, layer: Layer) -> Described:
         """Describe the agreement of sessions at each point, and mean and variance."""
         data = layer.data
+        values = self.arrange(data, layer.rows)
         agreed = trials.repeatability(
-            self.arrange(data, layer.rows),
+            values,
             confidence=self._settings.confidence,
             least=self._settings.min_participants,
         )
@@ -133,6 +134,7 @@ class Retested:
             mean=agreed["mean"],
             variance=agreed["sd_within"] ** 2 + between,
             freedom=np.maximum(freedom, 1.0),
+            mean_limits=agreed["mean"] + _reach(mean_of_known(values, 1), self._settings),
         )
         return Described(
             layer=layer,
@@ -222,14 +224,22 @@ class Modeled:
         """At one visit with the residual variance; over time with changes and both variances."""
         participants = self._table[PARTICIPANT].iloc[rows].to_numpy()
         n = participants_with(np.isfinite(values), participants)
+        mean = mean_of_known(values, 0)
+        people = np.unique(participants.astype(str), return_inverse=True)[1]
+        counts = glm.sum_by(people, np.isfinite(values).astype(np.float64))
+        own_means = glm.sum_by(people, np.nan_to_num(values)) / np.where(counts > 0, counts, np.nan)
         plain = trials.Reference(
             n=n,
-            mean=mean_of_known(values, 0),
+            mean=mean,
             variance=fit.sigma**2,
             freedom=np.maximum(n - float(len(self.model.design.columns)), 1.0),
+            mean_limits=mean + _reach(own_means, self._settings.glm),
         )
         if self.time is None:
             return plain
+        months = self._table[self.time].iloc[rows].to_numpy(dtype=np.float64) * self.months
+        visits = glm.sum_by(people, np.stack([np.ones_like(months), months, months**2], axis=1))
+        spreads = visits[:, 2] - visits[:, 1] ** 2 / visits[:, 0]
         (test,) = (one for one in fit.tests if one.contrast.name == self.time)
         slope, se = test.estimate[0] / self.months, test.se[0] / self.months
         reach = stats.t.ppf((1 + self._settings.glm.confidence) / 2, test.df) * se
@@ -239,6 +249,9 @@ class Modeled:
             slope=slope,
             slope_limits=np.stack([slope - reach, slope + reach]),
             slope_variance=fit.variances["slope"] / self.months**2,
+            slope_freedom=test.df,
+            spread=float(1 / np.mean(1 / spreads[spreads > 0])),
+            freedom=np.maximum(np.isfinite(values).sum(axis=0) - 2.0 * n, 1.0),
         )
 
     def words(self, cite: Callable[[str], str]) -> str:
@@ -254,6 +267,14 @@ class Modeled:
 
 
 Source = Retested | Modeled
+
+
+def _reach(means: Float, settings: GlmSettings | RetestSettings) -> Float:
+    """Limits (2, points) around the mean of participants' means (participants, points)."""
+    finite, _, sd = describe_known([means])
+    count = np.maximum(finite.sum(axis=0), 2)
+    reach = stats.t.ppf((1 + settings.confidence) / 2, count - 1) * sd / np.sqrt(count)
+    return np.stack([-reach, reach])
 
 
 def _check_times(table: pd.DataFrame, time: str | None, settings: GroupSettings) -> None:

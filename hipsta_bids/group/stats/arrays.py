@@ -58,7 +58,7 @@ class WarpedLabels:
         return self.carry(self.source[rows], self.warps[rows])
 
 
-def some_sheets(maps: Mapping[str, Float], rows: slice | Bool) -> Mapping[str, Float]:
+def some_sheets(maps: Mapping[str, Float], rows: slice | Bool | Int) -> Mapping[str, Float]:
     """Keep some sheets of maps."""
     if isinstance(maps, WarpedMaps):
         return WarpedMaps(some_sheets(maps.source, rows), maps.warps[rows], maps.carry)
@@ -102,6 +102,8 @@ class SideMaps:
     covariates: Mapping[str, Float] = field(default_factory=dict)
     """(sheets, x, y) maps that are covariates of the model at each point, by name."""
 
+    first: "SideMaps | None" = None
+    """Values at the baseline, a covariate at each point: the sheets of the same participants."""
     unmasked: Float | None = None
     """(sheets, x, y) curvature that registration uses, where a mask has points of that map."""
 
@@ -119,7 +121,8 @@ class SideMaps:
         """Keep some maps."""
         if set(measures) == set(self.maps):
             return self
-        return replace(self, maps={name: self.maps[name] for name in measures})
+        first = self.first and self.first.only(measures)
+        return replace(self, maps={name: self.maps[name] for name in measures}, first=first)
 
     def with_summary(self, columns: pd.DataFrame) -> "SideMaps":
         """Add summary measures."""
@@ -140,6 +143,7 @@ class SideMaps:
             rows=self.rows[keep],
             maps=some_sheets(self.maps, keep),
             covariates=some_sheets(self.covariates, keep),
+            first=None if self.first is None else self.first.sheets(keep),
             unmasked=None if self.unmasked is None else self.unmasked[keep],
             subfield=self.subfield[keep],
             summary=self.summary[keep].reset_index(drop=True),

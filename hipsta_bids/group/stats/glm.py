@@ -1,7 +1,7 @@
 """The general linear model at every point of a map, and for single measures."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -87,9 +87,9 @@ class PointTest:
 
     contrast: Contrast
     statistic: Float
-    """(points,) t, or F for contrasts of several rows."""
+    """(points,) t, or F for contrasts of several rows; t of the difference from a margin."""
     p: Float
-    """(points,) two-sided."""
+    """(points,) two-sided, unless the contrast has a side."""
     df: Float
     """(points,) residual degrees of freedom."""
     estimate: Float
@@ -193,7 +193,7 @@ def orthonormal(
     contrasts = [
         one
         if one.weights.shape[1] != matrix.shape[1]
-        else Contrast(one.name, np.pad(one.weights, widths))
+        else replace(one, weights=np.pad(one.weights, widths))
         for one in contrasts
     ]
     check_design(maps, matrix, contrasts, columns)
@@ -348,6 +348,9 @@ def with_effects(
         squared = statistic**2
         cohen_d = estimate[0] / sigma
         d_limits = np.stack(t_limits(statistic, df, confidence)) * (se[0] / sigma)
+        if contrast.side:
+            statistic = (estimate[0] - contrast.margin) / se[0]
+            p = special.stdtr(df, -statistic if contrast.side == "greater" else statistic)
     else:
         tail = special.fdtrc(float(rows), df, statistic)
         squared = statistic
@@ -511,6 +514,8 @@ def fit_maps(
         for name in side.maps:
             # Maps of a large cohort are made here: without a name, one is gone before the next.
             values = _values(side.maps[name], positions)
+            if side.first is not None:
+                covariates = _values(side.first.maps[name], positions)[None]
             fits[name] = model.fit(values, rows, tested, covariates)
             del values
     except ModelError as error:

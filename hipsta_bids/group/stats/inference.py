@@ -489,11 +489,21 @@ def correct(
 
 
 def check_permutations(
-    rules: MultiplicitySettings, settings: GlmSettings, *, joint: bool = False
+    rules: MultiplicitySettings,
+    settings: GlmSettings,
+    contrasts: Sequence[Contrast],
+    *,
+    joint: bool = False,
 ) -> None:
-    """Refuse permutations where rows cannot be exchanged."""
+    """Refuse permutations where rows cannot be exchanged, and of one-sided tests."""
     if (rules.method in PERMUTATIONS or joint) and settings.covariance != "ordinary":
         raise ModelError("permutations assume equal variances; set glm.covariance to ordinary")
+    one_sided = [contrast.name for contrast in contrasts if contrast.side]
+    if one_sided and (rules.method in PERMUTATIONS or joint):
+        raise ModelError(
+            f"contrast {one_sided[0]!r}: one-sided tests are not permuted; use --correction fdr2,"
+            " without --joint"
+        )
 
 
 def row_blocks(model: RowModel, table: pd.DataFrame, rules: MultiplicitySettings) -> Int | None:

@@ -232,13 +232,13 @@ def _tests(
         start = rows.stop
         estimate, se, t, df = (whole[name][rows] for name in ("estimate", "se", "t", "df"))
         single = contrast.n_rows == 1
-        values_of = {"df": df[0] if single else _denominator(df), "estimate": estimate, "se": se}
+        values_of = {"df": df[0] if single else denominator(df), "estimate": estimate, "se": se}
         statistic = t[0] if single else np.mean(t**2, axis=0)
         yield glm.with_effects(contrast, statistic, **values_of, sigma=sigma, confidence=confidence)
 
 
-def _denominator(df: Float) -> Float:
-    """Denominator's degrees of freedom of F from those (rows, points) of its t statistics."""
+def denominator(df: Float) -> Float:
+    """Denominator's degrees of freedom of F, from (rows, points) degrees of its t statistics."""
     rows, least = len(df), 2.0  # F has no expectation below
     expected = np.sum(df / np.where(df > least, df - least, np.nan), axis=0)
     df_residual = np.asarray(2 * expected / (expected - rows), dtype=np.float64)

@@ -226,13 +226,19 @@ def _derivatives(sums: SlopeSums, at: Float) -> tuple[Float, Float, Float]:
 
 
 def _second(function: Callable[[Float], Float], at: Float) -> Float:
-    """Second derivatives for the three numbers, by central differences of a wider step."""
+    """Second derivatives for the three numbers, by central differences of a wider step.
+
+    Values beside the middle serve all entries: 13 evaluations.
+    """
     step = 10 * _STEP
     shifts = step * np.eye(3)
+    middle = function(at)
+    beside = [function(at + shift) + function(at - shift) for shift in shifts]
     result = np.empty((len(at), 3, 3))
     for i in range(3):
-        for j in range(i + 1):
-            signs = ((1, 1), (1, -1), (-1, 1), (-1, -1))
-            corners = [p * q * function(at + p * shifts[i] + q * shifts[j]) for p, q in signs]
-            result[:, i, j] = result[:, j, i] = np.sum(corners, axis=0) / (4 * step**2)
+        result[:, i, i] = (beside[i] - 2 * middle) / step**2
+        for j in range(i):
+            corners = function(at + shifts[i] + shifts[j]) + function(at - shifts[i] - shifts[j])
+            mixed = (corners - beside[i] - beside[j] + 2 * middle) / (2 * step**2)
+            result[:, i, j] = result[:, j, i] = mixed
     return result

@@ -17,6 +17,8 @@ MOST_PARTICIPANTS = 10_000
 #: Kinds of effects: a share of the mean, or of the change over time.
 THINNING, SLOWING = "thinning", "slowing"
 _YEAR = 12.0
+#: Lower limit of a variance over its estimate, where the limit is zero.
+_LEAST_VARIANCE = 1e-6
 _TURNS = 200  # of the fixed point of the level; it settles in some tens
 
 
@@ -32,17 +34,23 @@ class Reference:
     """Between participants at one visit, or with several visits within participants."""
     freedom: Float
     """Degrees of freedom of the variance, about."""
+    mean_limits: Float | None = None
+    """(2, points); None if the mean is taken to be known."""
     slope: Float | None = None
     """Change per month."""
     slope_limits: Float | None = None
     """(2, points)"""
     slope_variance: Float | None = None
     """Of true changes per month between participants; None if they are taken to change alike."""
+    slope_freedom: Float | None = None
+    """Degrees of freedom of the variance between the slopes of participants."""
+    spread: float = 0.0
+    """Sum of squared deviations of a participant's visits from their mean, months squared."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrialEffect:
-    """What a trial of two arms of equal size is to find, and when it measures."""
+    """What a trial of two arms is to find, and when it measures."""
 
     kind: str
     """``thinning``: the arms differ by a share of the mean, at the last visit; ``slowing``: the
@@ -83,27 +91,21 @@ def sample_size(
     squares over the visits, as in a mixed model with random slopes and complete data: its variance
     is the variance of true slopes plus the variance within participants over the sum of squared
     times (Ard and Edland 2011). The test is Student's for two groups, so that power follows the
-    non-central t.
+    non-central t. With unequal arms, numbers are of the smaller one.
     """
     sd = endpoint_sd(effect, reference)
     difference = _difference(effect, reference.mean, reference.slope)
-    per_arm = participants_needed(difference / sd, alpha, settings.power, MOST_PARTICIPANTS)
+    goal, ratio = settings.power, settings.allocation
+    per_arm = participants_needed(difference / sd, alpha, goal, MOST_PARTICIPANTS, ratio)
     ends = {}
     if confidence is not None:
-        if effect.kind == SLOWING and reference.slope_limits is not None:
-            low, high = reference.slope_limits
-            # Where the slope may be zero, no number is enough.
-            least = np.where(low * high > 0, np.minimum(abs(low), abs(high)), 0.0)
-            largest = np.maximum(abs(low), abs(high))
-            d = np.stack([largest, least]) * effect.share / sd
-        else:
-            tail = (1 - confidence) / 2
-            chi = stats.chi2.ppf(np.array([[1 - tail], [tail]]), reference.freedom)
-            d = difference / sd * np.sqrt(chi / reference.freedom)
-        low, high = participants_needed(d, alpha, settings.power, MOST_PARTICIPANTS)
+        d = difference / sd * _effect_limits(effect, reference, confidence)
+        low, high = participants_needed(d, alpha, goal, MOST_PARTICIPANTS, ratio)
         ends = {"per_arm_low": low, "per_arm_high": high}
+    larger = np.ceil(np.round(ratio * per_arm, 9))
     per_year = _YEAR if effect.visits else 1.0
     left = information_left(effect, reference, settings.dropout)
+    unequal = {"larger_arm": larger, "enrolled_larger_arm": np.ceil(np.round(larger / left, 9))}
     return {
         "n": reference.n,
         "mean": reference.mean,
@@ -115,8 +117,49 @@ def sample_size(
         "per_arm": per_arm,
         **ends,
         "enrolled_per_arm": np.ceil(np.round(per_arm / left, 9)),
-        "power": power_of(difference / sd, per_arm, alpha),
+        **(unequal if ratio > 1 else {}),
+        "power": power_of(difference / sd, per_arm, alpha, ratio),
     }
+
+
+def _effect_limits(effect: TrialEffect, reference: Reference, confidence: float) -> Float:
+    """Limits (2, points) of the effect size over its estimate, the better one first.
+
+    Limits of the mean or of the change, by t, and of the SD, by chi squared, are joined on the
+    scale of logarithms (Zou and Donner 2008). Where the change may be zero, the worse one is zero.
+    """
+    is_slowing = effect.kind == SLOWING
+    center = np.abs(
+        reference.slope if is_slowing and reference.slope is not None else reference.mean
+    )
+    limits = reference.slope_limits if is_slowing else reference.mean_limits
+    low, high = np.stack([center, center]) if limits is None else np.sort(np.abs(limits), axis=0)
+    if limits is not None:
+        low = np.where(limits[0] * limits[1] > 0, low, 0.0)
+    variance = _variance_limits(effect, reference, confidence)
+    with np.errstate(divide="ignore"):
+        parts = np.log(np.stack([high, low]) / center), np.log(variance) / 2
+    reach = np.hypot(*parts)
+    return np.asarray(np.exp([reach[0], -reach[1]]), dtype=np.float64)
+
+
+def _variance_limits(effect: TrialEffect, reference: Reference, confidence: float) -> Float:
+    """Limits (2, points) of the variance of the end point over its estimate, by chi squared.
+
+    The variance of slopes in the trial is the variance in the reference, plus the error of a slope
+    in the trial, minus this error in the reference; errors depend on the visits. Limits of such a
+    sum join the limits of its parts (Graybill and Wang 1980).
+    """
+    tails = np.array([[1 + confidence], [1 - confidence]]) / 2
+    within = reference.freedom / stats.chi2.ppf(tails, reference.freedom)
+    if not effect.visits or reference.slope_variance is None or reference.slope_freedom is None:
+        return np.asarray(within, dtype=np.float64)
+    observed = reference.slope_variance + reference.variance / reference.spread
+    change = reference.variance * (1 / effect.spread - 1 / reference.spread)
+    slopes = reference.slope_freedom / stats.chi2.ppf(tails, reference.slope_freedom)
+    reach = np.abs(change) * np.where(change < 0, within[::-1] - 1, within - 1)
+    reach = np.hypot(observed * (slopes - 1), reach) / (observed + change)
+    return np.stack([np.maximum(1 - reach[0], _LEAST_VARIANCE), 1 + reach[1]])
 
 
 def endpoint_sd(effect: TrialEffect, reference: Reference) -> Float:
@@ -156,11 +199,16 @@ def _difference(effect: TrialEffect, mean: Float, slope: Float | None) -> Float:
     return effect.share * np.abs(mean) / (effect.duration if effect.visits else 1.0)
 
 
-def power_of(d: Float, per_arm: Float, alpha: float) -> Float:
-    """Power of Student's two-sided t test of two groups of equal size, by its non-central form."""
+def power_of(d: Float, per_arm: Float, alpha: float, ratio: float = 1.0) -> Float:
+    """Power of Student's two-sided t test of two groups, by its non-central form.
+
+    The larger group has ``ratio`` times as many members as the smaller one, rounded up.
+    """
     ready = np.isfinite(d) & np.isfinite(per_arm) & (per_arm > 1)
     size = np.where(ready, per_arm, 2.0)
-    center, df = np.abs(np.where(ready, d, 0.0)) * np.sqrt(size / 2), 2 * size - 2
+    larger = np.ceil(np.round(ratio * size, 9))
+    weight, df = size * larger / (size + larger), size + larger - 2
+    center = np.abs(np.where(ready, d, 0.0)) * np.sqrt(weight)
     limit = stats.t.isf(alpha / 2, df)
     power = 1 - special.nctdtr(df, center, limit) + special.nctdtr(df, center, -limit)
     # SciPy has no value for some centers far beyond the limit, where power is 1.
@@ -168,14 +216,16 @@ def power_of(d: Float, per_arm: Float, alpha: float) -> Float:
     return np.where(ready, power, np.nan)
 
 
-def participants_needed(d: Float, alpha: float, power: float, limit: int) -> Float:
-    """Smallest number per arm that reaches a power, by halving; NaN beyond ``limit``."""
+def participants_needed(
+    d: Float, alpha: float, power: float, limit: int, ratio: float = 1.0
+) -> Float:
+    """Smallest number in the smaller arm that reaches a power, by halving; NaN beyond ``limit``."""
     d = np.asarray(d, dtype=np.float64)
     low, high = np.ones(d.shape), np.full(d.shape, float(limit))
-    is_enough = power_of(d, high, alpha) >= power
+    is_enough = power_of(d, high, alpha, ratio) >= power
     while (high - low > 1).any():
         middle = np.floor((low + high) / 2)
-        reached = power_of(d, middle, alpha) >= power
+        reached = power_of(d, middle, alpha, ratio) >= power
         low, high = np.where(reached, low, middle), np.where(reached, middle, high)
     return np.where(is_enough, high, np.nan)
 

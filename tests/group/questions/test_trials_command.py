@@ -147,6 +147,26 @@ def test_sample_size_of_one_visit(dataset, capsys):
     assert (record["formula"], record["rows"]) == ("1 + age + sex", PEOPLE)
 
 
+PLAIN_POWER = ("--align", "none", "--measures", "thickness_mean", "--power", "thinning=1%")
+
+
+def test_sample_sizes_of_unequal_arms(dataset):
+    equal = table(run(dataset, *PLAIN_POWER) / "power.tsv")
+    assert "larger_arm" not in equal
+    folder = run(dataset, *PLAIN_POWER, "--allocation", "1:2")
+    summary = table(folder / "power.tsv")
+    assert (summary["per_arm"] < equal["per_arm"]).all()
+    assert (summary["larger_arm"] == 2 * summary["per_arm"]).all()
+    first = summary.iloc[0]
+    exact = [
+        TTestIndPower().power(first["cohen_d"], n, 0.05, 2)
+        for n in (first["per_arm"] - 1, first["per_arm"])
+    ]
+    assert exact[0] < 0.8 <= exact[1]
+    assert "two arms allocated 2:1" in (folder / "methods.md").read_text()
+    assert "arms of sizes 2 to 1 (numbers of the smaller arm)" in group_page(folder)
+
+
 def test_sample_size_of_slowing_among_patients_draws_a_map(dataset):
     options = ["--power", "slowing=25%", "--visits", "0,12,24", "--among", "group=AD"]
     options += ["--measures", "thickness", "thickness_mean", "volume"]
@@ -249,6 +269,8 @@ def test_harmonization_of_the_settings_is_refused(dataset, tmp_path, capsys):
         (["--power", "thinning=5%", "--visits", "12,0"], 64, "in their order"),
         (["--power", "thinning=5%", "--visits", "12"], 64, "two or more"),
         (["--power", "thinning=5%", "--dropout", "1"], 64, "dropout"),
+        (["--power", "thinning=5%", "--allocation", "2:0"], 64, "2:1"),
+        (["--power", "thinning=5%", "--allocation", "40:1"], 64, "allocation"),
         (["--power", "thinning=5%", "--correction", "permutation-max"], 64, "fdr2 or bh"),
         (["--power", "thinning=5%", "--paired", "1", "2"], 64, "--paired: has no effect"),
         (["--retest", "--harmonize", "site"], 64, "--harmonize: has no effect with --retest"),

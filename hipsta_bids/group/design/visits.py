@@ -1,0 +1,47 @@
+"""Visits as categories: analyses of end points, and their contrasts."""
+
+from collections.abc import Sequence
+
+from hipsta_bids.errors import UsageError
+
+#: Column of visits as categories, by the labels of sessions.
+VISIT = "visit"
+#: Analyses of end points: adjusted for the baseline as a covariate, or with equal arms there.
+ENDPOINTS = ("ancova", "mmrm", "clda")
+#: Analysis, baseline, and a later session.
+_SHORTEST = 3
+
+
+def check_endpoint(endpoint: tuple[str, ...]) -> None:
+    """Refuse an unknown analysis, or sessions that it cannot have."""
+    sessions = endpoint[1:]
+    is_valid = endpoint[0] in ENDPOINTS and len(set(sessions)) == len(sessions)
+    if not is_valid or len(endpoint) < _SHORTEST:
+        raise UsageError(
+            f"--endpoint {' '.join(endpoint)}: give ancova, mmrm or clda, the session of the"
+            " baseline, and later sessions"
+        )
+    if endpoint[0] == "ancova" and len(endpoint) > _SHORTEST:
+        raise UsageError("--endpoint ancova has one later session; use mmrm for several")
+
+
+def visit_contrasts(
+    groups: Sequence[str], labels: Sequence[str], endpoint: tuple[str, ...] = ()
+) -> list[str]:
+    """Contrasts of visits as categories, from contrasts of groups.
+
+    Changes since the first visit; of end points, differences of groups at each later visit.
+    """
+    first, *after = labels
+    if not groups:
+        changes = (f"change to {one} = {VISIT}[{one}] - {VISIT}[{first}]" for one in after)
+        return [] if endpoint else list(changes)
+    if endpoint:
+        terms = {one: f"{VISIT}[{one}]" for one in (after if endpoint[0] == "clda" else labels)}
+    else:
+        terms = {f"change to {one}": f"({VISIT}[{one}] - {VISIT}[{first}])" for one in after}
+    pairs = [one.split(" = ") for one in groups]
+    return [
+        *([] if endpoint else groups),
+        *(f"{name} in {p} = ({d}):{term}" for name, term in terms.items() for p, d in pairs),
+    ]
