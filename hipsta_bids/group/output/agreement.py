@@ -12,9 +12,9 @@ from scipy import stats
 
 from hipsta_bids import __version__
 from hipsta_bids.geometry.surrogate import agreement
+from hipsta_bids.group.output.citations import Citations, code, escaped, joined
 from hipsta_bids.group.output.ground import Ground, read_grounds
 from hipsta_bids.group.output.maps import ContrastMap, read_tests
-from hipsta_bids.group.output.methods import Citations, code, escaped, joined
 from hipsta_bids.group.output.panels import Row
 from hipsta_bids.group.stats.inference import MapKey
 from hipsta_bids.reports import cells, display

@@ -1,6 +1,5 @@
 """A methods and results paragraph with the numbers of one analysis filled in."""
 
-import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -8,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 
 from hipsta_bids import __version__
-from hipsta_bids.derivatives.dataset import references
 from hipsta_bids.group.cohort.crop import REACH
 from hipsta_bids.group.cohort.data import SIZES, Cohort
 from hipsta_bids.group.cohort.read import LEAST_SHARE
 from hipsta_bids.group.design import settings as group_settings
 from hipsta_bids.group.design.contrasts import Contrast
 from hipsta_bids.group.design.model import interactions
+from hipsta_bids.group.output.citations import Citations, code, escaped, joined
 from hipsta_bids.group.output.results import Analysis
 from hipsta_bids.group.output.tables import summary_tests
 from hipsta_bids.group.stats import inference
@@ -25,18 +24,8 @@ from hipsta_bids.protocols import EXPERIMENTAL
 from hipsta_bids.reports.group_tables import opposite_changes
 from hipsta_bids.types import PARTICIPANT
 
-REFERENCES = "# References"
 #: Level at which slopes are said to differ.
 _LEVEL = 0.05
-
-#: What was measured, by region.
-_MEASURED = {
-    "body": "the hippocampal body",
-    "extended": "the hippocampal body and the neighboring cortex",
-    "entorhinal": "the cortex beside the hippocampal body",
-    "headbody": "the hippocampal head and body on one sheet (experimental)",
-    "whole": "the whole hippocampus on one sheet (experimental)",
-}
 
 #: Points that are one family of tests.
 _FAMILIES = {
@@ -50,48 +39,6 @@ PROCEDURES: Mapping[str, str] = {
     "bh": "the procedure of Benjamini and Hochberg",
     "fdr2": "the two-stage procedure of Benjamini, Krieger and Yekutieli",
 }
-
-
-#: Signs in a name that Markdown, or the HTML in it, would take for its own.
-_SIGNS = re.compile(r"([\\`*~<$]|\](?=\()|&(?=#?\w+;)|(?<!\w)_|_(?!\w))")
-
-
-def escaped(text: object) -> str:
-    """Escape a name, or a text with names, that Markdown should show as it is."""
-    return _SIGNS.sub(r"\\\1", " ".join(str(text).split()))
-
-
-def code(formula: str) -> str:
-    """Write a formula as Markdown's code; it may have backticks."""
-    return f"`` {formula} ``" if "`" in formula else f"`{formula}`"
-
-
-def joined(names: Sequence[str]) -> str:
-    """Join names as a sentence does."""
-    return " and ".join(filter(None, [", ".join(names[:-1]), *names[-1:]]))
-
-
-class Citations:
-    """Numbers works in the order of the text."""
-
-    def __init__(self) -> None:
-        self._keys: list[str] = []
-
-    def __call__(self, key: str) -> str:
-        """Return the number of a work in brackets."""
-        if key not in self._keys:
-            self._keys.append(key)
-        return f"[{self._keys.index(key) + 1}]"
-
-    def page(self, paragraphs: Sequence[str], region: str = "body") -> str:
-        """Return the text with its references; the first paragraph names the region."""
-        region_text = _MEASURED["body"]
-        first = paragraphs[0].replace(region_text, _MEASURED.get(region, region_text), 1)
-        bibliography = references()
-        works = "\n".join(f"{i}. {bibliography[key]}" for i, key in enumerate(self._keys, start=1))
-        use = "This text may be used freely, as it stands or changed."
-        parts = ["# Methods and findings", use, first, *paragraphs[1:], REFERENCES, works]
-        return "\n\n".join(parts) + "\n"
 
 
 def methods_text(

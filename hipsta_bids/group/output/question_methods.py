@@ -6,7 +6,8 @@ import pandas as pd
 
 from hipsta_bids import __version__
 from hipsta_bids.group.design import settings as group_settings
-from hipsta_bids.group.output.methods import PROCEDURES, Citations, escaped
+from hipsta_bids.group.output.citations import Citations, escaped
+from hipsta_bids.group.output.methods import PROCEDURES
 from hipsta_bids.group.output.saved import NormsFile
 from hipsta_bids.group.stats.norms import CENTILE_FOLDS, LEVELS, SHAPE_LEVEL
 from hipsta_bids.group.stats.trials import THINNING, TrialEffect, point_level

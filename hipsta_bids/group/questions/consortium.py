@@ -15,9 +15,10 @@ from hipsta_bids.errors import OutputError, UsageError
 from hipsta_bids.group.cohort.data import Cohort
 from hipsta_bids.group.design.settings import GroupSettings
 from hipsta_bids.group.output import write
+from hipsta_bids.group.output.citations import Citations, code, escaped
 from hipsta_bids.group.output.ground import grounds_of
 from hipsta_bids.group.output.maps import ContrastMap, contrasts
-from hipsta_bids.group.output.methods import Citations, code, discovery_text, escaped
+from hipsta_bids.group.output.methods import discovery_text
 from hipsta_bids.group.output.panels import Row, draw_pages
 from hipsta_bids.group.output.style import Drawing
 from hipsta_bids.group.output.tables import META_COLUMNS

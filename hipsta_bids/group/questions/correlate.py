@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from hipsta_bids.errors import InputError, UsageError, did_you_mean, in_python
 from hipsta_bids.group.output import style, write
-from hipsta_bids.group.output.methods import Citations, escaped
+from hipsta_bids.group.output.citations import Citations, escaped
 from hipsta_bids.group.output.tables import CORRELATION_COLUMNS
 from hipsta_bids.group.stats.arrays import Float
 from hipsta_bids.group.stats.correlation import correlate_maps

@@ -18,9 +18,9 @@ from hipsta_bids.group.design.formula import check_names, level_labels, listed, 
 from hipsta_bids.group.design.model import BOTH, FIRST_AGE, Comparison
 from hipsta_bids.group.design.settings import GroupSettings, NormSettings
 from hipsta_bids.group.output import write
+from hipsta_bids.group.output.citations import escaped
 from hipsta_bids.group.output.figures import deviation_rows, draw_norms, norm_rows
 from hipsta_bids.group.output.ground import grounds_of
-from hipsta_bids.group.output.methods import escaped
 from hipsta_bids.group.output.panels import draw_pages
 from hipsta_bids.group.output.question_methods import norms_text
 from hipsta_bids.group.output.results import ScoredMaps

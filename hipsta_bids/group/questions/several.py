@@ -12,7 +12,7 @@ from hipsta_bids.errors import MissingFileError, ModelError, OutputError, UsageE
 from hipsta_bids.group.design.settings import GroupSettings
 from hipsta_bids.group.output import agreement, write
 from hipsta_bids.group.output.agreement import Entry
-from hipsta_bids.group.output.methods import joined
+from hipsta_bids.group.output.citations import joined
 from hipsta_bids.group.output.panels import draw_pages
 from hipsta_bids.group.output.tables import COMPARISON_COLUMNS
 from hipsta_bids.group.questions.compare import run_group

@@ -22,7 +22,7 @@ from hipsta_bids.group.design import model as designs
 from hipsta_bids.group.design.formula import ascii_letters, check_names, listed, with_factors
 from hipsta_bids.group.design.settings import GroupSettings
 from hipsta_bids.group.output import write
-from hipsta_bids.group.output.methods import REFERENCES
+from hipsta_bids.group.output.citations import REFERENCES
 from hipsta_bids.group.output.results import templates_of
 from hipsta_bids.group.output.saved import templates_from_json
 from hipsta_bids.group.output.tables import registration_tables

@@ -19,13 +19,14 @@ from hipsta_bids.group.design import model as designs
 from hipsta_bids.group.design.formula import listed, model_from_shortcut, parse_model
 from hipsta_bids.group.design.settings import GlmSettings, GroupSettings, RetestSettings
 from hipsta_bids.group.output import write
+from hipsta_bids.group.output.citations import Citations, code, escaped
 from hipsta_bids.group.output.columns import frame_of
 from hipsta_bids.group.output.ground import grounds_of
-from hipsta_bids.group.output.methods import Citations, code, escaped
-from hipsta_bids.group.output.panels import Row, draw_pages, spanned
+from hipsta_bids.group.output.panels import draw_pages
 from hipsta_bids.group.output.question_methods import power_text, retest_text
 from hipsta_bids.group.output.style import Drawing
 from hipsta_bids.group.output.tables import entity_label
+from hipsta_bids.group.output.trial_figures import agreement_rows, size_rows
 from hipsta_bids.group.questions import study as studies
 from hipsta_bids.group.questions.mixing import with_mixes
 from hipsta_bids.group.stats import glm, trials
@@ -34,11 +35,9 @@ from hipsta_bids.group.stats.glm import FittedMaps, PointwiseFit, RowModel, fit_
 from hipsta_bids.group.stats.mixed import longitudinal_model
 from hipsta_bids.io import files, gifti
 from hipsta_bids.progress import tell
-from hipsta_bids.reports.cells import display_name, with_brackets
+from hipsta_bids.reports.cells import display_name
 from hipsta_bids.types import PARTICIPANT, SESSION
 
-#: Ticks of numbers of participants.
-_COUNTS = tuple(n * 10**power for power in range(5) for n in (1, 2, 3, 5))
 #: Months per unit of columns of time with these names.
 _MONTHS = {"years": 12.0, "months": 1.0, "days": 12 / 365.25}
 #: Sessions that tell a participant's change from noise.
@@ -509,51 +508,15 @@ def _figures(
     """List the figures of each map by name."""
     maps = [result for result in results if result.points is not None]
     for surface, measure in dict.fromkeys((r.layer.surface, r.layer.measure) for r in maps):
-        for question, make in (("retest", _agreement), ("power", _sizes)):
+        for question, make in (("retest", agreement_rows), ("power", size_rows)):
             sides = {
                 r.layer.hemi: r
                 for r in maps
                 if (r.layer.surface, r.layer.measure) == (surface, measure) and question in r.tables
             }
             unit = cohorts[surface].units.get(measure, "1")
-            if rows := list(make(sides, display_name(measure), unit)):
+            tables = {hemi: result.tables[question] for hemi, result in sides.items()}
+            if rows := list(make(tables, display_name(measure), unit)):
                 points = {hemi: r.points for hemi, r in sides.items() if r.points is not None}
                 grounds = grounds_of(cohorts[surface], points)
                 yield f"{measure}_{question}", partial(draw_pages, grounds, [rows])
-
-
-def _agreement(sides: Mapping[str, Described], measure: str, unit: str) -> Iterator[Row]:
-    """Show agreement between sessions."""
-    if sides:
-        within, icc = (_values(sides, "retest", name) for name in ("sd_within", "icc"))
-        title = "Within-subject SD"
-        label = with_brackets(f"within-subject SD,\n{measure}", unit)
-        scale = spanned("magma", within)
-        yield Row(kind="error", index=0, title=title, label=label, scale=scale, values=within)
-        title = "ICC(2,1)"
-        scale = {"cmap": "viridis", "vmin": 0.0, "vmax": 1.0}
-        yield Row(kind="agreement", index=0, title=title, label=title, scale=scale, values=icc)
-
-
-def _sizes(sides: Mapping[str, Described], measure: str, _: str) -> Iterator[Row]:
-    """Show participants per arm, by their logarithm."""
-    values = {hemi: np.log10(n) for hemi, n in _values(sides, "power", "per_arm").items()}
-    if any(np.isfinite(n).any() for n in values.values()):
-        scale = spanned("viridis_r", values)
-        ticks = [n for n in _COUNTS if scale["vmin"] <= np.log10(n) <= scale["vmax"]]
-        yield Row(
-            kind="size",
-            index=0,
-            title="Participants per arm",
-            label=f"participants per arm,\n{measure}",
-            scale=scale,
-            values=values,
-            ticks={float(np.log10(n)): f"{n:,}" for n in ticks},
-        )
-
-
-def _values(sides: Mapping[str, Described], question: str, column: str) -> dict[str, Float]:
-    return {
-        hemi: np.asarray(result.tables[question][column], dtype=np.float64)
-        for hemi, result in sides.items()
-    }

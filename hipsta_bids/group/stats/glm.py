@@ -1,13 +1,12 @@
 """The general linear model at every point of a map, and for single measures."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy import special
 from scipy.linalg import block_diag
-from scipy.optimize import elementwise
 from statsmodels.regression.linear_model import OLS
 
 from hipsta_bids.errors import ModelError
@@ -17,6 +16,7 @@ from hipsta_bids.group.design.settings import GlmSettings
 from hipsta_bids.group.stats import arrays
 from hipsta_bids.group.stats.arrays import Bool, Float, Int, SideMaps
 from hipsta_bids.group.stats.exchangeability import Visits
+from hipsta_bids.group.stats.limits import f_limits, t_limits
 
 #: Points are left out where the missing values take away all but this fraction of what the data
 #: say about a direction of the coefficients.
@@ -26,59 +26,6 @@ MIN_INFORMATION = 1e-8
 MEAN = "mean"
 #: Values in memory at once; bounds the temporaries, and does not change a result.
 _CHUNK = 4_000_000
-#: SciPy's inverse is exact to some 1e-5 only; the root is looked for this far around it.
-_BRACKET = 0.01
-#: SciPy's inverse for F goes no farther than 10000; beyond it the root is looked for between a
-#: tenth of this and this many times the numerator's sum.
-_FARTHEST, _WIDEST = 9990.0, 20.0
-
-
-def t_limits(t: Float, df: Float, confidence: float) -> tuple[Float, Float]:
-    """Limits of the non-centrality of t statistics (Steiger 2004).
-
-    At the lower and upper limit, ``t`` is the upper and lower ``(1 - confidence) / 2`` quantile.
-    """
-    tail = (1 - confidence) / 2
-
-    def limit(probability: float) -> Float:
-        def excess(center: Float, t: Float, df: Float) -> Float:
-            return np.asarray(special.nctdtr(df, center, t) - probability)
-
-        return _root(excess, special.nctdtrinc(df, probability, t), t, df)
-
-    return limit(1 - tail), limit(tail)
-
-
-def f_limits(f: Float, df1: int, df2: Float, confidence: float) -> tuple[Float, Float]:
-    """Limits of the non-centrality of F statistics, as :func:`t_limits`."""
-    tail = (1 - confidence) / 2
-    first = float(df1)
-
-    def limit(probability: float) -> Float:
-        def excess(center: Float, f: Float, df: Float) -> Float:
-            at = np.maximum(center, 0.0)
-            return np.asarray(special.ncfdtr(first, df, at, f) - probability)
-
-        reachable = special.fdtr(first, df2, f) > probability
-        inside = np.where(reachable, f, np.nan)
-        start = special.ncfdtrinc(first, df2, probability, inside)
-        root = np.maximum(_root(excess, start, inside, df2), 0.0)
-        far = start >= _FARTHEST
-        if far.any():
-            wide = (np.full(far.sum(), _FARTHEST / 10), _WIDEST * first * inside[far])
-            found = elementwise.find_root(excess, wide, args=(inside[far], df2[far]))
-            root[far] = np.where(found.success, found.x, np.nan)
-        return np.where(reachable | np.isnan(f), root, 0.0)
-
-    return limit(1 - tail), limit(tail)
-
-
-def _root(function: Callable[..., Float], near: ArrayLike, statistic: Float, df: Float) -> Float:
-    """Polish approximate roots; keep those that cannot be bracketed."""
-    start: Float = np.asarray(near, dtype=np.float64)
-    reach = _BRACKET * (1 + np.abs(start))
-    root = elementwise.find_root(function, (start - reach, start + reach), args=(statistic, df))
-    return np.where(root.success, root.x, start)
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,8 @@ from scipy import stats
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.design.contrasts import Contrast
 from hipsta_bids.group.design.settings import GlmSettings
-from hipsta_bids.group.stats.glm import f_limits, fit_measures, fit_points, t_limits
+from hipsta_bids.group.stats.glm import fit_measures, fit_points
+from hipsta_bids.group.stats.limits import f_limits, t_limits
 
 SETTINGS = GlmSettings()
 HC3 = GlmSettings(covariance="hc3")
