@@ -113,6 +113,7 @@ def _add_processing(parser: Parser) -> None:
     add("--method", "NAME", choices=("default", "published"))
     add("--x-coordinate", "NAME", choices=("midsurface", "volume"))
     add("--ends", "FILE.tsv")
+    add("--longitudinal", "", nargs="?", const="auto", choices=["auto", "shared"])
     add("--write-meshes")
     add("--uncertainty", "K", type=_copies, default=0)
     add("--force")
@@ -215,6 +216,8 @@ def _run(options: "Namespace", arguments: Sequence[str]) -> ExitCode:
         console.echo(f"part {options.shard.name} of the dataset has nothing to process")
         return ExitCode.OK
     items, end_notes = attach_ends(findings.items, options.ends)
+    if settings.sheet.frame != "visit" and not any(item.session for item in items):
+        raise UsageError("--longitudinal: no segmentation has a session; name the visits (ses-)")
     items, map_notes = attach(items, requests, options.roi, options.bids_dir)
     notes = (
         *search.dataset_notes(request, items),
@@ -276,10 +279,15 @@ def _settings(options: "Namespace") -> "Settings":
 
     preset = PUBLISHED if options.method == "published" else {}
     settings = load_settings(options.settings).changed(**preset)
-    return settings.changed(
+    frames = {"auto": "person", "shared": "shared", None: None}
+    sheet = {"x_coordinate": options.x_coordinate, "frame": frames[options.longitudinal]}
+    settings = settings.changed(
         body={"region": options.region} if options.region else {},
-        sheet={"x_coordinate": options.x_coordinate} if options.x_coordinate else {},
+        sheet={name: value for name, value in sheet.items() if value},
     )
+    if settings.sheet.frame != "visit" and (settings.body.region != "body" or options.uncertainty):
+        raise UsageError("--longitudinal measures the body; omit --region and --uncertainty")
+    return settings
 
 
 def _find(

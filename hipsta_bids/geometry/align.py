@@ -186,7 +186,9 @@ def _smooth(volume: LabelVolume, sigma: float) -> _Image:
     affine = digital.affine_of(
         volume.affine[:3, :3] * size, volume.affine[:3, :3] @ first + volume.affine[:3, 3]
     )
-    return _Image(channels=channels, to_index=np.linalg.inv(affine), order=order)
+    return _Image(
+        channels=channels, to_index=np.asarray(np.linalg.inv(affine), dtype=np.float64), order=order
+    )
 
 
 def _averaged(mask: Bool, size: NDArray[np.intp]) -> NDArray[np.float32]:

@@ -56,7 +56,8 @@ def find_walls(sheet: Sheet, motion: Float, field: Field) -> Walls:
     points, depth = _continued(sheet)
     nodes = field.grid.to_nodes(to_ras(points.reshape(-1, 3), motion))
     values = ndimage.map_coordinates(field.values, nodes.T, order=3, mode="nearest")
-    low, high = _piece(values.reshape(depth.shape), depth)
+    at_nodes = np.asarray(values, dtype=np.float64).reshape(depth.shape)
+    low, high = _piece(at_nodes, depth)
     moves = np.stack([low, high - _length(sheet)], axis=-1)
     moves = np.where(np.abs(moves) <= FARTHEST, moves, np.nan)
     if not np.isfinite(moves).all(axis=-1).any():
