@@ -14,6 +14,8 @@ from hipsta_bids.derivatives.names import HemisphereName
 from hipsta_bids.errors import ExitCode
 from hipsta_bids.io import files
 from hipsta_bids.phantom import Hemisphere, PhantomSpec, write_dataset
+from hipsta_bids.reports.cohort import read_cohort
+from hipsta_bids.reports.participant import participant_page
 
 SEG = "freesurfer"
 THICKNESS = {"1": 2.0, "2": 1.9, "3": 1.8}
@@ -74,6 +76,7 @@ def test_each_visit_has_the_files_of_a_visit_alone(data, out, tmp_path):
     separate = tmp_path / "alone"
     assert main.main(list(map(str, [data, separate, "participant", *options]))) == ExitCode.OK
     folder = "sub-01/ses-1/anat"
+    assert "Visits on one sheet" not in participant_page(separate, "01", "1", read_cohort(separate))
     single, shared = ({p.name for p in (root / folder).iterdir()} for root in (separate, out))
     assert single <= shared
     assert {name.split("_desc-")[1] for name in shared - single} == {
@@ -130,6 +133,18 @@ def test_the_template_is_no_visit(out):
     rows = files.read_tsv(out / "status.tsv")
     assert [row["session"] for row in rows] == [f"ses-{session}" for session in THICKNESS]
     assert all(float(row["seconds_template"]) > 0 for row in rows)
+
+
+def test_pages_show_all_visits_on_the_same_columns(out):
+    page = participant_page(out, "01", "2", read_cohort(out))
+    assert "Visits on one sheet" in page
+    maps = [thickness(out, session) for session in THICKNESS]
+    for number, session in enumerate(THICKNESS):
+        change = maps[number].mean() - np.mean(maps)
+        words = f"left, ses-{session} mean {change:.3f}"
+        # Of maps in single precision, and of a table with four decimals.
+        near = [f"left, ses-{session} mean {change + step:.3f}" for step in (-1e-4, 1e-4)]
+        assert any(text in page for text in (words, *near))
 
 
 def test_methods_describe_the_common_sheet(out):
