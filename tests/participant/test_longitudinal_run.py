@@ -178,6 +178,29 @@ def test_a_visit_that_cannot_be_read_fails_alone(data, tmp_path):
     assert [rows[f"ses-{n}"]["decision"] for n in "123"] == ["use", "use", "failed"]
 
 
+@pytest.mark.parametrize("way", ["folders", "option"])
+def test_visits_that_share_a_space_are_not_aligned(data, tmp_path, way):
+    shutil.copytree(data, tmp_path / "data")
+    folder = tmp_path / "data" / "derivatives" / SEG
+    shutil.rmtree(folder / "sub-01_ses-3")
+    if way == "folders":  # FreeSurfer's longitudinal stream
+        for session in "12":
+            path = folder / f"sub-01_ses-{session}"
+            path.rename(path.with_name(f"{path.name}.long.sub-01"))
+    # The second visit is moved back to the first one, but for half a millimeter.
+    for path in folder.glob("sub-01_ses-2*/mri/*.mgz"):
+        image = nib.load(path)
+        shift = np.eye(4)
+        shift[0, 3] = 0.5
+        back = shift @ pose(0) @ np.linalg.inv(pose(1))
+        nib.save(type(image)(np.asarray(image.dataobj), back @ image.affine), path)
+    out = tmp_path / "out"
+    options = ["--longitudinal", "shared"] if way == "option" else []
+    assert run(tmp_path / "data", out, *options) == ExitCode.OK
+    motions = files.read_json(place(out, None).path("template_qc"))["motions"]
+    assert motions[0]["frame_to_visit"] == motions[1]["frame_to_visit"]
+
+
 def test_a_folder_holds_one_kind_of_maps(data, out, capsys):
     options = ["--settings", data / "coarse.toml", "--no-reports"]
     code = main.main(list(map(str, [data, out, "participant", *options])))
