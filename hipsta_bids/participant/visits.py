@@ -16,7 +16,7 @@ from hipsta_bids.inputs.scan import HemisphereInput
 from hipsta_bids.io import files
 from hipsta_bids.participant import job as one_job
 from hipsta_bids.participant.job import CostClock, Job, Measure, Outcome, fail, finished
-from hipsta_bids.types import HemisphereMaps
+from hipsta_bids.types import HemisphereMaps, LabelVolume
 
 
 def side(item: HemisphereInput) -> tuple[str, str, str]:
@@ -73,6 +73,7 @@ def _measure_visits(jobs: tuple[Job, ...]) -> list[Outcome]:
     except Exception as error:  # noqa: BLE001  (each visit reports it)
         problem = error
     spent = clock.spent()
+    thick = _thick(usable, volumes)
     measured: dict[str | None, HemisphereMaps] = {}
 
     def measure(job: Job) -> Measure:
@@ -88,7 +89,7 @@ def _measure_visits(jobs: tuple[Job, ...]) -> list[Outcome]:
     outcomes = []
     for job in jobs:
         renewal = _renewal(job)
-        notes = (*job.item.notes, renewal) if renewal else job.item.notes
+        notes = (*job.item.notes, *thick, *([renewal] if renewal else []))
         noted = replace(job, item=replace(job.item, notes=notes))
         outcome = replace(one_job.measure_job(noted, measure(job)), renewal=renewal)
         outcomes.append(_with_cost(outcome, spent, len(jobs)))
@@ -114,6 +115,19 @@ def _measure_visits(jobs: tuple[Job, ...]) -> list[Outcome]:
                 change = measured[job.item.session].thickness - thickness.mean(axis=0)
                 template.write_change(job.result, change, record)
     return outcomes
+
+
+def _thick(jobs: Sequence[Job], volumes: Sequence[LabelVolume]) -> list[str]:
+    """Note visits in thick slices, of which a common sheet does not lower all noise."""
+    from hipsta_bids.geometry.slices import has_thick_slices  # noqa: PLC0415  (workers only)
+
+    sessions = [
+        str(job.item.session)
+        for job, volume in zip(jobs, volumes, strict=True)
+        if has_thick_slices(volume.affine, job.settings.slices)
+    ]
+    text = "thick slices: a common sheet does not lower noise of the mean thickness (sessions {})"
+    return [text.format(", ".join(sessions))] if sessions else []
 
 
 def _with_cost(outcome: Outcome, spent: dict[str, Any], count: int) -> Outcome:

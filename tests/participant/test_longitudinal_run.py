@@ -201,6 +201,19 @@ def test_visits_that_share_a_space_are_not_aligned(data, tmp_path, way):
     assert motions[0]["frame_to_visit"] == motions[1]["frame_to_visit"]
 
 
+def test_visits_in_thick_slices_get_a_note(tmp_path):
+    bodies = [
+        Hemisphere(subject=f"01_ses-{n}", hemi="L", spec=PhantomSpec(length=16.0), pose=pose(0))
+        for n in "12"
+    ]
+    voxels = (0.5, 2.0, 0.5)
+    write_dataset(tmp_path / "data", bodies, layouts=(SEG,), voxel_size=voxels, axes="LAI")
+    (tmp_path / "data" / "coarse.toml").write_text("[grid]\nspacing = 0.5\n")
+    assert run(tmp_path / "data", tmp_path / "out") == ExitCode.OK
+    notes = read_record(place(tmp_path / "out", "2"))["notes"]
+    assert any(note.startswith("thick slices") and "sessions 1, 2" in note for note in notes)
+
+
 def test_a_folder_holds_one_kind_of_maps(data, out, capsys):
     options = ["--settings", data / "coarse.toml", "--no-reports"]
     code = main.main(list(map(str, [data, out, "participant", *options])))
