@@ -216,8 +216,6 @@ def _run(options: "Namespace", arguments: Sequence[str]) -> ExitCode:
         console.echo(f"part {options.shard.name} of the dataset has nothing to process")
         return ExitCode.OK
     items, end_notes = attach_ends(findings.items, options.ends)
-    if settings.sheet.frame != "visit" and not any(item.session for item in items):
-        raise UsageError("--longitudinal: no segmentation has a session; name the visits (ses-)")
     items, map_notes = attach(items, requests, options.roi, options.bids_dir)
     notes = (
         *search.dataset_notes(request, items),

@@ -11,7 +11,7 @@ import numpy as np
 from hipsta_bids import __version__
 from hipsta_bids.derivatives import template
 from hipsta_bids.derivatives.hemisphere import read_record
-from hipsta_bids.errors import HipstaError, InputError, OutputError
+from hipsta_bids.errors import HipstaError, InputError, OutputError, UsageError
 from hipsta_bids.inputs.scan import HemisphereInput
 from hipsta_bids.io import files
 from hipsta_bids.participant import job as one_job
@@ -32,6 +32,8 @@ def by_side(jobs: Iterable[Job]) -> list[tuple[Job, ...]]:
 
 def share_sheets(jobs: Sequence[Job]) -> list[Job]:
     """Add to each hemisphere all visits that share its sheet."""
+    if not any(job.item.session for job in jobs):
+        raise UsageError("--longitudinal: no segmentation has a session; name the visits (ses-)")
     usable = [[job.item for job in unit if job.item.problem is None] for unit in by_side(jobs)]
     visits = {side(items[0]): tuple(items) for items in usable if items}
     return [replace(job, visits=visits.get(side(job.item), ())) for job in jobs]

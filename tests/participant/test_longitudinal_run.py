@@ -201,6 +201,14 @@ def test_visits_that_share_a_space_are_not_aligned(data, tmp_path, way):
     assert motions[0]["frame_to_visit"] == motions[1]["frame_to_visit"]
 
 
+def test_a_dataset_without_sessions_is_refused(tmp_path, capsys):
+    body = Hemisphere(subject="01", hemi="L", spec=PhantomSpec(length=12.0))
+    write_dataset(tmp_path / "data", [body], layouts=(SEG,), voxel_size=(0.6, 0.6, 0.6))
+    (tmp_path / "data" / "coarse.toml").write_text("[grid]\nspacing = 0.5\n")
+    assert run(tmp_path / "data", tmp_path / "out") == ExitCode.USAGE
+    assert "no segmentation has a session" in capsys.readouterr().err
+
+
 def test_visits_in_thick_slices_get_a_note(tmp_path):
     bodies = [
         Hemisphere(subject=f"01_ses-{n}", hemi="L", spec=PhantomSpec(length=16.0), pose=pose(0))
