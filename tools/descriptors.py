@@ -75,6 +75,10 @@ def merge_inputs(levels: Mapping[str, Sequence[Entry]]) -> list[Entry]:
     for level, inputs in levels.items():
         for entry in inputs:
             kind = {key: value for key, value in entry.items() if key != "description"}
+            choices = merged.get(entry["id"], {}).get("value-choices")
+            if choices and kind.get("value-choices"):  # words of either level
+                words = list(dict.fromkeys([*choices, *kind["value-choices"]]))
+                merged[entry["id"]]["value-choices"] = kind["value-choices"] = words
             if merged.setdefault(entry["id"], kind) != kind:
                 raise ValueError(f"{entry['id']}: the levels give it different kinds of value")
             texts.setdefault(entry["id"], {})[level] = entry["description"]

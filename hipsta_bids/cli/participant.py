@@ -113,6 +113,7 @@ def _add_processing(parser: Parser) -> None:
     add("--method", "NAME", choices=("default", "published"))
     add("--x-coordinate", "NAME", choices=("midsurface", "volume"))
     add("--ends", "FILE.tsv")
+    add("--longitudinal", "", nargs="?", const="auto", choices=["auto", "shared"])
     add("--write-meshes")
     add("--uncertainty", "K", type=_copies, default=0)
     add("--force")
@@ -276,10 +277,15 @@ def _settings(options: "Namespace") -> "Settings":
 
     preset = PUBLISHED if options.method == "published" else {}
     settings = load_settings(options.settings).changed(**preset)
-    return settings.changed(
+    frames = {"auto": "person", "shared": "shared", None: None}
+    sheet = {"x_coordinate": options.x_coordinate, "frame": frames[options.longitudinal]}
+    settings = settings.changed(
         body={"region": options.region} if options.region else {},
-        sheet={"x_coordinate": options.x_coordinate} if options.x_coordinate else {},
+        sheet={name: value for name, value in sheet.items() if value},
     )
+    if settings.sheet.frame != "visit" and (settings.body.region != "body" or options.uncertainty):
+        raise UsageError("--longitudinal measures the body; omit --region and --uncertainty")
+    return settings
 
 
 def _find(

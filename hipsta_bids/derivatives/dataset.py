@@ -336,6 +336,7 @@ def citation_text(
         operator=about["operator"][settings.boundaries.operator],
         edges=about["edges"][settings.boundaries.edges],
         x_coordinate=about["x_coordinate"][sheet.x_coordinate],
+        frame=about["frame"][sheet.frame],
         nodes=f"{sheet.x_nodes} x {sheet.y_nodes} x {sheet.z_nodes}",
         order=settings.measures.curvature_order,
         window=settings.measures.curvature_window,

@@ -263,7 +263,7 @@ def write_results(
         _write_layers(result, maps.layers)
         files.write_bytes(result.path("mesh"), gifti.mesh_bytes(maps.mesh, maps.coordinates))
     write_more()
-    _write_sources(result, record)
+    write_sources(result, record)
     undefined = int(np.isnan(maps.sheet.points[:, :, [0, -1]]).any(axis=(2, 3)).sum())
     decision, reason, message = verdict(maps)
     files.write_json(
@@ -281,10 +281,10 @@ def write_results(
     )
 
 
-def _write_sources(result: ResultPlace, record: Mapping[str, Any]) -> None:
-    """Write beside the images that are there what they come from.
+def write_sources(result: ResultPlace, record: Mapping[str, Any]) -> None:
+    """Write sidecars with the sources of the images of a hemisphere.
 
-    What else is to be said is in the root of the dataset, but for images that few datasets have.
+    Their other entries are in the root of the dataset, except for images that few datasets have.
     """
     for row in (*OUTPUTS, *EXTRA_OUTPUTS):
         if any(result.path(image.key).exists() for image in row.images):
@@ -349,7 +349,7 @@ def write_failure(
     remove_results(result)
     if body is not None:
         files.write_bytes(result.path("body_mask"), mask_bytes(body))
-        _write_sources(result, record)
+        write_sources(result, record)
     ending = {"decision": Decision.FAILED, "reason": error.reason, "message": str(error)}
     files.write_json(result.path("qc"), ending | dict(record))
 

@@ -179,6 +179,24 @@ _HEADS = tuple(
     _output(key, "morph", ".shape.gii", unit="1", desc=key)
     for key in ("distortion", "proximodistal")
 )
+_CHANGE = _output("change", "morph", ".shape.gii", unit="mm", desc="thicknessChange")
+#: Of the sheet that all visits of a participant share, in the folder of the participant.
+_TEMPLATE = (
+    *(
+        Output(
+            f"template_{name}",
+            name,
+            ".surf.gii",
+            f"{name} {_ABOUT['template_surface']}",
+            unit="mm",
+            desc="longitudinal",
+        )
+        for name in ("interior", "midthickness", "exterior")
+    ),
+    _output("template_thickness", "thickness", ".shape.gii", unit="mm", desc="longitudinal"),
+    _output("template_sd", "morph", ".shape.gii", unit="mm", desc="longitudinalSd"),
+    _output("template_mask", "mask", ".nii.gz", desc="longitudinal"),
+)
 _SAMPLED = {"table": ".tsv", "sidecar": ".json", "shape": ".shape.gii", "series": ".func.gii"}
 
 #: Files of one hemisphere that come with an option or another command. A ``*`` stands for the name
@@ -193,6 +211,11 @@ EXTRA_OUTPUTS: tuple[Output, ...] = (
     *_HEADS,
     *_sidecars(_HEADS),
     *_table("surrogate", called="that table"),
+    _CHANGE,
+    *_sidecars([_CHANGE]),
+    *_TEMPLATE,
+    *_sidecars(_TEMPLATE),
+    _output("template_qc", "metrics", ".json", desc="longitudinal"),
 )
 
 #: Files of the whole dataset, by the name of what they hold.
@@ -351,6 +374,6 @@ def _by_name(sidecar: Output, text_of: Callable[[Output], str]) -> str:
 
 
 def sources(record: Mapping[str, Any]) -> list[str]:
-    """List the inputs of a quality record, edited ones included, as BIDS addresses."""
-    entries = [*(record.get("inputs") or ()), *(record.get("edited") or ())]
+    """List the inputs of a quality record, with edits and other visits, as BIDS addresses."""
+    entries = [entry for key in ("inputs", "edited", "visits") for entry in record.get(key) or ()]
     return list(dict.fromkeys(str(entry["file"]) for entry in entries))

@@ -16,7 +16,7 @@ from hipsta_bids.geometry import measures
 from hipsta_bids.geometry.body import Body
 from hipsta_bids.protocols.protocol import Tissue
 from hipsta_bids.settings import Settings
-from hipsta_bids.types import Bool, Float, Sheet, Surface, TetMesh
+from hipsta_bids.types import Bool, Float, Sheet, TetMesh
 
 DIERS = "Diers et al. 2023, NeuroImage 276:120182, section 2.2"
 DO_CARMO = "do Carmo 1976, Differential Geometry of Curves and Surfaces, section 3.3"
@@ -28,7 +28,6 @@ class Measured:
     """One hemisphere's body and sheet, and what several measures share."""
 
     body: Body
-    surface: Surface
     mesh: TetMesh
     sheet: Sheet
     """Sheet on which maps are measured."""

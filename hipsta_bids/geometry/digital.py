@@ -44,6 +44,13 @@ def to_ras(index: Index | Float, affine: NDArray[np.floating]) -> Float:
     return np.asarray(index @ affine[:3, :3].T + affine[:3, 3])
 
 
+def affine_of(matrix: NDArray[np.floating], shift: NDArray[np.floating]) -> Float:
+    """Combine a matrix (3, 3) and a shift (3,) to an affine (4, 4)."""
+    affine = np.eye(4)
+    affine[:3, :3], affine[:3, 3] = matrix, shift
+    return affine
+
+
 def positions(mask: Bool) -> Index:
     """Find the indices (N, 3) of a mask's voxels, in order, in a quarter of np.argwhere's time."""
     return np.array(np.unravel_index(np.flatnonzero(mask), mask.shape)).T

@@ -7,7 +7,7 @@ import resource
 import sys
 import time
 import traceback
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -32,7 +32,7 @@ from hipsta_bids.participant.maps import (
 )
 from hipsta_bids.protocols.load import for_region
 from hipsta_bids.settings import Settings
-from hipsta_bids.types import BodyMask, Decision, HemisphereMaps
+from hipsta_bids.types import BodyMask, Decision, HemisphereMaps, LabelVolume
 
 if TYPE_CHECKING:
     from hipsta_bids.participant.uncertainty import Uncertainty
@@ -54,6 +54,8 @@ class Job:
     sources: tuple[tuple[str, Path], ...]
     """Input datasets by name."""
     write_meshes: bool
+    visits: tuple[HemisphereInput, ...] = ()
+    """All visits that share a sheet, this one included; none if it has its own sheet."""
     copies: int = 0
     """Perturbed copies from which uncertainty is estimated; 0 for none."""
     force: bool = False
@@ -81,6 +83,8 @@ class Outcome:
     """Set if it failed for a foreseen reason."""
     trace: str | None = None
     """Set if it failed by a bug."""
+    renewal: str | None = None
+    """Set if it was measured before on a sheet of other visits."""
     skipped: bool = False
     """An earlier run had done it."""
     input_hash: str | None = None
@@ -112,6 +116,7 @@ def recorded(job: Job) -> Outcome | None:
         all(path.exists() for path in job.result.paths(optional=job.write_meshes))
         and is_complete(job.result, record)
         and has_spread(job.result, record, job.copies)
+        and (not job.visits or job.result.path("change").exists())
     )
     if not (is_current and whole):
         return None
@@ -201,8 +206,25 @@ def hash_inputs(job: Job, record: Mapping[str, Any]) -> tuple[str, dict[str, Any
         *([[asdict(end) for end in item.ends]] if item.ends else []),
         *signal_hash(item),
     ]
+    entries = {"inputs": inputs, "edited": edited}
+    if job.visits:
+        entries["visits"] = list(_hash_visits(job))
+        reading.append([entry["sha256"] for entry in entries["visits"]])
+        reading.append([[asdict(end) for end in visit.ends] for visit in job.visits])
     digest = hashlib.sha256(json.dumps(reading).encode()).hexdigest()
-    return digest, {"inputs": inputs, "edited": edited}
+    return digest, entries
+
+
+def _hash_visits(job: Job) -> Iterator[dict[str, Any]]:
+    """List the files of all visits that share a sheet, with their hashes."""
+    sources = dict(job.sources)
+    for visit in job.visits:
+        for path in (*visit.files, *(edit.path for edit in visit.edits)):
+            yield {
+                "session": visit.session,
+                "file": source_address(path, sources),
+                "sha256": files.sha256_of(path),
+            }
 
 
 class CostClock:
@@ -295,12 +317,17 @@ def run_job(job: Job) -> Outcome:
     """
     try:
         with files.locked(job.result.root, job.title):
-            return finished(job) or _measure(job)
+            return finished(job) or measure_job(job)
     except OutputError as error:
         return fail(job, error)
 
 
-def _measure(job: Job) -> Outcome:
+#: Function of labels, hemisphere, settings and clock that measures a hemisphere.
+Measure = Callable[[LabelVolume, str, Settings, CostClock], HemisphereMaps]
+
+
+def measure_job(job: Job, measure: Measure | None = None) -> Outcome:
+    """Measure a hemisphere, by default on a sheet of its own, and write its results."""
     from hipsta_bids.inputs.labels import read_label_volume  # noqa: PLC0415  (workers only)
     from hipsta_bids.io.volumes import limit_memory  # noqa: PLC0415  (likewise)
     from hipsta_bids.participant.measure import find_body, measure_hemisphere  # noqa: PLC0415
@@ -316,7 +343,7 @@ def _measure(job: Job) -> Outcome:
             volume = read_label_volume(job.item, job.settings.body.region)
             edges = np.linalg.norm(volume.affine[:3, :3], axis=0)
             record["provenance"]["voxel_size"] = " x ".join(f"{edge:.3g}" for edge in edges)
-        maps = measure_hemisphere(volume, job.item.hemi, job.settings, clock)
+        maps = (measure or measure_hemisphere)(volume, job.item.hemi, job.settings, clock)
         mapped: list[Mapped] = []
         regions = None
         if job.item.maps or job.item.regions:

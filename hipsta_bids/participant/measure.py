@@ -96,6 +96,7 @@ _PARTS = {
 class Evidence(Measured):
     """One hemisphere's sheet, and the evidence of the stages before it."""
 
+    surface: Surface
     coordinates: Coordinates
     image: tuple[Finding, ...]
     """What the checks of the label image found."""
@@ -200,7 +201,7 @@ def find_all(evidence: Evidence) -> list[Finding]:
         ),
     ]
     return [
-        *map(_of_repair, solid.repairs),
+        *map(describe_repair, solid.repairs),
         *map(_whole, rows),
         *[
             sheet_checks.check_rival(evidence.thickness, *rival, checks)
@@ -219,7 +220,8 @@ def find_all(evidence: Evidence) -> list[Finding]:
     ]
 
 
-def _of_repair(repair: Repair) -> Finding:
+def describe_repair(repair: Repair) -> Finding:
+    """Return the finding of a repair: its size over the limit."""
     return Finding(
         reason="large-repair",
         value=repair.excess,
@@ -245,25 +247,10 @@ def _whole(row: tuple[str, float, float, str, str, Float | float]) -> Finding:
 def quality_metrics(evidence: Evidence) -> dict[str, Any]:
     """Numbers and words by which to judge the map, JSON-serializable."""
     solid, boundaries, surface = evidence.solid, evidence.boundaries, evidence.surface
-    body, ends, valid = evidence.body, evidence.body.ends, evidence.sheet.valid
-    quality, inside = tetra_quality(evidence.mesh), body.inside_points()[1]
+    body, valid = evidence.body, evidence.sheet.valid
+    quality = tetra_quality(evidence.mesh)
     return {
-        "region": body.region,
-        "x_coordinate": evidence.settings.sheet.x_coordinate,
-        "voxel_size_mm": np.linalg.norm(body.affine[:3, :3], axis=0).round(4).tolist(),
-        "body_voxels": int(np.count_nonzero(body.inside)),
-        "layer_voxels": body.layer_voxels,
-        "cavities_mm3": len(body.cavities.all) * body.voxel_volume,
-        "uncus_mm3": len(body.uncus) * body.voxel_volume,
-        "end_voxels_inside": body.handed_over,
-        "body_length_mm": ends.length(inside),
-        "medial_offset_mm": evidence.side,
-        "posterior_end_rule": ends.posterior.rule,
-        "anterior_end_rule": ends.anterior.rule,
-        "posterior_end_uncertainty_mm": ends.posterior.uncertainty,
-        "anterior_end_uncertainty_mm": ends.anterior.uncertainty,
-        "posterior_plane": ends.posterior.entry(inside),
-        "anterior_plane": ends.anterior.entry(inside),
+        **body_metrics(body, evidence.side, evidence.settings),
         "voxels_across": evidence.voxels_across,
         "euler_before": solid.euler_before,
         "euler_after": solid.euler_after,
@@ -299,6 +286,29 @@ def quality_metrics(evidence: Evidence) -> dict[str, Any]:
     }
 
 
+def body_metrics(body: Body, side: float, settings: Settings) -> dict[str, Any]:
+    """Return numbers and words about a body, ``side`` mm medial, and its end planes."""
+    ends, inside = body.ends, body.inside_points()[1]
+    return {
+        "region": body.region,
+        "x_coordinate": settings.sheet.x_coordinate,
+        "voxel_size_mm": np.linalg.norm(body.affine[:3, :3], axis=0).round(4).tolist(),
+        "body_voxels": int(np.count_nonzero(body.inside)),
+        "layer_voxels": body.layer_voxels,
+        "cavities_mm3": len(body.cavities.all) * body.voxel_volume,
+        "uncus_mm3": len(body.uncus) * body.voxel_volume,
+        "end_voxels_inside": body.handed_over,
+        "body_length_mm": ends.length(inside),
+        "medial_offset_mm": side,
+        "posterior_end_rule": ends.posterior.rule,
+        "anterior_end_rule": ends.anterior.rule,
+        "posterior_end_uncertainty_mm": ends.posterior.uncertainty,
+        "anterior_end_uncertainty_mm": ends.anterior.uncertainty,
+        "posterior_plane": ends.posterior.entry(inside),
+        "anterior_plane": ends.anterior.entry(inside),
+    }
+
+
 Clock = Callable[[str], AbstractContextManager[None]]
 
 
@@ -312,7 +322,7 @@ def unfold(
         side = check_side(body, hemi)
     with clock("surface"):
         field = resample_body(body, hemi, settings.grid, settings.slices)
-        solid = _solid(field, body, settings)
+        solid = make_solid(field, body, settings)
         surface = extract_surface(solid.field, settings.surface)
         across = check_voxels_across(surface, body, settings.checks)
     with clock("tetrahedra"):
@@ -375,7 +385,8 @@ def unfold(
     )
 
 
-def _solid(field: Field, body: Body, settings: Settings) -> SolidField:
+def make_solid(field: Field, body: Body, settings: Settings) -> SolidField:
+    """Repair the topology of the field of a body."""
     return repair_topology(field, settings.topology, name_subfields(body), find_contacts(body))
 
 
@@ -396,7 +407,7 @@ def _boundaries(surface: Surface, laplace: Laplace, body: Body, settings: Settin
 
 def _thickness(field: Field, body: Body, settings: Settings) -> Float:
     """Measure the thickness (Nx, Ny), mm, of another field of the same body."""
-    solid = _solid(field, body, settings)
+    solid = make_solid(field, body, settings)
     surface, mesh, _ = _fill(extract_surface(solid.field, settings.surface), solid, settings)
     laplace = volume_laplace(mesh, settings.boundaries.solver)
     boundaries = _boundaries(surface, laplace, body, settings)
@@ -456,8 +467,10 @@ def measure_hemisphere(
     evidence = unfold(volume, hemi, settings, clock)
     sheet = evidence.sheet
     with clock("measures"):
-        repairs = [add_consequence(_of_repair(repair), sheet) for repair in evidence.solid.repairs]
-        layers, folded_layers = _layers(sheet, settings)
+        repairs = [
+            add_consequence(describe_repair(repair), sheet) for repair in evidence.solid.repairs
+        ]
+        layers, folded_layers = space_layers(sheet, settings)
         findings = [*_find(volume, hemi, evidence), *folded_layers]
         maps = measure_maps(evidence)
         return HemisphereMaps(
@@ -513,8 +526,8 @@ def find_body(volume: LabelVolume, settings: Settings) -> BodyMask | None:
     return volume.in_file(body.inside)
 
 
-def _layers(sheet: Sheet, settings: Settings) -> tuple[Sheet, list[Finding]]:
-    """Space layers as the settings say, and find out where that is not possible."""
+def space_layers(sheet: Sheet, settings: Settings) -> tuple[Sheet, list[Finding]]:
+    """Space layers by the settings, and list places where this is impossible."""
     if settings.sheet.depths == "distance":
         return sheet, []
     layers, folded = equal_volume_layers(sheet)

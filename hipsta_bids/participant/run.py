@@ -47,6 +47,7 @@ from hipsta_bids.participant.job import (
 )
 from hipsta_bids.participant.pages import PagePlan, reports_after
 from hipsta_bids.participant.pool import WorkerLost, WorkerPlan, run_jobs
+from hipsta_bids.participant.visits import by_side, run_visits, share_sheets
 from hipsta_bids.progress import tell
 from hipsta_bids.settings import Settings
 from hipsta_bids.types import Decision
@@ -455,7 +456,7 @@ def _prepare(
         write_sidecar(out_dir)
         write_shared(out_dir)
     memory = options.mem_gb and options.mem_gb / n_workers(options, len(items))
-    return [
+    jobs = [
         Job(
             item=item,
             result=ResultPlace(
@@ -478,6 +479,7 @@ def _prepare(
         )
         for item in items
     ]
+    return share_sheets(jobs) if settings.sheet.frame != "visit" else jobs
 
 
 def n_workers(options: RunOptions, n_jobs: int) -> int:
@@ -496,22 +498,26 @@ def _measured(
     jobs: list[Job], table: StatusTable, options: RunOptions, log: Path
 ) -> Generator[Outcome]:
     """Return the outcomes of all hemispheres: first what is done already, then the others."""
-    todo = []
-    for job in jobs:
-        earlier = finished(job)
-        if earlier is None:
-            todo.append(job)
+    todo: list[Job] = []
+    # Visits that share a sheet are measured together.
+    shared = any(job.visits for job in jobs)
+    for unit in by_side(jobs) if shared else [(job,) for job in jobs]:
+        earlier = [outcome for job in unit if (outcome := finished(job)) is not None]
+        if len(earlier) < len(unit):
+            todo += unit
         else:
-            yield earlier
+            yield from earlier
     table.expect(todo)
     for job in todo:
         if job.item.problem is not None:
             yield fail(job, job.item.problem)
     able = [job for job in todo if job.item.problem is None]
+    units: Sequence[Job | tuple[Job, ...]] = by_side(able) if shared else able
+    visits = max((len(unit) for unit in units if isinstance(unit, tuple)), default=1)
     plan = WorkerPlan(
-        work=run_job,
-        n_workers=n_workers(options, len(able)),
-        timeout=options.timeout,
+        work=run_visits if shared else run_job,
+        n_workers=n_workers(options, len(units)),
+        timeout=options.timeout * visits,
         log=log,
         warm_up=warm_up,
         environment=() if options.work_dir is None else (("TMPDIR", str(options.work_dir)),),
@@ -519,12 +525,15 @@ def _measured(
     )
     if options.cluster is None or not able:
         tell(STAGE, None, current=f"about {_expected(table, plan, able)}")
-        pool = run_jobs(plan, able)
+        pool = run_jobs(plan, units)
     else:
-        pool = run_on_cluster(options.cluster, plan, able)
+        pool = run_on_cluster(options.cluster, plan, units)
     try:
-        for job, answer in pool:
-            yield _lost(job, answer, options) if isinstance(answer, WorkerLost) else answer
+        for unit, answer in pool:
+            if isinstance(answer, WorkerLost):
+                yield from (_lost(job, answer, options) for job in _jobs_of(unit))
+            else:
+                yield from answer if isinstance(answer, list) else (answer,)
     except BaseException:
         pool.close()
         for job in able:
@@ -533,8 +542,12 @@ def _measured(
         raise
 
 
-def _tell_titles(jobs: list[Job]) -> None:
-    name, count = jobs[-1].result.name, len(jobs) - 1
+def _jobs_of(unit: Job | tuple[Job, ...]) -> tuple[Job, ...]:
+    return unit if isinstance(unit, tuple) else (unit,)
+
+
+def _tell_titles(units: list[Job | tuple[Job, ...]]) -> None:
+    name, count = _jobs_of(units[-1])[0].result.name, len(units) - 1
     ending = f" and {count} more" if count else ""
     tell(STAGE, None, current=f"sub-{name.subject} {name.hemi}{ending}")
 

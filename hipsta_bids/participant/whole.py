@@ -140,7 +140,6 @@ def measure_whole(
     with clock("measures"):
         measured = catalog.Measured(
             body=body,
-            surface=surface,
             mesh=mesh,
             sheet=sheet,
             subfield=subfield,

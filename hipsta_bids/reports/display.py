@@ -102,6 +102,16 @@ UNCERTAINTY = MapKind(
     digits=2,
     limits=(0.0, 0.3),
 )
+#: At visits that share a sheet (``--longitudinal``); noise is about 0.1 mm.
+THICKNESS_CHANGE = MapKind(
+    column="thickness_change",
+    title="Change of thickness",
+    unit="mm",
+    colors="PRGn",
+    centered=True,
+    digits=3,
+    limits=(-0.3, 0.3),
+)
 #: Of any measure, between two visits or sides.
 _CHANGE = MapKind(
     column="", title="", unit="", colors="PRGn", centered=True, digits=3, percentiles=(2, 98)

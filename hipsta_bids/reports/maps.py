@@ -119,10 +119,12 @@ def draw_map(
     hemispheres: Sequence[Hemisphere],
     *,
     pins: Sequence[tuple[float, float, float]] = (),
+    titles: Sequence[str] = (),
 ) -> Picture:
     """Draw one map of hemispheres, unfolded, side by side on one color scale.
 
-    ``pins`` are points, RAS mm, whose nearest columns in the first map become pins.
+    ``pins`` are points, RAS mm, whose nearest columns in the first map become pins; ``titles``
+    replace the names of the sides.
     """
     height = 3.1 if hemispheres[0].sheet.ends is None else 4.6
     figure, axes = _new_figure(1, len(hemispheres), (2.6 * len(hemispheres) + 0.9, height))
@@ -132,13 +134,16 @@ def draw_map(
         extents = [hemisphere.summary.get(f"extent_{a}", np.nan) for a in "xy"]
         hemi = hemisphere.result.name.hemi
         image = draw_sheet(axis, hemisphere.sheet, kind, (low, high), extents=extents, hemi=hemi)
+    for axis, title in zip(axes[0], titles, strict=False):
+        axis.set_title(title)
     axes[0, 0].set_ylabel("  ←  mm  →  ".join(Y_ENDS))
     figure.colorbar(
         image, ax=list(axes[0]), label=f"{kind.title.lower()} [{kind.unit}]", extend="both"
     )
+    names = titles or [h.side for h in hemispheres]
     means = ", ".join(
-        f"{h.side} mean {np.nanmean(h.sheet.columns[kind.column]):.{kind.digits}f}"
-        for h in hemispheres
+        f"{name} mean {np.nanmean(h.sheet.columns[kind.column]):.{kind.digits}f}"
+        for name, h in zip(names, hemispheres, strict=True)
     )
     picture = _encode(
         figure,

@@ -40,6 +40,7 @@ from hipsta_bids.reports.results import (
 )
 from hipsta_bids.reports.slices import stack_of
 from hipsta_bids.reports.verdict import RATINGS
+from hipsta_bids.reports.visits import draw_visits
 from hipsta_bids.types import Decision, Float
 
 #: Finer masks of failed hemispheres are thinned to about this edge before they are drawn, mm.
@@ -401,6 +402,11 @@ def _uncertainty(hemisphere: Hemisphere) -> str:
     )
 
 
+def _visits(series: Series) -> Mapping[str, Any] | None:
+    pictures = [picture for h in series.measured for picture in draw_visits(h)]
+    return {"pictures": pictures} if pictures else None
+
+
 def _view(series: Series) -> Mapping[str, Any] | None:
     names = subfields_of(series.measured)
     scenes = [scene_of(h, series.view(h), names) for h in series.hemispheres]
@@ -447,6 +453,7 @@ SECTIONS: tuple[Section[Series], ...] = tuple(
         ("status", "Hemispheres", _sides),
         ("numbers", "Key numbers", _key_numbers),
         ("sheet", "Unfolded maps", _sheets),
+        ("visits", "Visits on one sheet", _visits),
         ("view", "Three dimensions", _view),
         ("profiles", "Profiles", _profiles),
         ("quality", "Quality", _quality_numbers),

@@ -208,6 +208,10 @@ class Hemisphere:
         subfield, valid, repaired = (columns.pop(name) for name in words)
         if "uncertainty_copies" in self.metrics and self.result.path("uncertainty").exists():
             columns |= read_sheet(self.result.path("uncertainty"))
+        if self.record.get("visits") and self.result.path("change").exists():
+            path, hemi = self.result.path("change"), self.result.name.hemi
+            change = gifti.read_map(path, "thickness_change", hemi).values
+            columns["thickness_change"] = change.reshape(valid.shape)
         return SheetTable(
             columns=columns,
             subfield=subfield.astype(np.str_),

@@ -64,7 +64,7 @@ def test_maps_are_those_of_the_group_level(labeled):
             rows=np.arange(keep.sum()), maps=maps, names=(), summary=pd.DataFrame(),
             subfield=np.full(maps["curvature"].shape, -1, dtype=np.int8),
         )  # fmt: skip
-        cohort = SimpleNamespace(sides={side: sheets}, y=np.linspace(-1, 1, NY))
+        cohort = SimpleNamespace(sides={side: sheets}, y=np.linspace(-1, 1, NY), shared=False)
         result, registered = register_side(
             cohort, side, groups=None, settings=GroupSettings(), templates=None
         )

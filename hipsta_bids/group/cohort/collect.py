@@ -157,17 +157,18 @@ def collect_sheets(request: GroupRequest, *, may_lack: bool = False) -> Collecti
         raise NothingToDoError(
             f"{request.roots[0]}: no hemisphere is left for the group level ({reasons})"
         )
-    digest = _one_settings(records)
+    digest, grid = _one_settings(records), grid_of(records[0].result.root)
     return Collection(
         records=tuple(records),
         exclusions=tuple(left_out),
-        grid=grid_of(records[0].result.root),
+        grid=grid,
         settings_hash=digest,
         quality=pd.DataFrame(quality),
         versions=tuple(sorted({record.version for record in records})),
         ratings=choices.counts(digests),
         notes=(
             *notes,
+            *_shared_sheets(grid),
             *choices.excluded.notes(_with_digests(results)),
             *choices.rated.notes(_with_digests(results)),
         ),
@@ -376,6 +377,13 @@ def _one_settings(records: Sequence[SheetRecord]) -> str:
             " with the same"
         )
     return next(iter(counts))
+
+
+def _shared_sheets(grid: SheetSettings) -> tuple[str, ...]:
+    """Note that all visits of a participant share a sheet."""
+    if grid.frame == "visit":
+        return ()
+    return ("all visits of a participant share a sheet (participant --longitudinal)",)
 
 
 def grid_of(root: Path) -> SheetSettings:

@@ -39,6 +39,8 @@ class Cohort:
     """(y,) sheet coordinates of the nodes, posterior to anterior, -1..1."""
     units: Mapping[str, str]
     """Units of maps and summary columns."""
+    shared: bool = False
+    """Whether the visits of a participant share a sheet, and therefore a warp."""
 
     def take(self, keep: NDArray[np.bool_]) -> "Cohort":
         """Keep some visits; ``keep`` has one value per visit."""

@@ -157,6 +157,7 @@ def read_sheets(
         sides=sides,
         x=x,
         y=y,
+        shared=grid.frame != "visit",
         units=(hemisphere.read_units(records[0].result) if records else {})
         | {n: ARBITRARY for n in names if n not in SHEET_MAPS},
         sources={

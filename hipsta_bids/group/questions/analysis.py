@@ -6,6 +6,7 @@ from functools import partial
 from itertools import product
 
 import numpy as np
+import pandas as pd
 from scipy import special
 
 from hipsta_bids.errors import ModelError
@@ -360,6 +361,9 @@ def register_side(
     """Register the sheets of one hemisphere, to a template or to each other; also the maps."""
     side = cohort.sides[hemi]
     profiles = registration.mean_profiles(side.curvature, settings.registration)
+    if cohort.shared:
+        people = pd.factorize(cohort.table[PARTICIPANT].iloc[side.rows])[0]
+        profiles = pd.DataFrame(profiles).groupby(people).transform("mean").to_numpy()
     if templates is None:
         result = registration.register(profiles, settings.registration)
     else:

@@ -327,6 +327,7 @@ def read_study(
         x=measured.x,
         y=measured.y,
         units=measured.units,
+        shared=measured.shared,
     )
     # A visit may have lost both of its hemispheres.
     cohorts = {SHEET: all_visits, **surfaces}

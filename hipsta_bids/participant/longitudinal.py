@@ -1,0 +1,300 @@
+"""All visits of one side of a participant on one sheet: the sheet of their mean labels.
+
+The labels of the visits are aligned and averaged, and the mean is laid out once. So its end planes,
+boundaries and coordinates hold for all visits. Each visit has its own walls, which are found along
+the columns of the common sheet.
+"""
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+
+import numpy as np
+from nibabel.affines import apply_affine
+
+from hipsta_bids.errors import GeometryError
+from hipsta_bids.geometry import catalog, checks, columns
+from hipsta_bids.geometry.align import align
+from hipsta_bids.geometry.average import average_labels
+from hipsta_bids.geometry.body import Body, check_side, extract_body
+from hipsta_bids.geometry.ends import EndPlanes
+from hipsta_bids.geometry.grid import resample_body
+from hipsta_bids.geometry.label_checks import check_label_image
+from hipsta_bids.geometry.measures import bending_angle, subfield_volumes
+from hipsta_bids.geometry.topology import SolidField, repaired_columns
+from hipsta_bids.participant import measure
+from hipsta_bids.participant.measure import Clock, Evidence
+from hipsta_bids.protocols.load import for_region
+from hipsta_bids.protocols.protocol import Tissue
+from hipsta_bids.settings import Settings
+from hipsta_bids.types import End, Finding, Float, GivenEnd, HemisphereMaps, LabelVolume, Sheet
+
+#: A visit whose walls lie farther from the mean's is flagged: RMS over both walls, mm. Walls that
+#: are not found count as the largest distance.
+FLAG_DISTANCE = 0.35
+#: A visit whose body overlaps less with the mean's is flagged (Dice's coefficient).
+FLAG_OVERLAP = 0.8
+#: Walls at least this far from the mean's are the place of a visit that does not fit, mm.
+FAR = 0.5
+
+_ENDS: tuple[End, ...] = ("posterior", "anterior")
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Visit(catalog.Measured):
+    """The common sheet at the walls of a visit."""
+
+    factors: dict[Tissue, float]
+    """Volume of each subfield of the mean over the volume of its cells, which lack the rounded
+    edges."""
+
+    @cached_property
+    def volumes(self) -> dict[Tissue, float]:
+        """Volume of each subfield, mm3: the mean's volume, changed as the cells are."""
+        cells = subfield_volumes(self.mesh, self.body)
+        return {tissue: v * self.factors.get(tissue, 1.0) for tissue, v in cells.items()}
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Frame:
+    """The sheet of the mean labels of all visits, and the way from there to each visit."""
+
+    evidence: Evidence
+    """The mean, laid out."""
+    volume: LabelVolume
+    """The mean labels."""
+    motions: tuple[Float, ...]
+    """(4, 4) from the mean to each visit, RAS mm."""
+
+    @cached_property
+    def factors(self) -> dict[Tissue, float]:
+        """Volume of each subfield over the volume of its cells."""
+        mesh, _ = columns.grid_mesh(self.evidence.whole)
+        cells = subfield_volumes(mesh, self.evidence.body)
+        return {t: v / cells[t] for t, v in self.evidence.volumes.items() if cells.get(t)}
+
+    def ends(self, motion: Float) -> tuple[GivenEnd, ...]:
+        """Return the end planes in a visit."""
+        body = self.evidence.body
+        points = body.inside_points()[1]
+        return tuple(_moved_end(body.ends[end].moved(end, 0.0, points), motion) for end in _ENDS)
+
+    def body(self, motion: Float) -> Body:
+        """Return the body of the mean in a visit: what names the subfields along the sheet."""
+        body = self.evidence.body
+        planes = {
+            end: body.ends[end]._replace(
+                point=apply_affine(motion, body.ends[end].point),
+                normal=motion[:3, :3] @ body.ends[end].normal,
+            )
+            for end in _ENDS
+        }
+        ends = EndPlanes(
+            **planes, axis=motion[:3, :3] @ body.ends.axis, half_slice=body.ends.half_slice
+        )
+        return replace(body, affine=motion @ body.affine, ends=ends)
+
+
+def make_frame(
+    volumes: Sequence[LabelVolume], hemi: str, settings: Settings, clock: Clock, *, shared: bool
+) -> Frame:
+    """Align and average the labels of all visits, and lay out the mean.
+
+    The order of the visits does not matter. With ``shared``, they share a space.
+    """
+    order = sorted(range(len(volumes)), key=lambda n: _digest(volumes[n]))
+    ordered = [volumes[n] for n in order]
+    with clock("alignment"):
+        aligned = align(ordered, hemi, shared=shared)
+    with clock("template"):
+        mean = average_labels(ordered, aligned, settings.slices)
+        mean = replace(mean, given_ends=_mean_ends(ordered, aligned))
+    motions = [aligned[order.index(n)] for n in range(len(volumes))]
+    evidence = measure.unfold(mean, hemi, settings, clock, rivals=False)
+    return Frame(evidence=evidence, volume=mean, motions=tuple(motions))
+
+
+def _digest(volume: LabelVolume) -> bytes:
+    content = (volume.tissue, volume.part, volume.affine)
+    return hashlib.sha256(b"".join(np.ascontiguousarray(a).tobytes() for a in content)).digest()
+
+
+def _moved_end(end: GivenEnd, motion: Float) -> GivenEnd:
+    point = apply_affine(motion, np.array(end.point)).tolist()
+    normal = None if end.normal is None else (motion[:3, :3] @ np.array(end.normal)).tolist()
+    return GivenEnd(
+        end=end.end, point=tuple(point), normal=None if normal is None else tuple(normal)
+    )
+
+
+def _mean_ends(volumes: Sequence[LabelVolume], motions: Sequence[Float]) -> tuple[GivenEnd, ...]:
+    """Average the planes that a person placed in some visits, in the space of the mean."""
+    means = []
+    for end in _ENDS:
+        planes = [
+            _moved_end(given, np.asarray(np.linalg.inv(motion), dtype=np.float64))
+            for volume, motion in zip(volumes, motions, strict=True)
+            for given in volume.given_ends
+            if given.end == end
+        ]
+        if planes:
+            point = np.mean([plane.point for plane in planes], axis=0).tolist()
+            normals = np.array([plane.normal for plane in planes if plane.normal])
+            normals *= np.sign(normals @ normals[:1].T) if len(normals) else 1.0
+            normal = tuple(normals.mean(axis=0).tolist()) if len(normals) == len(planes) else None
+            means.append(GivenEnd(end=end, point=tuple(point), normal=normal))
+    return tuple(means)
+
+
+def measure_visit(
+    frame: Frame, number: int, volume: LabelVolume, hemi: str, clock: Clock
+) -> HemisphereMaps:
+    """Measure a visit along the columns of the common sheet; ``number`` is its place in the frame.
+
+    GeometryError if it cannot be measured, or does not resemble the mean at all.
+    """
+    motion, common, settings = frame.motions[number], frame.evidence, frame.evidence.settings
+    with clock("body"):
+        image = check_label_image(volume, hemi, settings.checks)
+        body = extract_body(replace(volume, given_ends=frame.ends(motion)), settings.body)
+        side = check_side(body, hemi)
+    with clock("surface"):
+        field = resample_body(body, hemi, settings.grid, settings.slices)
+        solid = measure.make_solid(field, body, settings)
+    with clock("sheet"):
+        walls = columns.find_walls(common.sheet, motion, solid.field)
+        carried = columns.move_walls(common.sheet, walls.moves, motion)
+        sheet = Sheet(points=carried.points, valid=common.sheet.valid & walls.known)
+        filled = 1 - float(sheet.valid.mean())
+        if filled > settings.sheet.max_filled:
+            raise GeometryError(
+                f"{filled:.0%} of the columns meet no wall near the wall of the mean visit: "
+                "compare the labels of the visits",
+                reason="visit-unlike",
+            )
+        extents = settings.sheet.x_extent, settings.sheet.y_extent
+        moves = columns.moves_at(walls.moves, common.sheet, common.whole, *extents)
+        whole = columns.move_walls(common.whole, moves, motion)
+        mesh, coordinates = columns.grid_mesh(whole)
+        measured = _Visit(
+            factors=frame.factors,
+            body=frame.body(motion),
+            mesh=mesh,
+            sheet=sheet,
+            subfield=common.subfield,
+            whole=whole,
+            settings=settings,
+        )
+    with clock("measures"):
+        maps = catalog.measure_maps(measured)
+        repaired = repaired_columns(sheet, solid)
+        layers, folded_layers = measure.space_layers(sheet, settings)
+        overlap = _overlap(body, frame, motion)
+        repairs = [checks.add_consequence(measure.describe_repair(r), sheet) for r in solid.repairs]
+        findings = [
+            *image,
+            *checks.check_image(body),
+            *_of_visit(body, solid, settings),
+            *_fits(walls, sheet, overlap, settings),
+            *folded_layers,
+            *(_of_frame(finding, motion) for finding in measure.find_all(common)),
+        ]
+        return HemisphereMaps(
+            sheet=sheet,
+            layers=layers,
+            maps=maps,
+            profiles=catalog.average_profiles(maps, sheet),
+            sections=catalog.measure_sections(measured),
+            subfield=common.subfield,
+            repaired=repaired,
+            body_mask=volume.in_file(body.inside),
+            summary=catalog.summarize(measured, for_region(volume.protocol, body.region).sheet),
+            qc={
+                **measure.body_metrics(body, side, settings),
+                "euler_before": solid.euler_before,
+                "euler_after": solid.euler_after,
+                "changed_fraction": solid.changed_fraction,
+                "bending_rad": bending_angle(sheet, settings.measures),
+                "filled_columns": int(np.count_nonzero(~sheet.valid)),
+                "filled_fraction": filled,
+                "regions_outside": "head and tail (as in Diers et al. 2023)",
+                "repaired_fraction": float(repaired.mean()),
+                "repaired_change_mm": checks.change_of_mean(sheet, repaired),
+                "frame": "person",
+                "frame_visits": len(frame.motions),
+                "frame_to_visit": motion.round(6).tolist(),
+                "frame_distance_mm": walls.distance,
+                "frame_overlap": overlap,
+                "flag_margins": checks.flag_margins(findings),
+            },
+            repairs=(
+                *(f"{finding.text}{checks.consequence_text(finding)}" for finding in repairs),
+                *checks.describe_uncus(body, settings.checks),
+            ),
+            flags=tuple(checks.raise_flags(findings, sheet, partial(checks.name_place, body=body))),
+            mesh=mesh,
+            coordinates=coordinates,
+        )
+
+
+def _of_visit(body: Body, solid: SolidField, settings: Settings) -> list[Finding]:
+    """List what the checks of the labels of a visit found."""
+    cuts = solid.touched & (solid.field.values < 0)
+    step = 2 * body.ends.half_slice
+    return [
+        *map(measure.describe_repair, solid.repairs),
+        *checks.check_cavities(body, settings.checks),
+        *checks.check_labels(body, settings.checks),
+        *checks.check_cross_sections(solid.field, step, settings.checks, cuts),
+    ]
+
+
+def _of_frame(finding: Finding, motion: Float) -> Finding:
+    """Carry what was found in the mean labels to a visit."""
+    text = "a repair" if finding.reason == "large-repair" else finding.text
+    return replace(
+        finding,
+        text=f"in the mean of the visits, {text}",
+        points=apply_affine(motion, finding.points) if len(finding.points) else finding.points,
+        placed=finding.placed and finding.reason != "large-repair",
+    )
+
+
+def _overlap(body: Body, frame: Frame, motion: Float) -> float:
+    """Compute Dice's coefficient of the bodies of a visit and of the mean."""
+    mean = frame.evidence.body
+    points = apply_affine(np.linalg.inv(motion), body.inside_points()[1])
+    voxel = np.rint(mean.to_voxels(points)).astype(np.intp)
+    within = ((voxel >= 0) & (voxel < mean.inside.shape)).all(axis=1)
+    shared = np.count_nonzero(mean.inside[tuple(voxel[within].T)]) * body.voxel_volume
+    total = len(points) * body.voxel_volume + np.count_nonzero(mean.inside) * mean.voxel_volume
+    return float(2 * shared / total)
+
+
+def _fits(walls: columns.Walls, sheet: Sheet, overlap: float, settings: Settings) -> list[Finding]:
+    """Check whether a visit resembles the mean of all visits."""
+    moves = np.where(np.isfinite(walls.raw), np.abs(walls.raw), columns.FARTHEST)
+    far = sheet.points[:, :, sheet.middle][(moves > FAR).any(axis=-1)]
+    distance = float(np.sqrt((moves**2).mean()))
+    remedy = "compare the labels of the visits there"
+    return [
+        Finding(
+            reason="visits-differ",
+            value=max(distance / FLAG_DISTANCE, (1 - overlap) / (1 - FLAG_OVERLAP)),
+            limit=1.0,
+            text=f"the walls lie {distance:.2f} mm from the walls of the mean visit, and "
+            f"{overlap:.0%} of the bodies overlap",
+            remedy=remedy,
+            points=far,
+        ),
+        Finding(
+            reason="columns-filled",
+            value=1 - float(sheet.valid.mean()),
+            limit=settings.checks.flag_filled,
+            text=f"{1 - sheet.valid.mean():.1%} of the columns meet no wall near the wall of the "
+            "mean visit",
+            remedy=remedy,
+            points=sheet.points[:, :, sheet.middle][~sheet.valid],
+        ),
+    ]

@@ -1,0 +1,432 @@
+"""Visits of one person on a common sheet: noise within the person against separate sheets."""
+
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from nibabel.affines import apply_affine, from_matvec
+from scipy import ndimage, stats
+from scipy.spatial.transform import Rotation
+
+from hipsta_bids.geometry.columns import SMOOTHING
+from hipsta_bids.geometry.ends import long_axis
+from hipsta_bids.geometry.measures import column_area
+from hipsta_bids.group.stats.trials import participants_needed
+from hipsta_bids.inputs.search import HemisphereInput
+from hipsta_bids.participant.job import peak_memory, reset_peak_memory
+from hipsta_bids.participant.longitudinal import make_frame, measure_visit
+from hipsta_bids.phantom import PhantomSpec, Thinning
+from hipsta_bids.protocols.protocol import Tissue
+from hipsta_bids.settings import Settings
+from hipsta_bids.types import Bool, Float, HemisphereMaps, LabelVolume, Sheet
+from validation import cases
+from validation.labelings import revisions
+from validation.report import Cell, Cells, Content, suite, table
+from validation.thick_slices import slice_frame
+
+SEED = 20261
+FINE, THICK = (0.4, 0.4, 0.4), (0.4, 0.4, 2.0)
+"""Voxels, mm."""
+YEARS = np.array([0.0, 1.0, 2.0])
+NOISE, STRONG = 0.2, 0.3
+"""mm, SD along each axis of displacements of the labels, correlated over ``CORRELATION`` mm."""
+CORRELATION = 1.0
+SLOPE, LOCAL = -0.1, -0.15
+"""mm per year, planted everywhere, and in CA1 only: so large that noise of voxels hides no bias."""
+LOSS = 0.02
+"""mm per year, lost without treatment in a trial, ..."""
+TRUE_SD = 0.01
+"""mm per year, SD of that loss between participants."""
+SLOWED = 0.25
+"""Share of the loss that treatment stops."""
+UNCHANGED = 40
+"""People without change, for false positives."""
+MAX_BIAS, MAX_LEAKAGE = 0.05, 0.002
+MAX_POSE, MAX_EQUAL = 0.02, 1e-6
+MAX_COST, MAX_MEMORY = 1.6, 400.0
+FALSE_POSITIVES = (0.04, 0.06)
+MEGABYTE = 1e6
+
+
+Voxel = tuple[float, float, float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Person:
+    """Visits to be drawn: a segmentation scanned anew, two segmentations, or phantoms."""
+
+    name: str
+    sources: tuple[HemisphereInput | PhantomSpec, ...]
+    """Of each visit."""
+    voxels: tuple[Voxel, ...] = (FINE,) * 3
+    """Of each visit, mm; without any, segmentations are taken as they are and share a space."""
+    noise: float = 0.0
+    """mm."""
+    seed: int = 0
+    separate: bool = True
+    """Whether the visits are also measured on sheets of their own."""
+    coarse: bool = False
+    """Whether the working grid is coarse, which saves time."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Result:
+    """Maps of thickness (visits, Nx, Ny), mm."""
+
+    frame: Float
+    """On the common sheet."""
+    smooth: Float | None
+    """On separate sheets, smoothed as the walls of the common sheet are; None if not measured."""
+    separate: Float | None
+    """On separate sheets."""
+    ca1: Bool
+    """(Nx, Ny) columns in CA1."""
+    filled: float
+    """Largest share of columns without a wall."""
+    overlap: float
+    """Least overlap of a visit with the mean."""
+    distance: float
+    """Largest distance of the walls of a visit, mm."""
+    flagged: int
+    """Visits that are flagged as different."""
+    cost: float
+    """Processor time on the common sheet over separate sheets."""
+    memory: float
+    """Peak on the common sheet, MB."""
+
+
+def scan(
+    volume: LabelVolume,
+    voxel: tuple[float, float, float],
+    noise: float,
+    random: np.random.Generator,
+) -> LabelVolume:
+    """Take the labels in new voxels: position and direction of the grid, pose, errors of labels."""
+    hippocampal = (volume.tissue > 0) & (volume.tissue <= Tissue.HIPPOCAMPUS)
+    points = apply_affine(volume.affine, np.argwhere(hippocampal))
+    axis = long_axis(points, volume.part[hippocampal])
+    degrees = 6.0 if max(voxel) > 2 * min(voxel) else 25.0
+    turn = cases.turned(random, degrees) @ slice_frame(axis)
+    matrix = turn * np.array(voxel)
+    index = np.linalg.solve(matrix, points.T).T
+    low = np.floor(index.min(axis=0)) - 2 + random.uniform(0, 1, 3)
+    shape = tuple((np.ceil(index.max(axis=0) - low) + 3).astype(int).tolist())
+    affine = from_matvec(matrix, matrix @ low)
+    places = apply_affine(affine, np.indices(shape).reshape(3, -1).T)
+    if noise:
+        for side in range(3):
+            errors = random.standard_normal(shape)
+            errors = ndimage.gaussian_filter(errors, CORRELATION / np.array(voxel) / 2, mode="wrap")
+            places[:, side] += noise / errors.std() * errors.ravel()
+    nearest = np.rint(apply_affine(np.linalg.inv(volume.affine), places)).astype(int)
+    inside = ((nearest >= 0) & (nearest < volume.tissue.shape)).all(axis=1)
+    values = np.zeros((2, len(places)), dtype=np.uint8)
+    for row, labels in zip(values, (volume.tissue, volume.part), strict=True):
+        row[inside] = labels[tuple(nearest[inside].T)]
+    pose = from_matvec(cases.turned(random, 6.0), random.uniform(-4, 4, 3))
+    tissue, part = values.reshape(2, *shape)
+    return LabelVolume(tissue=tissue, part=part, affine=pose @ affine, protocol=volume.protocol)
+
+
+def draw(person: Person) -> tuple[list[LabelVolume], str]:
+    """Draw the visits of a person; return the hemisphere, too."""
+    random = np.random.default_rng((SEED, person.seed))
+    loaded = [cases.load_body(source, 0.3) for source in person.sources]
+    volumes = [volume for volume, _ in loaded]
+    if person.voxels:
+        volumes = [
+            scan(volume, voxel, person.noise, random)
+            for volume, voxel in zip(volumes, person.voxels, strict=True)
+        ]
+    return volumes, loaded[0][1]
+
+
+def measure_frame(
+    volumes: Sequence[LabelVolume], hemi: str, settings: Settings, *, shared: bool = False
+) -> list[HemisphereMaps]:
+    """Measure visits on a common sheet."""
+    frame = make_frame(volumes, hemi, settings, lambda _: nullcontext(), shared=shared)
+    return [
+        measure_visit(frame, number, volume, hemi, lambda _: nullcontext())
+        for number, volume in enumerate(volumes)
+    ]
+
+
+def measure_person(person: Person) -> Result:
+    """Measure the visits of a person on a common sheet, and perhaps on separate ones."""
+    volumes, hemi = draw(person)
+    settings = Settings().changed(grid={"spacing": 0.5}) if person.coarse else Settings()
+    separate: list[HemisphereMaps] = []
+    start = time.process_time()
+    if person.separate:
+        separate = [cases.measure_body(volume, hemi, settings) for volume in volumes]
+    middle = time.process_time()
+    reset_peak_memory()
+    maps = measure_frame(volumes, hemi, settings, shared=not person.voxels)
+    end = time.process_time()
+    stacked = np.stack([m.thickness for m in separate]) if separate else None
+    return Result(
+        frame=np.stack([m.thickness for m in maps]),
+        separate=stacked,
+        smooth=np.stack([smooth(m.sheet, m.thickness) for m in separate]) if separate else None,
+        ca1=maps[0].subfield == Tissue.CA1,
+        filled=max(m.qc["filled_fraction"] for m in maps),
+        overlap=min(m.qc["frame_overlap"] for m in maps),
+        distance=max(m.qc["frame_distance_mm"] for m in maps),
+        flagged=sum("visits-differ" in {f.reason for f in m.flags} for m in maps),
+        cost=(end - middle) / (middle - start) if separate else np.nan,
+        memory=peak_memory() / MEGABYTE,
+    )
+
+
+def smooth(sheet: Sheet, values: Float) -> Float:
+    """Smooth a map (Nx, Ny) on its sheet as the walls of a common sheet are."""
+    middle = sheet.points[:, :, sheet.middle].reshape(-1, 3)
+    squared = ((middle[:, None] - middle[None]) ** 2).sum(axis=-1)
+    kernel = np.exp(-squared / (2 * (SMOOTHING / np.sqrt(8 * np.log(2))) ** 2))
+    kernel = kernel * column_area(sheet).ravel()
+    return np.asarray(kernel @ values.ravel() / kernel.sum(axis=1)).reshape(values.shape)
+
+
+def noise_of(maps: Float, *, mean: bool = False) -> float:
+    """SD within a person, mm: RMS over the map, or of the mean over the map."""
+    values = maps.mean(axis=(1, 2)) if mean else maps
+    return float(np.sqrt(values.var(axis=0, ddof=1).mean()))
+
+
+def slopes(maps: Float) -> Float:
+    """Slope (Nx, Ny) over the visits, mm per year."""
+    years = YEARS[: len(maps)] - YEARS[: len(maps)].mean()
+    return np.asarray(np.tensordot(years, maps, axes=1) / (years**2).sum())
+
+
+def per_arm(noise: float) -> float:
+    """Participants per arm of a trial of the mean thickness, for noise of a visit, mm."""
+    spread = ((YEARS - YEARS.mean()) ** 2).sum()
+    sd = np.sqrt(TRUE_SD**2 + noise**2 / spread)
+    effect = np.array([SLOWED * LOSS / sd])
+    return float(participants_needed(effect, 0.05, 0.8, 100_000)[0])
+
+
+def ragged(seed: int) -> PhantomSpec:
+    """Make a phantom with thin tips and notches along its edges."""
+    random = np.random.default_rng((SEED, seed, 7))
+    tips = [
+        Thinning(depth=0.45, u=(-1.0, 0.08), v=(-1.0, 2.0), edge=0.6),
+        Thinning(depth=0.45, u=(0.93, 2.0), v=(-1.0, 2.0), edge=0.6),
+    ]
+    for edge in (0.05, 0.95):
+        start = float(random.uniform(0.15, 0.7))
+        notch = (edge - 0.08, edge + 0.08)
+        tips.append(Thinning(depth=0.35, u=notch, v=(start, start + 0.15), edge=0.5))
+    return PhantomSpec(
+        kind="spiral", variation=0.1, bend=0.02, length=14.0, thickness=2.0, thinnings=tuple(tips)
+    )
+
+
+def plain(seed: int, change: float = 0.0, local: float = 0.0) -> PhantomSpec:
+    """Make a smooth phantom, changed everywhere or in CA1, mm."""
+    kind = ("spiral", "arc")[seed % 2]
+    thinning = Thinning(depth=-local, u=(0.35, 0.75), v=(-1.0, 2.0), edge=0.2)
+    return PhantomSpec(
+        kind=kind,
+        thickness=2.0 + change,
+        variation=0.1,
+        bend=0.02,
+        length=14.0,
+        thinnings=(thinning,) if local else (),
+    )
+
+
+def people(full: bool, labels: Path | None) -> dict[str, list[Person]]:
+    """List the people of each set."""
+    items = cases.fine_segmentations(labels, 0.6) if labels else []
+    beside = [
+        item
+        for folder in (cases.hippunfold_beside(labels) if labels else [])
+        for item in cases.fine_segmentations(folder, 0.6)
+    ]
+    few = slice(None) if full else slice(1)
+
+    def real(group: Sequence[HemisphereInput], **options: object) -> list[Person]:
+        return [
+            Person(name=f"{item.subject} {item.hemi}", sources=(item,) * 3, seed=n, **options)  # type: ignore[arg-type]  # fields of Person
+            for n, item in enumerate(group)
+        ]
+
+    pairs = revisions(labels, Settings())
+    return {
+        "real, 0.4 mm": real([*items, *beside][few]),
+        "real, 2 mm slices": real(items[few], voxels=(THICK,) * 3) if full else [],
+        "real, third visit in 2 mm slices": (
+            real(items[:3], voxels=(FINE, FINE, THICK)) if full else []
+        ),
+        "real, label errors": real(items[few], noise=STRONG) if full else [],
+        "two labelings": [
+            Person(name=pair.name, sources=(pair.first, pair.second), voxels=())
+            for pair in (pairs if full else [])
+        ],
+        "ragged phantoms": [
+            Person(name=f"{n}", sources=(ragged(n),) * 3, noise=NOISE, seed=n)
+            for n in range(4 if full else 1)
+        ],
+        "smooth phantoms": [
+            Person(name=f"{n}", sources=(plain(n),) * 3, seed=n) for n in range(4 if full else 0)
+        ],
+    }
+
+
+@suite("visits")
+def run(full: bool, labels: Path | None = None) -> Iterator[Content]:
+    """Measure people on common and separate sheets, planted change, and invariances."""
+    sets = people(full, labels)
+    results = cases.run_groups(measure_person, sets, timeout=300.0)
+    yield _noise({name: group for name, group in results.items() if group}, sets)
+    count = 8 if full else 2
+    planted = {
+        name: [
+            Person(
+                name=name,
+                sources=tuple(plain(n, *(float(y) * c for c in change)) for y in YEARS),
+                seed=100 + n,
+                separate=False,
+            )
+            for n in range(count)
+        ]
+        for name, change in (("everywhere", (SLOPE, 0.0)), ("CA1", (0.0, LOCAL)))
+    }
+    planted["none"] = [
+        Person(
+            name="none",
+            sources=(replace(plain(n), length=10.0),) * 3,
+            voxels=((0.5, 0.5, 0.5),) * 3,
+            noise=NOISE,
+            seed=200 + n,
+            separate=False,
+            coarse=True,
+        )
+        for n in range(UNCHANGED if full else 4)
+    ]
+    yield _slopes(cases.run_groups(measure_person, planted, timeout=300.0))
+    yield _invariance(cases.attempt(invariance, Person(name="", sources=(plain(0),) * 2)))
+    yield cases.left_out(labels)
+
+
+@table("visits.noise")
+def _noise(
+    results: Mapping[str, Sequence[Result | cases.Refusal]], sets: Mapping[str, Sequence[Person]]
+) -> Iterator[Cells | str]:
+    for name, group in results.items():
+        measured = [result for result in group if isinstance(result, Result)]
+        sums = {key: _pooled(measured, key) for key in ("separate", "smooth", "frame")}
+        means = {key: _pooled(measured, key, mean=True) for key in ("separate", "frame")}
+        arms = {key: per_arm(value) for key, value in means.items()}
+        cells: dict[str, Cell] = {"set": name, "hemispheres": f"{len(measured)} of {len(group)}"}
+        cells |= {
+            "separate, mm": sums["separate"],
+            "separate, smoothed, mm": sums["smooth"],
+            "common, mm": sums["frame"],
+            "ratio": sums["frame"] / sums["separate"],
+            "ratio, equal smoothing": sums["frame"] / sums["smooth"],
+            "lower in": f"{sum(_lower(result) for result in measured)} of {len(measured)}",
+            "mean, separate, mm": means["separate"],
+            "mean, common, mm": means["frame"],
+            "ratio of means": means["frame"] / means["separate"],
+            "level, mm": float(np.mean([_level(result) for result in measured])),
+            "per arm, separate": f"{arms['separate']:.0f}",
+            "per arm, common": f"{arms['frame']:.0f}",
+            "without wall, at most": f"{max(result.filled for result in measured):.1%}",
+            "overlap, at least": min(result.overlap for result in measured),
+            "flagged": str(sum(result.flagged for result in measured)),
+            "cost": float(np.median([result.cost for result in measured])),
+            "memory, MB": f"{max(result.memory for result in measured):.0f}",
+        }
+        yield cells | {
+            "cost met": float(cells["cost"]) <= MAX_COST,  # type: ignore[arg-type]  # as above
+            "memory met": max(result.memory for result in measured) <= MAX_MEMORY,
+        }
+    names = {f"{key}, {p.name}": [r] for key in results for p, r in zip(sets[key], results[key])}  # noqa: B905
+    yield cases.refusal_notes(names)
+
+
+def _pooled(results: Sequence[Result], key: str, *, mean: bool = False) -> float:
+    """Pool the SD within people, as root mean square."""
+    return cases.rms([noise_of(getattr(result, key), mean=mean) for result in results])
+
+
+def _lower(result: Result) -> bool:
+    """Whether a person has less noise on the common sheet, at equal smoothing."""
+    return result.smooth is not None and noise_of(result.frame) < noise_of(result.smooth)
+
+
+def _level(result: Result) -> float:
+    """Mean thickness on the common sheet minus that on separate sheets, mm."""
+    separate = result.frame if result.separate is None else result.separate
+    return float(result.frame.mean() - separate.mean())
+
+
+@table("visits.slopes")
+def _slopes(results: Mapping[str, Sequence[Result | cases.Refusal]]) -> Iterator[Cells | str]:
+    for name, group in results.items():
+        measured = [result for result in group if isinstance(result, Result)]
+        maps = np.stack([slopes(result.frame) for result in measured])
+        ca1 = np.stack([result.ca1 for result in measured])
+        inner = np.stack([ndimage.binary_erosion(result.ca1, iterations=3) for result in measured])
+        outer = np.stack(
+            [~ndimage.binary_dilation(result.ca1, iterations=3) for result in measured]
+        )
+        part = inner if name == "CA1" else np.ones_like(ca1)
+        true = {"everywhere": SLOPE, "CA1": LOCAL, "none": 0.0}[name]
+        people_means = np.array([m[p].mean() for m, p in zip(maps, part, strict=True)])
+        error = people_means.std(ddof=1) / np.sqrt(len(maps))
+        p = stats.ttest_1samp(maps, 0.0, axis=0).pvalue
+        positives = float(np.mean(p < 0.05))  # noqa: PLR2004 -- the level
+        leakage = float(np.mean([m[o].mean() for m, o in zip(maps, outer, strict=True)]))
+        cells: dict[str, Cell] = {
+            "change": name,
+            "people": str(len(maps)),
+            "planted, mm per year": true,
+            "measured, mm per year": float(people_means.mean()),
+            "standard error": float(error),
+            "bias": f"{people_means.mean() / true - 1:+.1%}" if true else None,
+            "outside CA1": leakage if name == "CA1" else None,
+            "false positives": f"{positives:.3f}" if not true else None,
+        }
+        bias = bool(abs(people_means.mean() / true - 1) <= MAX_BIAS) if true else None
+        low, high = FALSE_POSITIVES
+        yield cells | {
+            "bias met": bias,
+            "leakage met": abs(leakage) <= MAX_LEAKAGE if name == "CA1" else None,
+            "false positives met": low <= positives <= high if not true else None,
+        }
+    yield cases.refusal_notes(results)
+
+
+def invariance(person: Person) -> dict[str, float]:
+    """Measure the largest difference of maps that should be equal, mm, by name."""
+    volumes, hemi = draw(replace(person, voxels=(FINE,) * 2))
+    settings = Settings()
+    maps = [m.thickness for m in measure_frame(volumes, hemi, settings)]
+    backward = [m.thickness for m in measure_frame(volumes[::-1], hemi, settings)][::-1]
+    twice = [m.thickness for m in measure_frame(volumes[:1] * 2, hemi, settings)]
+    turn = Rotation.from_euler("x", 20, degrees=True).as_matrix()
+    moved = replace(volumes[0], affine=from_matvec(turn, [0, 20, 0]) @ volumes[0].affine)
+    pair = [m.thickness for m in measure_frame([volumes[0], moved], hemi, settings)]
+    return {
+        "order of visits reversed, largest": float(np.abs(np.subtract(maps, backward)).max()),
+        "one visit twice, largest": float(np.abs(twice[0] - twice[1]).max()),
+        "a visit moved by 20 degrees and 20 mm, RMS": cases.rms(pair[0] - pair[1]),
+    }
+
+
+@table("visits.invariance")
+def _invariance(result: Mapping[str, float] | cases.Refusal) -> Iterator[Cells | str]:
+    if isinstance(result, cases.Refusal):
+        yield cases.refusal_notes({"invariance": [result]})
+        return
+    for name, value in result.items():
+        limit = MAX_POSE if "moved" in name else MAX_EQUAL
+        yield {"maps of": name, "difference, mm": value, "limit, mm": limit, "met": value <= limit}
