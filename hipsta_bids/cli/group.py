@@ -244,8 +244,8 @@ def _add_methods(parser: Parser) -> None:
     add(
         "--align",
         "",
-        "registration of curvature profiles (default: registr)",
-        choices=["registr", "none"],
+        "registration of curvature profiles (auto, the default: none for fewer than 10 sheets)",
+        choices=["auto", "registr", "none"],
     )
     add(
         "--template",

@@ -159,6 +159,25 @@ class Study:
         cohorts = {surface: one.take(keep) for surface, one in self.cohorts.items()}
         return replace(self, cohorts=cohorts, left_out=self.left_out | left_out)
 
+    def with_alignment(self) -> "Study":
+        """Choose registration, or none where sheets are too few for a template, with a note."""
+        rules = self.settings.registration
+        if rules.align != "auto":
+            return self
+        counts = {hemi: len(side.rows) for hemi, side in self.cohort.sides.items()}
+        hemi = min(counts, key=lambda name: counts[name], default="")
+        is_small = bool(self.measures.maps and hemi) and counts[hemi] < rules.min_subjects
+        align = "none" if is_small and self.options.template is None else "registr"
+        note = (
+            f"maps are not registered: hemisphere {hemi} has {counts.get(hemi)} sheets, a template"
+            f" needs {rules.min_subjects}; --template FILE takes another cohort's"
+        )
+        return replace(
+            self,
+            settings=self.settings.changed(registration={"align": align}),
+            notes=(*self.notes, *[note] * (align == "none")),
+        )
+
     def register(
         self, templates: Mapping[str, Template] | None
     ) -> tuple[dict[str, Any] | None, dict[str, Cohort], dict[str, pd.DataFrame]]:
