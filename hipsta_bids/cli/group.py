@@ -250,7 +250,8 @@ def _add_methods(parser: Parser) -> None:
     add(
         "--template",
         "FILE",
-        "register to the template.json of another analysis, or that in a summary.json",
+        "register to the template.json of another analysis, or that in a summary.json or in a"
+        " dataset of a template",
     )
     add(
         "--harmonize",

@@ -26,6 +26,7 @@ from hipsta_bids.group.output.citations import REFERENCES
 from hipsta_bids.group.output.results import templates_of
 from hipsta_bids.group.output.saved import templates_from_json
 from hipsta_bids.group.output.tables import registration_tables
+from hipsta_bids.group.output.template import template_file
 from hipsta_bids.group.questions import analysis
 from hipsta_bids.group.stats.arrays import Bool
 from hipsta_bids.group.stats.warps import Template
@@ -457,6 +458,7 @@ def read_templates(path: Path | None, cohort: Cohort) -> Mapping[str, Template] 
     """Read the templates of an earlier analysis, if one is named."""
     if path is None:
         return None
+    path = template_file(path)
     content = files.read_json(path)
     content = content.get("template") or content  # in the summary of another site
     templates = templates_from_json(content, str(path))
