@@ -85,7 +85,7 @@ def export_parser() -> Parser:
     parser, add = parser_of("export")
     add("output_dir", "OUT_DIR", type=Path)
     add("folder", "DIR", type=Path)
-    add("--format", choices=["freesurfer", "vtk", "ply", "template"], default="freesurfer")
+    add("--format", choices=["freesurfer", "vtk", "ply", "template", "prov"], default="freesurfer")
     add("--name", "LABEL")
     add("--seg", "NAME")
     add("--region", "NAME", default="body")
@@ -347,6 +347,12 @@ def run_export(arguments: Sequence[str]) -> ExitCode:
         from hipsta_bids.group.output.template import export_template  # noqa: PLC0415  (heavy)
 
         files = export_template(options.output_dir, options.folder, options.name)
+        echo(f"{options.folder}: {len(files)} files")
+        return ExitCode.OK
+    if options.format == "prov":
+        from hipsta_bids.derivatives.provenance import export_provenance  # noqa: PLC0415  (heavy)
+
+        files = export_provenance(options.output_dir, options.folder)
         echo(f"{options.folder}: {len(files)} files")
         return ExitCode.OK
     from hipsta_bids.participant.export import export_surfaces  # noqa: PLC0415  (heavy)
