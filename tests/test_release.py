@@ -41,6 +41,29 @@ def test_the_recipe_has_the_dependencies_of_the_package():
     assert project["requires-python"] == f">={recipe['context']['python_min']}"
 
 
+def test_dependencies_have_lower_bounds_only():
+    """What has an upper bound needs a reason beside it in pyproject.toml, and a line here."""
+    project = tomllib.loads(read("pyproject.toml"))["project"]
+    extras = project["optional-dependencies"].values()
+    names = [*project["dependencies"], *(name for extra in extras for name in extra)]
+    bounds = [one.operator for name in names for one in Requirement(name).specifier]
+    assert len(bounds) > len(project["dependencies"])
+    assert set(bounds) == {">="}
+
+
+def test_ci_installs_the_wheel_on_each_python_that_is_named():
+    jobs = yaml.safe_load(read(".github/workflows/test.yml"))["jobs"]
+    named = {
+        line.rpartition(":: ")[2]
+        for line in tomllib.loads(read("pyproject.toml"))["project"]["classifiers"]
+        if re.search(r"Python :: 3\.\d", line)
+    }
+    for name in ("test", "install"):
+        assert set(jobs[name]["strategy"]["matrix"]["python"]) == named
+    assert jobs["install"]["steps"][-1]["run"].split()[0] == "tools/test-install"
+    assert (ROOT / "tools" / "test-install").is_file()
+
+
 def test_the_definition_for_apptainer_converts_this_image():
     text = read("descriptors/hipsta_bids.def")
     assert f"From: hipsta_bids:{hipsta_bids.__version__}" in text
