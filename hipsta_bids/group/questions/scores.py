@@ -183,7 +183,9 @@ def fit_summaries(
             )
 
     fit(model.formula, rows_of(design), lambda _: True)
-    if not fits:
+    if not any(
+        data.grows_with_head(str(name)) for columns, *_ in fits.values() for name in columns
+    ):
         return fits, []
     if icv is None:
         return fits, [f"{data.SIZES} are not adjusted: no intracranial volume is known"]
