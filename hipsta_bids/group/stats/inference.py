@@ -487,9 +487,9 @@ def correct(
         for test in fit.tests
     }
     if rules.method not in PERMUTATIONS:
-        found = discover({key: test.p for key, test in tests.items()}, rules)
+        discoveries = discover({key: test.p for key, test in tests.items()}, rules)
         return {
-            key: found[key].at_least(test.p) if test.contrast.side else found[key]
+            key: discoveries[key].at_least(test.p) if test.contrast.side else discoveries[key]
             for key, test in tests.items()
         }
     permuted = _permuted(
