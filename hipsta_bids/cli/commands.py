@@ -8,7 +8,7 @@ from hipsta_bids.cli import parser as parsing
 from hipsta_bids.cli import participant
 from hipsta_bids.cli.console import echo, echo_table, warn
 from hipsta_bids.cli.parser import Parser, bids_label, from_namespace, given_settings, parser_of
-from hipsta_bids.errors import ExitCode, UsageError
+from hipsta_bids.errors import ExitCode, MissingFileError, UsageError
 
 _DEMO_PROTOCOL = "freesurfer"  # the layout that the demo dataset has
 
@@ -343,6 +343,8 @@ def run_resample(arguments: Sequence[str]) -> ExitCode:
 def run_export(arguments: Sequence[str]) -> ExitCode:
     """Write surfaces and maps in formats of other programs."""
     options = export_parser().parse_intermixed_args(arguments)
+    if not options.output_dir.is_dir():
+        raise MissingFileError(f"{options.output_dir}: folder not found; check its name")
     if options.format == "template":
         from hipsta_bids.group.output.template import export_template  # noqa: PLC0415  (heavy)
 
