@@ -368,6 +368,12 @@ def register_side(
         people = pd.factorize(cohort.table[PARTICIPANT].iloc[side.rows])[0]
         profiles = pd.DataFrame(profiles).groupby(people).transform("mean").to_numpy()
     if templates is None:
+        least = settings.registration.min_subjects
+        if settings.registration.align == "registr" and len(profiles) < least:
+            raise ModelError(
+                f"registration: {len(profiles)} profiles are too few for a template (least"
+                f" {least}); use --align none or --template FILE"
+            )
         result = registration.register(profiles, settings.registration)
     else:
         result = registration.register_to(profiles, templates[hemi], settings.registration)
