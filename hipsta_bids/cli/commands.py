@@ -1,6 +1,7 @@
 """The other commands: protocols, settings, the demonstration, phantoms and others."""
 
 import argparse
+import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -297,6 +298,15 @@ def run_compare(arguments: Sequence[str]) -> ExitCode:
     return ExitCode.OK
 
 
+#: Options of ``figure`` by the words of Python's messages about its arguments.
+_FIGURE_OPTIONS = {
+    "^(measures|contrasts)(?= is|: )": r"--\1",
+    "^participant: ": "--participant-label: ",
+    "; give the name of one: ": "; give one by --name: ",
+    ": give the session, one of ": ": give --session-label, one of ",
+}
+
+
 def draw_figure(arguments: Sequence[str]) -> ExitCode:
     """Draw a figure for a paper from results."""
     options = figure_parser().parse_intermixed_args(arguments)
@@ -321,8 +331,11 @@ def draw_figure(arguments: Sequence[str]) -> ExitCode:
             dpi=options.dpi,
             file=options.output,
         )
-    except ValueError as error:  # a name that is not there
-        raise UsageError(str(error)) from error
+    except (ValueError, UsageError) as error:  # a name that is not there
+        message = str(error)
+        for words, option in _FIGURE_OPTIONS.items():
+            message = re.sub(words, option, message)
+        raise UsageError(message) from error
     echo(f"figure: {options.output}")
     return ExitCode.OK
 
