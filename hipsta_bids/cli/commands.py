@@ -1,6 +1,7 @@
 """The other commands: protocols, settings, the demonstration, phantoms and others."""
 
 import argparse
+import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -8,7 +9,7 @@ from hipsta_bids.cli import parser as parsing
 from hipsta_bids.cli import participant
 from hipsta_bids.cli.console import echo, echo_table, warn
 from hipsta_bids.cli.parser import Parser, bids_label, from_namespace, given_settings, parser_of
-from hipsta_bids.errors import ExitCode, UsageError
+from hipsta_bids.errors import ExitCode, MissingFileError, UsageError
 
 _DEMO_PROTOCOL = "freesurfer"  # the layout that the demo dataset has
 
@@ -297,6 +298,15 @@ def run_compare(arguments: Sequence[str]) -> ExitCode:
     return ExitCode.OK
 
 
+#: Options of ``figure`` by the words of Python's messages about its arguments.
+_FIGURE_OPTIONS = {
+    "^(measures|contrasts)(?= is|: )": r"--\1",
+    "^participant: ": "--participant-label: ",
+    "; give the name of one: ": "; give one by --name: ",
+    ": give the session, one of ": ": give --session-label, one of ",
+}
+
+
 def draw_figure(arguments: Sequence[str]) -> ExitCode:
     """Draw a figure for a paper from results."""
     options = figure_parser().parse_intermixed_args(arguments)
@@ -321,8 +331,11 @@ def draw_figure(arguments: Sequence[str]) -> ExitCode:
             dpi=options.dpi,
             file=options.output,
         )
-    except ValueError as error:  # a name that is not there
-        raise UsageError(str(error)) from error
+    except (ValueError, UsageError) as error:  # a name that is not there
+        message = str(error)
+        for words, option in _FIGURE_OPTIONS.items():
+            message = re.sub(words, option, message)
+        raise UsageError(message) from error
     echo(f"figure: {options.output}")
     return ExitCode.OK
 
@@ -343,6 +356,8 @@ def run_resample(arguments: Sequence[str]) -> ExitCode:
 def run_export(arguments: Sequence[str]) -> ExitCode:
     """Write surfaces and maps in formats of other programs."""
     options = export_parser().parse_intermixed_args(arguments)
+    if not options.output_dir.is_dir():
+        raise MissingFileError(f"{options.output_dir}: folder not found; check its name")
     if options.format == "template":
         from hipsta_bids.group.output.template import export_template  # noqa: PLC0415  (heavy)
 

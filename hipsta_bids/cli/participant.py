@@ -4,7 +4,7 @@ import argparse
 import os
 import re
 import shlex
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -186,6 +186,18 @@ def run_participant_level(options: "Namespace", arguments: Sequence[str] = ()) -
         return _run(options, arguments)
 
 
+def _echo_notes(notes: Iterable[str], items: Sequence["HemisphereInput"]) -> None:
+    """Print notes on inputs, and a warning for each map of which no hemisphere has a file."""
+    for note in notes:
+        console.echo(f"note: {note}")
+    for requests in zip(*(item.maps for item in items), strict=True):
+        if not any(request.path for request in requests):
+            console.warn(
+                f"warning: --map {requests[0].name}: no hemisphere has this map; check the pattern"
+                f" {requests[0].pattern}"
+            )
+
+
 def _run(options: "Namespace", arguments: Sequence[str]) -> ExitCode:
     pin_threads()
     for name, reason in dict(options.ignored).items():
@@ -226,8 +238,7 @@ def _run(options: "Namespace", arguments: Sequence[str]) -> ExitCode:
     )
     unused = (*findings.ignored, *findings.other_entries)
     inputs = account.input_table(items, unused, options.bids_dir)
-    for note in notes:
-        console.echo(f"note: {note}")
+    _echo_notes(notes, items)
     counts = f"inputs: {account.count_inputs(inputs)}"
     if options.dry_run:
         console.echo(counts)

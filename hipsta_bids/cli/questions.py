@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from hipsta_bids.cli.parser import Parser, adder, factor_level
-from hipsta_bids.errors import UsageError
+from hipsta_bids.errors import UsageError, did_you_mean
 
 if TYPE_CHECKING:
     from hipsta_bids.group.design.settings import GroupSettings
@@ -93,8 +93,12 @@ def _effect(text: str) -> tuple[str, float]:
         value = float(share.removesuffix("%")) / 100
     except ValueError:
         value = 0.0
-    if kind not in {"thinning", "slowing"} or not share.endswith("%") or not 0 < value <= 1:
-        raise argparse.ArgumentTypeError(f"{text!r} is not of the form thinning=5% or slowing=25%")
+    kinds = ("thinning", "slowing")
+    if kind not in kinds or not share.endswith("%") or not 0 < value <= 1:
+        hint = "" if kind in kinds else did_you_mean([kind], kinds)
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is not of the form thinning=5% or slowing=25%{hint}"
+        )
     return kind, value
 
 

@@ -366,6 +366,14 @@ Nested = dict[str, dict[str, dict[str, list[Any]]]]
 #: Characters of a mistake in a file.
 _LONGEST = 300
 
+#: Keys of the group level's files, in lower case, of which no other file has all.
+_FOREIGN_KINDS = {
+    "a summary of --export-summary": {"site", "axes", "models"},
+    "norms of --fit-norms": {"knots", "norms"},
+    "the harmonization.json of an analysis": {"repeated", "maps", "summaries"},
+    "a template of registration": {"hemispheres"},
+}
+
 
 def read_foreign(path: Path, kind: type[Table], *, max_bytes: float) -> Table:
     """Read a JSON file of another site, which may hold anything; nothing in it is run.
@@ -374,7 +382,12 @@ def read_foreign(path: Path, kind: type[Table], *, max_bytes: float) -> Table:
     """
     if path.is_file() and path.stat().st_size > max_bytes:
         raise ValueError(f"larger than {max_bytes / 1e6:g} MB")
-    return checked_foreign(read_json(path, max_bytes), kind)
+    content = read_json(path, max_bytes)
+    present_keys = {str(key).casefold() for key in content}
+    for name, keys in _FOREIGN_KINDS.items():
+        if keys <= present_keys and not keys <= set(kind.model_fields):
+            raise ValueError(f"it is {name}")
+    return checked_foreign(content, kind)
 
 
 def checked_foreign(content: object, kind: type[Table]) -> Table:

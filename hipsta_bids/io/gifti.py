@@ -44,7 +44,7 @@ from nibabel.gifti.gifti import (
 from nibabel.spatialimages import HeaderDataError
 from numpy.typing import ArrayLike, NDArray
 
-from hipsta_bids.errors import InputError, UsageError
+from hipsta_bids.errors import InputError, MissingFileError, UsageError
 from hipsta_bids.io import files
 from hipsta_bids.io.hippunfold import has_opposite_sign, suffix
 from hipsta_bids.opening import TABLE, open_regular, read_bounded
@@ -354,6 +354,8 @@ def _load(path: Path, kind: type[Image]) -> Image:
         _check_claims(path)
         with warnings.catch_warnings(action="ignore"):  # of what is checked below, or harmless
             image = nib.load(path)
+    except FileNotFoundError as error:
+        raise MissingFileError(f"{path}: file not found; check its name") from error
     except _DAMAGE as error:
         raise _unreadable(path, format_name, error) from error
     if not isinstance(image, kind):
@@ -400,6 +402,8 @@ def read_surface(path: Path) -> Mesh:
         open_regular(path).close()
         mesh = importlib.import_module(f"meshio.{path.suffix[1:]}").read(path)
         points, triangles = mesh.points, mesh.get_cells_type("triangle")
+    except FileNotFoundError as error:
+        raise MissingFileError(f"{path}: file not found; check its name") from error
     except Exception as error:  # of any kind: meshio checks little
         raise InputError(
             f"{path}: not readable as {path.suffix[1:].upper()}; write it again"

@@ -105,14 +105,20 @@ def test_files_are_written_in_the_format_of_their_name(out, tmp_path, capsys, ki
 @pytest.mark.parametrize(
     ("given", "outcome"),
     [
-        (["group"], (64, "several analyses; give the name of one: first, second")),
+        (["group"], (64, "several analyses; give one by --name: first, second")),
         (["roc", "--name", "second"], (66, "no classification")),
         (["registration", "--name", "second"], (66, "no registration")),
         (["group", "--name", "fist"], (66, "did you mean first")),
-        (["group", "--name", "first", "--measures", "volume"], (64, "choose 'thickness'")),
-        (["contrast", "--name", "first", "--contrasts", "AD-CN"], (64, "choose 'CN-AD'")),
+        (
+            ["group", "--name", "first", "--measures", "volume"],
+            (64, "--measures is 'volume'; choose 'thickness'"),
+        ),
+        (
+            ["contrast", "--name", "first", "--contrasts", "AD-CN"],
+            (64, "--contrasts is 'AD-CN'; choose 'CN-AD'"),
+        ),
         (["contrast", "--name", "first", "--limits", "1", "0"], (64, "exchange them")),
-        (["participant"], (64, "name the participant")),
+        (["participant"], (64, "--participant-label: name the participant")),
         (["participant", "--participant-label", "99"], (66, "no map of sub-99")),
     ],
 )
@@ -128,6 +134,8 @@ def test_what_is_not_there_is_told_in_one_line(out, tmp_path, capsys, given, out
 def test_errors_in_python_name_arguments(out, tmp_path):
     with pytest.raises(UsageError, match="give the name of one"):
         hb.figure("group", out)
+    with pytest.raises(ValueError, match=r"^contrasts is 'AD-CN'; choose 'CN-AD'"):
+        hb.figure("contrast", out, name="first", contrasts=["AD-CN"])
     with pytest.raises(UsageError, match=r"use \.pdf, \.svg or \.png"):
         hb.figure("group", out, name="first", file=tmp_path / "a.gif")
     with pytest.raises(ValueError, match="what is 'map'; choose 'participant' or"):

@@ -2,7 +2,7 @@ import meshio
 import numpy as np
 import pytest
 
-from hipsta_bids.errors import InputError, UsageError
+from hipsta_bids.errors import InputError, MissingFileError, UsageError
 from hipsta_bids.io.gifti import ENDINGS, read_surface, sheet_triangles, write_surface
 from hipsta_bids.types import Mesh
 
@@ -46,6 +46,12 @@ def test_damaged_files_are_refused(tmp_path, ending, content):
     path.write_bytes(content)
     with pytest.raises(InputError, match=r"write it again"):
         read_surface(path)
+
+
+@pytest.mark.parametrize("ending", [*ENDINGS, ".surf.gii"])
+def test_missing_files_are_not_found(tmp_path, ending):
+    with pytest.raises(MissingFileError, match="file not found; check its name"):
+        read_surface(tmp_path / f"average{ending}")
 
 
 def test_other_endings_are_refused(tmp_path):

@@ -84,6 +84,7 @@ def test_surfaces_for_viewers_have_all_maps(results, tmp_path, kind):
 
 def test_wrong_use_is_one_line(results, tmp_path, capsys):
     cases = (
+        ([tmp_path / "none", tmp_path], 65, "none: folder not found; check its name"),
         ([results, tmp_path, "--seg", "none"], 66, "check --seg and --region"),
         ([results, tmp_path, "--format", "vtk", "--space-of", "a{subject}.mgz"], 64, "omit it"),
         ([results, tmp_path, "--space-of", tmp_path / "{subject}.mgz"], 65, "file not found"),

@@ -354,11 +354,13 @@ def test_a_dry_run_says_which_maps_there_are(bids_dir, tmp_path, capsys):
     options = ["--map", f"half={pattern('half_hemi-{hemi}')}", "all=sub-*/anat/*_T1w.nii.gz"]
     options += ["many=sub-*/anat/*.nii.gz", "fs=derivatives/*/sub-{subject}/mri/{side}.*.mgz"]
     assert run(bids_dir, tmp_path / "out", "--dry-run", *options, hemi="LR") == ExitCode.OK
-    said = capsys.readouterr().out
+    said, warnings = capsys.readouterr()
     assert "map half: 1 of 2 hemispheres have a file; not sub-01 hemi-R (no file sub-01" in said
     assert "map all: 2 of 2 hemispheres\n" in said
     assert "map fs: 2 of 2 hemispheres\n" in said
     assert "map many: 0 of 2 hemispheres have a file; not sub-01 hemi-L (11 files match" in said
+    absent = "no hemisphere has this map; check the pattern sub-*/anat/*.nii.gz"
+    assert warnings == f"warning: --map many: {absent}\n"
 
 
 def test_sessions_are_filled_in(bids_dir, tmp_path, capsys):

@@ -89,8 +89,11 @@ def choose_visits(cohort: Cohort, comparison: Comparison) -> tuple[Cohort, Mappi
     named = comparison.pair or comparison.endpoint[1:]
     sessions = sorted(table[SESSION].dropna().unique())
     if unknown := sorted(set(named) - set(sessions)):
+        option = "--paired" if comparison.pair else "--endpoint"
+        if not sessions:
+            raise ModelError(f"{option}: no sessions in this dataset; remove it")
         raise ModelError(
-            f"there is no session {listed(unknown)}, only {listed(sessions) or 'none'}"
+            f"{option}: there is no session {listed(unknown)}, only {listed(sessions)}"
         )
     if comparison.endpoint:
         in_trial = table[SESSION].isin(named).to_numpy()

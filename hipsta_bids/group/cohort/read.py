@@ -57,10 +57,9 @@ def choose_measures(
         elif name in summaries or name.startswith(VOLUME):
             numbers.append(name)
         else:
-            ending = " ..." if len(available) > _MOST_NAMES else ""
-            raise _unknown(
-                name, available, f"there are {', '.join(available[:_MOST_NAMES])}{ending}"
-            )
+            names = list(dict.fromkeys(available))  # maps and summary measures share some
+            ending = " ..." if len(names) > _MOST_NAMES else ""
+            raise _unknown(name, names, f"there are {', '.join(names[:_MOST_NAMES])}{ending}")
     return Measures(maps=tuple(maps), summaries=tuple(numbers) or None)
 
 

@@ -12,7 +12,7 @@ import pandas as pd
 from formulaic import Formula
 from numpy.typing import NDArray
 
-from hipsta_bids.errors import ModelError
+from hipsta_bids.errors import ModelError, did_you_mean
 from hipsta_bids.group.design import contrasts as texts
 from hipsta_bids.group.design.contrasts import ContrastSpec, contrast_json, refusal
 from hipsta_bids.group.design.grammar import CONTEXT, closed_formula
@@ -397,7 +397,8 @@ def set_levels(
             variables[name] = pd.Categorical(variables[name], categories=levels[name])
     if unknown := sorted(set(references) - set(levels)):
         raise ModelError(
-            f"model: reference level given for {listed(unknown)}, which is no factor of the model"
+            f"model: reference level given for {listed(unknown)}, which is no factor of the model;"
+            f" its factors: {listed(levels) or 'none'}{did_you_mean(unknown, levels)}"
         )
     return levels
 
@@ -428,7 +429,7 @@ def _levels(
     if small:
         raise ModelError(
             f"model: too few complete rows in {name!r}: {listed(small)}; at least"
-            f" {settings.min_level} are needed"
+            f" {settings.min_level} are needed; merge levels or remove {name}"
         )
     levels.remove(first)
     return [first, *levels]

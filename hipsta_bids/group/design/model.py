@@ -295,6 +295,10 @@ def model_document(
             f'{available}; or give --formula "age + sex" --contrast age'
         )
     time = visits.column if visits else None
+    if has_changes and not table[PARTICIPANT].duplicated().any():
+        raise ModelError(
+            "longitudinal model: no participant has a second session; remove --longitudinal"
+        )
     if has_changes and time is None:
         raise ModelError(
             "the default longitudinal model needs the time of each session: a column"

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from hipsta_bids.errors import UsageError
+from hipsta_bids.errors import UsageError, did_you_mean
 
 #: Column of visits as categories, by the labels of sessions.
 VISIT = "visit"
@@ -17,9 +17,10 @@ def check_endpoint(endpoint: tuple[str, ...]) -> None:
     sessions = endpoint[1:]
     is_valid = endpoint[0] in ENDPOINTS and len(set(sessions)) == len(sessions)
     if not is_valid or len(endpoint) < _SHORTEST:
+        hint = "" if endpoint[0] in ENDPOINTS else did_you_mean(endpoint[:1], ENDPOINTS)
         raise UsageError(
             f"--endpoint {' '.join(endpoint)}: give ancova, mmrm or clda, the session of the"
-            " baseline, and later sessions"
+            f" baseline, and later sessions{hint}"
         )
     if endpoint[0] == "ancova" and len(endpoint) > _SHORTEST:
         raise UsageError("--endpoint ancova has one later session; use mmrm for several")

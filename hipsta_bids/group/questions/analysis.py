@@ -246,14 +246,18 @@ def _check_visits(
     is_harmonized: bool,
 ) -> None:
     """Refuse what models of visits as categories cannot do."""
+    method = settings.multiplicity.method
+    option = f"--endpoint {comparison.endpoint[0]}" if comparison.endpoint else ""
     excluded = {
-        "--correction permutation": settings.multiplicity.method in inference.PERMUTATIONS,
+        f"--correction {method}": method in inference.PERMUTATIONS,
         "--joint": bool(settings.joint.measures),
         "--harmonize": bool(comparison.endpoint) and is_harmonized,
         "map() in the formula": bool(maps),
     }
     if problems := [name for name, is_asked in excluded.items() if is_asked]:
-        raise ModelError(f"visits as categories: not with {listed(problems)}; remove it")
+        raise ModelError(
+            f"{option or '--longitudinal visits'}: not with {listed(problems)}; remove it"
+        )
 
 
 def _check_margins(design: designs.Design, cohort: data.Cohort, measures: data.Measures) -> None:
@@ -368,6 +372,12 @@ def register_side(
         people = pd.factorize(cohort.table[PARTICIPANT].iloc[side.rows])[0]
         profiles = pd.DataFrame(profiles).groupby(people).transform("mean").to_numpy()
     if templates is None:
+        least = settings.registration.min_subjects
+        if settings.registration.align == "registr" and len(profiles) < least:
+            raise ModelError(
+                f"registration: {len(profiles)} profiles are too few for a template (least"
+                f" {least}); use --align none or --template FILE"
+            )
         result = registration.register(profiles, settings.registration)
     else:
         result = registration.register_to(profiles, templates[hemi], settings.registration)

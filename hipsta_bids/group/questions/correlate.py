@@ -10,6 +10,7 @@ import pandas as pd
 from numpy.typing import ArrayLike
 
 from hipsta_bids.errors import InputError, UsageError, did_you_mean, in_python
+from hipsta_bids.group.design.formula import listed
 from hipsta_bids.group.output import style, write
 from hipsta_bids.group.output.citations import Citations, escaped
 from hipsta_bids.group.output.tables import CORRELATION_COLUMNS
@@ -115,7 +116,14 @@ def _read(text: str, hemi: str) -> Float:
         raise InputError(
             f"{path}: no column {min(unknown)!r}{did_you_mean([min(unknown)], columns)}"
         )
-    cells = [row[column] for row in rows if all(row[key] == value for key, value in pairs)]
+    for number, (key, value) in enumerate(pairs, start=1):
+        levels = sorted({row[key] for row in rows})
+        if value not in levels:
+            raise InputError(
+                f"{path}: no row has {' and '.join(conditions[:number])}; {key} is {listed(levels)}"
+            )
+        rows = [row for row in rows if row[key] == value]
+    cells = [row[column] for row in rows]
     try:
         return np.array([np.nan if files.is_missing(cell) else float(cell) for cell in cells])
     except ValueError as error:

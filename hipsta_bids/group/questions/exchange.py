@@ -163,8 +163,7 @@ def write_summary(path: Path, summary: Mapping[str, Any]) -> None:
 
 def read_summary(path: Path) -> SiteSummary:
     """Read and check a summary of another site, which may hold anything."""
-    path = path / SUMMARY if path.is_dir() else path
-    if not path.exists():
+    if path.is_dir() and not (path := path / SUMMARY).exists():
         raise InputError(f"{path}: no summary; it is written by `group --export-summary`")
     try:
         summary = read_foreign(path, SiteSummary, max_bytes=_MOST_BYTES)

@@ -171,7 +171,7 @@ def _check(profiles: Float, settings: RegistrationSettings) -> float | None:
     if len(profiles) < settings.min_subjects:
         raise ModelError(
             f"registration: {len(profiles)} profiles are too few for a template (least"
-            f" {settings.min_subjects}); use align none, or a template of another cohort"
+            f" {settings.min_subjects}); add sheets or lower min_subjects"
         )
     scale = float(profiles.std())
     if scale <= np.finfo(np.float64).eps * float(np.abs(profiles).max()):

@@ -10,7 +10,7 @@ from small_cohorts import NODES, PLAN, place_of, table, write_dataset
 from hipsta_bids.cli.main import main
 from hipsta_bids.errors import InputError
 from hipsta_bids.geometry.sampling import SampledMap
-from hipsta_bids.group.cohort.read import choose_measures
+from hipsta_bids.group.cohort.read import SHEET_MAPS, choose_measures
 from hipsta_bids.group.design.formula import left_side
 from hipsta_bids.group.output import write
 from hipsta_bids.group.output.tables import COLUMNS
@@ -108,6 +108,15 @@ def test_model_of_a_summary_measure_has_no_maps(dataset, quick):
     assert not list(folder.glob("*_statmap.*"))
     assert not (folder / "peaks.tsv").exists()
     assert "volume" in json.loads((folder / "analysis.json").read_text())["measures"]["summaries"]
+
+
+def test_unknown_measures_list_each_known_one_once(dataset, capsys, monkeypatch):
+    summary = {"extent_x": 20.0, "extent_y": 9.0, "volume": 500.0, "area_mid": 100.0}
+    monkeypatch.setattr("hipsta_bids.derivatives.hemisphere.read_summary", lambda _: summary)
+    assert run(dataset, [], "--measures", "xyz")[0] == 65
+    names = capsys.readouterr().err.strip().partition("; there are ")[2].split(", ")
+    assert set(names) == {*SHEET_MAPS, "T2", *summary}
+    assert len(names) == len(set(names))
 
 
 @pytest.mark.parametrize(

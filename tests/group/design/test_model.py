@@ -135,7 +135,12 @@ def with_value(value, *rows):
 REFUSALS = {
     "unknown-variable": ("group + aeg", {}, {}, "did you mean age"),
     "not-numeric": ("group + age", {"age": with_value("old", "sub-04")}, {}, "rows sub-04"),
-    "group-size": ("group", {"group": with_value("rare", "sub-04")}, {}, r"rare \(1\)"),
+    "group-size": (
+        "group",
+        {"group": with_value("rare", "sub-04")},
+        {},
+        r"rare \(1\).*merge levels or remove group",
+    ),
     "constant-column": ("group + site", {}, {}, "all 60 complete rows have 'site' one"),
     "unknown-level": ("group", {}, {"group": "HC"}, "no level 'HC'"),
     "design-rank": ("age + I(2 * age) + sex", {}, {}, "is a combination of"),
@@ -163,8 +168,10 @@ def test_more_refusals():
         design("group + age", table=table.iloc[:6], settings=SETTINGS.changed(min_level=2))
     with pytest.raises(ModelError, match="did you mean group"):
         design("group + age", ["group[CU]-group[DTA]"])
-    with pytest.raises(ModelError, match="which is no factor"):
+    with pytest.raises(ModelError, match=r"no factor of the model; its factors: group$"):
         design("group", references={"sex": "F"})
+    with pytest.raises(ModelError, match=r"did you mean group\?"):
+        design("group", references={"grp": "CN"})
 
 
 def test_expressions():

@@ -290,6 +290,11 @@ def test_asymmetry_is_left_minus_right_in_the_same_model(dataset, quick):
         (["--paired", "1", "9"], 65, "there is no session ses-9"),
         (["--paired", "1", "2", "--longitudinal"], 64, "not both"),
         (
+            ["--longitudinal", "--session-label", "1"],
+            65,
+            "longitudinal model: no participant has a second session; remove --longitudinal",
+        ),
+        (
             [
                 *("--longitudinal", "intercept", "--correction", "permutation-tfce"),
                 *("--blocks", "session_id", "--measures", "thickness"),
@@ -321,6 +326,13 @@ def test_refusals(sessions, capsys, options, code, message):
     assert main([str(data), str(out), "group", *ALIGNED, *options]) == code
     assert message in capsys.readouterr().err
     assert (sorted((out / "group").glob("*")) if (out / "group").exists() else []) == before
+
+
+@pytest.mark.parametrize("options", [["--paired", "a", "b"], ["--endpoint", "mmrm", "a", "b"]])
+def test_a_dataset_without_sessions_has_none_to_compare(dataset, capsys, options):
+    data, out = dataset
+    assert main([str(data), str(out), "group", *options]) == 65
+    assert f"{options[0]}: no sessions in this dataset" in capsys.readouterr().err
 
 
 def test_w_scores_are_those_of_a_model_without_the_participant(dataset, quick):

@@ -376,7 +376,9 @@ def test_wrong_use_is_one_line(plain, tmp_path, capsys):
             64,
             "summaries have no participants to permute",
         ),
-        ([first, str(tmp_path / "none.json")], 65, "no summary"),
+        ([first, str(tmp_path / "none.json")], 65, "file not found; check its name"),
+        (["--norms", first, second], 65, "not a file of norms (it is a summary of"),
+        ([first, str(tmp_path)], 65, "no summary; it is written by `group --export-summary`"),
     ):
         assert main(["meta", *arguments, str(tmp_path / "out")]) == code
         error = capsys.readouterr().err

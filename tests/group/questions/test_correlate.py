@@ -67,6 +67,8 @@ def test_files_and_arrays_have_the_same_correlation(folder, capsys):
         ("means.tsv:mena", "a", 65, "no column 'mena'; did you mean mean?"),
         ("means.tsv:group", "a", 65, "column group has other cells than numbers"),
         ("means.tsv:mean:group=AD", "a", 65, "one value everywhere"),
+        ("means.tsv:mean:group=MCI", "a", 65, "no row has group=MCI; group is AD, CN"),
+        ("two.shape.gii", "a", 65, "two.shape.gii: file not found; check its name"),
         ("one.shape.gii", ".", 64, "exists and is no correlation"),
     ],
 )
@@ -77,3 +79,21 @@ def test_problems_are_one_line(folder, capsys, second, out, code, said):  # noqa
     error = capsys.readouterr().err
     assert said in error, error
     assert error.count("\n") == 1
+
+
+def test_a_missing_surface_is_not_found(folder, capsys):
+    root, *_ = folder
+    one = str(root / "one.shape.gii")
+    surface = root / "none.surf.gii"
+    assert main(["correlate", one, one, str(root / "a"), "--surface", str(surface)]) == 65
+    assert f"{surface}: file not found; check its name" in capsys.readouterr().err
+
+
+def test_conditions_are_combined(folder, tmp_path, capsys):
+    root, *_ = folder
+    table = tmp_path / "means.tsv"
+    table.write_text("hemi\tgroup\tmean\nL\tCN\t1\nR\tAD\t2\n")
+    choice = f"{table}:mean:hemi=L:group=AD"
+    command = ["correlate", choice, choice, str(tmp_path / "a")]
+    assert main([*command, "--surface", str(root / "mid.surf.gii")]) == 65
+    assert "no row has hemi=L and group=AD; group is CN" in capsys.readouterr().err

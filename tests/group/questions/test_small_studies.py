@@ -51,7 +51,8 @@ def test_eight_participants_are_compared_without_registration(eight, capsys):
 
 def test_registration_that_is_asked_for_is_refused(eight, capsys, tmp_path):
     assert call(eight, "--name", "asked", "--align", "registr") == 65
-    assert "8 profiles are too few for a template (least 10)" in capsys.readouterr().err
+    said = "8 profiles are too few for a template (least 10); use --align none or --template FILE"
+    assert said in capsys.readouterr().err
     settings = tmp_path / "group.toml"
     settings.write_text('[registration]\nalign = "registr"\n')
     assert call(eight, "--name", "asked", "--settings", str(settings)) == 65

@@ -224,6 +224,7 @@ def test_equivalence_has_two_sides_of_one_difference(trial, capsys):
     [
         (["--endpoint", "clda", "base"], 64, "later sessions"),
         (["--endpoint", "lmm", "base", "m12"], 64, "give ancova, mmrm or clda"),
+        (["--endpoint", "mmrmm", *SESSIONS], 64, "later sessions; did you mean mmrm?"),
         (["--endpoint", "ancova", *SESSIONS], 64, "use mmrm for several"),
         (["--endpoint", "clda", "base", "m12", "--paired", "base", "m12"], 64, "give one of"),
         (["--endpoint", "clda", "base", "m18"], 65, "no session ses-m18"),
@@ -232,7 +233,12 @@ def test_equivalence_has_two_sides_of_one_difference(trial, capsys):
         (
             ["--longitudinal", "visits", "--correction", "permutation-max"],
             65,
-            "not with --correction permutation",
+            "--longitudinal visits: not with --correction permutation-max; remove it",
+        ),
+        (
+            ["--endpoint", "mmrm", *SESSIONS, "--correction", "permutation-tfce"],
+            65,
+            "--endpoint mmrm: not with --correction permutation-tfce; remove it",
         ),
         (
             ["--longitudinal", "visits", "--formula", "arm * visit + map(curvature)"],

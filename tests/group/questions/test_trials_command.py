@@ -263,6 +263,7 @@ def test_harmonization_of_the_settings_is_refused(dataset, tmp_path, capsys):
     ("options", "code", "message"),
     [
         (["--power", "thinning=5"], 64, "not of the form thinning=5%"),
+        (["--power", "thining=5%"], 64, "slowing=25%; did you mean thinning?"),
         (["--power", "thinning=0%"], 64, "not of the form"),
         (["--power", "growth=5%"], 64, "not of the form"),
         (["--power", "slowing=25%"], 64, "--visits 0,12,24"),
