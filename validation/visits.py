@@ -134,7 +134,8 @@ def scan(
 def draw(person: Person) -> tuple[list[LabelVolume], str]:
     """Draw the visits of a person; return the hemisphere, too."""
     random = np.random.default_rng((SEED, person.seed))
-    loaded = [cases.load_body(source, 0.3) for source in person.sources]
+    bodies = {source: cases.load_body(source, 0.3) for source in dict.fromkeys(person.sources)}
+    loaded = [bodies[source] for source in person.sources]
     volumes = [volume for volume, _ in loaded]
     if person.voxels:
         volumes = [
