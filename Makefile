@@ -72,7 +72,7 @@ quick: $(STAMP)
 
 release: $(STAMP) validation
 	$(PYTEST) tests/validation
-	set -e; for script in tutorials faults fuzz container cluster reports long; do \
+	set -e; for script in tutorials faults fuzz container cluster reports long install; do \
 		PYTHON="$(BIN)/python" "tools/test-$$script"; done
 
 # All suites, on the real labels too where they are: LABELS=BIDS_DIR.

@@ -2,9 +2,11 @@
 
 import contextlib
 import io
+import os
 import re
 import shutil
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,6 +16,7 @@ selenium = pytest.importorskip("selenium", reason="selenium is not installed")
 from selenium import webdriver  # noqa: E402
 from selenium.webdriver.chrome.service import Service  # noqa: E402
 from selenium.webdriver.common.by import By  # noqa: E402
+from selenium.webdriver.common.keys import Keys  # noqa: E402
 
 FLAGS = (
     *("--headless", "--no-sandbox", "--disable-gpu", "--use-angle=swiftshader"),
@@ -124,6 +127,84 @@ return [seen, found];
 def faint(browser):
     """Count the visible texts of a page, and list those that are hard to read."""
     return browser.execute_script(_FAINT)
+
+
+#: Visible elements that react to keys, in the order of the page; of radio buttons one of a group.
+_CONTROLS = """
+const kinds = "a[href], button, input, select, textarea, summary, [tabindex]";
+const groups = new Set();
+return [...document.querySelectorAll(kinds)].filter((one) => {
+  if (one.tabIndex < 0 || one.disabled || one.type === "hidden") return false;
+  if (!one.checkVisibility({visibilityProperty: true}) || one.closest("[inert]")) return false;
+  if (one.type !== "radio") return true;
+  const known = groups.has(one.name);
+  groups.add(one.name);
+  return !known;
+});
+"""
+
+#: What has the focus: its group if it is a radio button, and whether a mark shows the focus.
+_FOCUS = """
+const one = document.activeElement, style = getComputedStyle(one);
+const mark = style.outlineStyle !== "none" && parseFloat(style.outlineWidth) >= 1;
+return [one, one.type === "radio" ? one.name : "", mark || style.boxShadow !== "none"];
+"""
+
+#: Roles that people operate; each needs a name.
+_OPERATED = {
+    *("button", "link", "checkbox", "radio", "combobox", "textbox", "searchbox", "slider"),
+    *("spinbutton", "listbox", "menuitem", "switch", "tab", "image", "region"),
+}
+
+
+def unreached(browser):
+    """Press Tab through a page: list controls that are passed over, or have no visible focus."""
+    controls = browser.execute_script(_CONTROLS)
+    browser.execute_script("document.activeElement.blur(); window.scrollTo(0, 0)")
+    groups, reached, faint_ones = set(), set(), []
+    for _ in range(len(controls) + 3):
+        webdriver.ActionChains(browser).send_keys(Keys.TAB).perform()
+        element, group, is_marked = browser.execute_script(_FOCUS)
+        if element.tag_name == "body":
+            continue
+        reached.add(element.id)
+        groups.add(group)
+        if not is_marked:
+            faint_ones.append(element.get_attribute("outerHTML")[:120])
+    passed_over = [
+        element.get_attribute("outerHTML")[:120]
+        for element in controls
+        if element.id not in reached
+        and not (
+            element.get_attribute("type") == "radio" and element.get_attribute("name") in groups
+        )
+    ]
+    return len(controls), passed_over, faint_ones
+
+
+def unnamed(browser):
+    """Count the controls and pictures in the tree for screen readers; list those without a name."""
+    nodes = browser.execute_cdp_cmd("Accessibility.getFullAXTree", {})["nodes"]
+    roles = [
+        (node["role"]["value"], node.get("name", {}).get("value", "").strip())
+        for node in nodes
+        if not node["ignored"] and node["role"]["value"] in _OPERATED
+    ]
+    return len(roles), [role for role, name in roles if not name]
+
+
+def violations(browser):
+    """List what axe-core finds, if ``HIPSTA_BIDS_AXE`` names its file (``npm pack axe-core``)."""
+    file = os.environ.get("HIPSTA_BIDS_AXE")
+    if not file:
+        pytest.skip("HIPSTA_BIDS_AXE does not name axe.min.js")
+    browser.execute_script(Path(file).read_text("utf-8"))
+    script = "axe.run().then(arguments[0], (error) => arguments[0]({error: String(error)}))"
+    report = browser.execute_async_script(script)
+    assert len(report["passes"]) > 10, report.get("error")
+    return [
+        (one["id"], node["html"][:160]) for one in report["violations"] for node in one["nodes"]
+    ]
 
 
 def one(browser, selector):

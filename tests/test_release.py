@@ -1,5 +1,6 @@
 """Files of a release: one version, one list of dependencies, and places for persons to decide."""
 
+import fnmatch
 import json
 import re
 import tomllib
@@ -10,6 +11,8 @@ import yaml
 from packaging.requirements import Requirement
 
 import hipsta_bids
+from hipsta_bids.cli.participant import build_parser
+from hipsta_bids.derivatives.names import HemisphereName, output_name
 
 ROOT = Path(__file__).parents[1]
 #: Names of packages at conda-forge; the second is missing there (docs/release.md).
@@ -38,9 +41,78 @@ def test_the_recipe_has_the_dependencies_of_the_package():
     assert project["requires-python"] == f">={recipe['context']['python_min']}"
 
 
+def test_dependencies_have_lower_bounds_only():
+    """What has an upper bound needs a reason beside it in pyproject.toml, and a line here."""
+    project = tomllib.loads(read("pyproject.toml"))["project"]
+    extras = project["optional-dependencies"].values()
+    names = [*project["dependencies"], *(name for extra in extras for name in extra)]
+    bounds = [one.operator for name in names for one in Requirement(name).specifier]
+    assert len(bounds) > len(project["dependencies"])
+    assert set(bounds) == {">="}
+
+
+def test_ci_installs_the_wheel_on_each_python_that_is_named():
+    jobs = yaml.safe_load(read(".github/workflows/test.yml"))["jobs"]
+    named = {
+        line.rpartition(":: ")[2]
+        for line in tomllib.loads(read("pyproject.toml"))["project"]["classifiers"]
+        if re.search(r"Python :: 3\.\d", line)
+    }
+    for name in ("test", "install"):
+        assert set(jobs[name]["strategy"]["matrix"]["python"]) == named
+    assert jobs["install"]["steps"][-1]["run"].split()[0] == "tools/test-install"
+    assert (ROOT / "tools" / "test-install").is_file()
+
+
 def test_the_definition_for_apptainer_converts_this_image():
     text = read("descriptors/hipsta_bids.def")
     assert f"From: hipsta_bids:{hipsta_bids.__version__}" in text
+
+
+def test_the_pipeline_of_nipoppy_is_this_version_with_options_that_exist():
+    folder = ROOT / "descriptors" / "nipoppy" / "hipsta_bids"
+    parts = {path.stem: json.loads(path.read_text(encoding="utf-8")) for path in folder.iterdir()}
+    config, descriptor = parts["config"], parts["descriptor"]
+    assert descriptor == json.loads(read("descriptors/hipsta_bids_participant.json"))
+    assert config["VERSION"] == hipsta_bids.__version__ == descriptor["tool-version"]
+    (step,) = config["STEPS"]
+    names = {value for key, value in step.items() if key.endswith("_FILE")} | {"config.json"}
+    assert names == {path.name for path in folder.iterdir()}
+    inputs = {entry["id"] for entry in descriptor["inputs"]}
+    assert set(parts["invocation"]) <= inputs
+    # Brackets are replaced by Nipoppy: paths and IDs by its own names, else by variables.
+    used = set(re.findall(r"\[\[(?!NIPOPPY_|HPC_|PIPELINE_)(\w+)\]\]", json.dumps(parts)))
+    assert used == set(config["VARIABLES"])
+    # Records are written last, so that they mark what is complete.
+    name = output_name(HemisphereName(subject="1", session="2", hemi="L", seg="x"), "qc")
+    (path, _) = parts["tracker"]["PATHS"]
+    assert fnmatch.fnmatch(name, path.rpartition("/")[2])
+
+
+def test_the_configuration_of_babs_has_this_version_and_options_that_exist():
+    config = yaml.safe_load(read("descriptors/babs/hipsta_bids.yaml"))
+    (version,) = config["zip_foldernames"].values()
+    assert version == hipsta_bids.__version__.replace(".", "-")
+    options = dict(config["bids_app_args"])
+    line = [options.pop("$SUBJECT_SELECTION_FLAG"), "sub-01"]
+    for flag, value in options.items():
+        line += [flag, value]
+    parsed = build_parser().parse_args(["in", "out", "participant", *line])
+    assert parsed.participant_label == ["01"]
+    assert (parsed.n_procs, parsed.mem) == (1, 2.0)
+    # BABS unzips to a folder of the name of the input.
+    folder = config["input_datasets"]["freesurfer"]["path_in_babs"]
+    assert options["--freesurfer-dir"] == f"${{PWD}}/{folder}/freesurfer"
+
+
+def test_pixi_has_the_package_and_commands_that_exist():
+    content = tomllib.loads(read("pyproject.toml"))
+    pixi, project = content["tool"]["pixi"], content["project"]
+    assert pixi["pypi-dependencies"] == {project["name"]: {"path": ".", "editable": True}}
+    words = pixi["tasks"]["demo"].split()
+    assert words[0] in project["scripts"]
+    extras = pixi["feature"]["dev"]["pypi-dependencies"][project["name"]]["extras"]
+    assert set(extras) <= set(project["optional-dependencies"])
 
 
 def test_the_paper_has_the_sections_of_the_journal():

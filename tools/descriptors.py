@@ -288,6 +288,9 @@ DESCRIPTORS: dict[str, str | None] = {
 SHIPPED = "hipsta_bids/cli/descriptor.json"
 """What the package prints for ``--bids-exec-spec``: the descriptor of both levels."""
 
+NIPOPPY = "descriptors/nipoppy/hipsta_bids/descriptor.json"
+"""That of the participant level again: a pipeline of Nipoppy holds all of its files."""
+
 _PARSERS = {"participant": build_parser, "group": group_parser}
 
 _DESCRIPTIONS = {

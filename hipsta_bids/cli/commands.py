@@ -85,7 +85,8 @@ def export_parser() -> Parser:
     parser, add = parser_of("export")
     add("output_dir", "OUT_DIR", type=Path)
     add("folder", "DIR", type=Path)
-    add("--format", choices=["freesurfer", "vtk", "ply"], default="freesurfer")
+    add("--format", choices=["freesurfer", "vtk", "ply", "template", "prov"], default="freesurfer")
+    add("--name", "LABEL")
     add("--seg", "NAME")
     add("--region", "NAME", default="body")
     add("--participant-label", "LABEL", nargs="+", type=bids_label("sub-"), default=[])
@@ -342,6 +343,18 @@ def run_resample(arguments: Sequence[str]) -> ExitCode:
 def run_export(arguments: Sequence[str]) -> ExitCode:
     """Write surfaces and maps in formats of other programs."""
     options = export_parser().parse_intermixed_args(arguments)
+    if options.format == "template":
+        from hipsta_bids.group.output.template import export_template  # noqa: PLC0415  (heavy)
+
+        files = export_template(options.output_dir, options.folder, options.name)
+        echo(f"{options.folder}: {len(files)} files")
+        return ExitCode.OK
+    if options.format == "prov":
+        from hipsta_bids.derivatives.provenance import export_provenance  # noqa: PLC0415  (heavy)
+
+        files = export_provenance(options.output_dir, options.folder)
+        echo(f"{options.folder}: {len(files)} files")
+        return ExitCode.OK
     from hipsta_bids.participant.export import export_surfaces  # noqa: PLC0415  (heavy)
 
     paths = export_surfaces(

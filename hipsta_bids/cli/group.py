@@ -244,13 +244,14 @@ def _add_methods(parser: Parser) -> None:
     add(
         "--align",
         "",
-        "registration of curvature profiles (default: registr)",
-        choices=["registr", "none"],
+        "registration of curvature profiles (auto, the default: none for fewer than 10 sheets)",
+        choices=["auto", "registr", "none"],
     )
     add(
         "--template",
         "FILE",
-        "register to the template.json of another analysis, or that in a summary.json",
+        "register to the template.json of another analysis, or that in a summary.json or in a"
+        " dataset of a template",
     )
     add(
         "--harmonize",

@@ -169,6 +169,15 @@ def write_notes(root: Path) -> None:
         files.write_text(root / DATASET_FILES["readme"], TEXTS["readme"])
 
 
+def write_template_notes(root: Path) -> None:
+    """Write description, README and ``.bidsignore`` of a dataset of templates."""
+    texts = TEXTS["template"]
+    about = {"Name": texts["name"], "BIDSVersion": BIDS_VERSION, "DatasetType": "derivative"}
+    files.write_json(root / DATASET_FILES["description"], about | {"GeneratedBy": [_maker()]})
+    files.write_text(root / DATASET_FILES["readme"], texts["readme"])
+    files.write_text(root / DATASET_FILES["ignore"], texts["ignored"])
+
+
 def _maker() -> dict[str, Any]:
     """Say what made the dataset: an entry of ``GeneratedBy``."""
     maker: dict[str, Any] = {

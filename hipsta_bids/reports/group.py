@@ -195,8 +195,11 @@ def _registration(results: GroupResults) -> Mapping[str, Any] | None:
     for measure in dict.fromkeys(row["measure"] for row in alignment):
         title = f"Statistics with and without registration, {cells.display_name(measure)}"
         names |= {f"{measure}_alignment{end}": title for end in ("", "_2", "_3")}
+    least = settings.get("min_subjects", 0)
+    fewest = min((row["n"] for row in records(table)), default=least)
     return {
         "align": settings.get("align"),
+        "least": least if fewest < least else None,
         "rows": records(table),
         "alignment": alignment,
         "extreme": records(extreme),

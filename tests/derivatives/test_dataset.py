@@ -42,7 +42,7 @@ def test_description_has_what_the_standard_asks_for(tmp_path, monkeypatch):
     assert maker["CodeURL"] == "https://example.org/code"
     assert written["SourceDatasets"] == [{"URL": "../in%20put", "DOI": "doi:10.1/x"}]
     assert written["DatasetLinks"] == {"freesurfer": "../in%20put"}
-    assert "*_morph.*" in (tmp_path / "out" / ".bidsignore").read_text().splitlines()
+    assert "*_label-*" in (tmp_path / "out" / ".bidsignore").read_text().splitlines()
     assert "DatasetLinks" in (tmp_path / "out" / "README.md").read_text()
 
 

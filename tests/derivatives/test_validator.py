@@ -43,7 +43,8 @@ def issues(tmp_path_factory):
             env=environment,
         )
         report = json.loads(done.stdout)
-        assert report["summary"]["totalFiles"] > 0
+        run.checked = report["summary"]["totalFiles"]
+        assert run.checked > 0
         found = report["issues"]["issues"]
         return [(i["code"], i.get("location")) for i in found if i["severity"] == severity]
 
@@ -81,9 +82,28 @@ def test_output_of_both_levels_is_valid(phantom, measured, issues):
     line = [str(phantom), str(measured), "group", "--formula", "thickness ~ age"]
     assert main([*line, "--align", "none"]) == 0  # a template takes ten
     assert list((measured / "group").glob("*/*"))
+    assert main(["export", str(measured), str(measured), "--format", "prov"]) == 0
+    assert list((measured / "prov").iterdir())
     assert issues(measured) == []
     # Whose dataset it is, we cannot know; all else that BIDS recommends is there.
     assert {code for code, _ in issues(measured, severity="warning")} == {"TOO_FEW_AUTHORS"}
+
+
+def test_eight_patterns_hide_what_has_no_name_in_bids(measured, issues):
+    """Labels of subfields are checked, and what the dataset is."""
+    lines = (measured / ".bidsignore").read_text(encoding="utf-8").splitlines()
+    assert sum(not line.startswith("#") for line in lines) <= 8
+    assert issues(measured) == []
+    count = len(list_results(measured))
+    checked = [".bidsignore", "dataset_description.json", "README.md", "dseg.json"]
+    assert issues.checked == len(checked) + 2 * count  # labels on the surface, and a sidecar
+    # Without a pattern each would be an error: none hides nothing.
+    for line in [one for one in lines if not one.startswith("#")]:
+        if line in {"/[gp]ro[uv]*", "*_label-*"}:
+            continue  # not of this run
+        (measured / ".bidsignore").write_text("\n".join(one for one in lines if one != line))
+        assert issues(measured), line
+    files.write_text(measured / ".bidsignore", "\n".join(lines) + "\n")
 
 
 def test_every_name_of_the_table_is_valid(measured, tmp_path, issues):

@@ -17,8 +17,11 @@ from browsing import (
     open_page,
     pixels,
     texts,
+    unnamed,
+    unreached,
     until,
     use_theme,
+    violations,
     watched,
 )
 from page_outline import Outline
@@ -414,6 +417,18 @@ def test_texts_can_be_read_in_both_themes(visit, theme):
     use_theme(browser, "light")
     assert seen > 100
     assert found == []
+
+
+def test_the_page_works_by_keys_and_for_screen_readers(visit):
+    browser = visit()
+    for check in (unreached, unnamed):
+        count, *wrong = check(browser)
+        assert count > 10
+        assert not any(wrong)
+
+
+def test_axe_finds_nothing(visit):
+    assert violations(visit()) == []
 
 
 @pytest.mark.parametrize(

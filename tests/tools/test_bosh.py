@@ -43,6 +43,7 @@ SAMPLES = {
     "mem": "8G",
     "shard": "1/4",
     "power": "thinning=5%",
+    "allocation": "2:1",
     "visits": "0,12,24",
     "contrast": ["group[NAME]-group[SEG]", "age"],
     "formula": "thickness ~ group * age",

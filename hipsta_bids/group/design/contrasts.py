@@ -29,10 +29,8 @@ _TOKEN = re.compile(
 #: Outside of brackets: the sign of a name and, after a bar, of a fixed value.
 _EQUALS, _BAR = (re.compile(rf"{sign}(?![^\[]*\])") for sign in ("=", r"\|"))
 _COMMA = re.compile(r",(?![^\[(]*[\])])")
-#: Sign and margin of a one-sided test, at the end or before the bar.
-_SIDED = re.compile(
-    r"(?P<sign>[<>])\s*(?P<margin>[-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?)\s*(?=\||$)"
-)
+#: Sign and margin of a one-sided test, at the end.
+_SIDED = re.compile(r"(?P<sign>[<>])\s*(?P<margin>[-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?)\s*$")
 _SIGN = re.compile(r"[<>](?![^\[]*\])")
 #: Alternatives of one-sided tests, by their sign.
 _SIDES = {">": "greater", "<": "less"}
@@ -99,17 +97,18 @@ def contrast_json(text: str) -> dict[str, Any]:
     A sign and a margin, as in ``arm[B]-arm[A] > -0.05``, are of a one-sided test, which BIDS Stats
     Models do not have; they are further keys.
     """
-    sided = _SIDED.search(text)
-    text = text if sided is None else text[: sided.start()] + text[sided.end() :]
-    if _SIGN.search(text):
+    combination, *conditions = _BAR.split(text, 1)
+    *names, body = _EQUALS.split(combination)
+    parts = [body, *conditions]  # a side may stand before the bar, or at the end
+    sided = next(filter(None, map(_SIDED.search, parts)), None)
+    body, *conditions = (_SIDED.sub("", part, count=1) for part in parts)
+    if _SIGN.search(body) or (names and names[-1].rstrip().endswith(("<", ">"))):
         raise ModelError(
             f"contrast {text!r}: write one-sided tests with one > or < and a number, as"
             " arm[B]-arm[A] > -0.05"
         )
     margin = 0.0 if sided is None else float(sided["margin"])
     ending_side = f" {sided['sign']} {margin:g}" if sided else ""
-    combination, *conditions = _BAR.split(text, 1)
-    *names, body = _EQUALS.split(combination)
     ending = "".join(CONDITION + ", ".join(map(str.strip, c.split(","))) for c in conditions)
     rows = [
         {name + ending: weight for name, weight in parse_expression(row).items()}

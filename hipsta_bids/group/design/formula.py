@@ -156,7 +156,10 @@ def _formula(model: Mapping[str, Any]) -> str:
 
 def file_label(text: str) -> str:
     """Write a name in ASCII letters and digits, as BIDS has it; other scripts as ``u5973``."""
-    words = ascii_letters(text.replace("+", " plus ")).split()
+    text = re.sub(r"([<>])\s*-", r"\1 minus ", text)
+    for sign, word in (("+", " plus "), (">", " above "), ("<", " below ")):
+        text = text.replace(sign, word)
+    words = ascii_letters(text).split()
     return "".join(word[:1].upper() + word[1:] for word in words)
 
 

@@ -34,8 +34,9 @@ class RegistrationSettings(toml.SettingsTable):
     appendix B) and of R's ``registr``.
     """
 
-    align: Literal["registr", "none"] = "registr"
-    """``registr`` (Wrobel et al. 2018) or ``none``."""
+    align: Literal["auto", "registr", "none"] = "auto"
+    """``registr`` (Wrobel et al. 2018), ``none``, or ``auto``: ``registr``, or ``none`` with a note
+    where sheets are too few for a template (``min_subjects``)."""
     standardize: bool = True
     """Subtract each profile's mean and divide it by its own standard deviation. Curvature that is
     larger everywhere is then not taken for a displacement; R's ``registr`` does not do this."""

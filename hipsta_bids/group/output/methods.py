@@ -140,7 +140,9 @@ def _registration(
 ) -> str:
     rules = settings.registration
     if rules.align == "none":
-        return "Maps were not registered to each other."
+        fewest = min(len(one.warps) for one in analysis.registrations.values())
+        reason = f", since a template needs {rules.min_subjects} sheets per hemisphere"
+        return f"Maps were not registered to each other{reason * (fewest < rules.min_subjects)}."
     shares = "; ".join(
         f"{one.explained_before:.0%} before and {one.explained_after:.0%} after registration"
         f" ({_SIDES[hemi]})"

@@ -209,7 +209,9 @@ def with_fdr(table: pd.DataFrame, settings: GroupSettings) -> pd.DataFrame:
     method = "bh" if rules.method == "bh" else "fdr2"
     for _, rows in table.groupby("contrast", sort=False):
         discoveries = control_fdr(rows["p"].to_numpy(dtype=np.float64), rules.alpha, method)
-        table.loc[rows.index, "p_fdr"] = discoveries.adjusted
+        one_sided = rows["alternative"].notna() if "alternative" in rows else False
+        floor = np.where(one_sided, rows["p"], 0.0)  # see Discoveries.at_least
+        table.loc[rows.index, "p_fdr"] = np.maximum(discoveries.adjusted, floor)
     return table
 
 

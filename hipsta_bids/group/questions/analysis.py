@@ -85,6 +85,12 @@ def analyze_cohort(
     """
     comparison = comparison or designs.Comparison()
     _check_covariates(model, comparison, settings, measures, is_harmonized=site_effects is not None)
+    has_visits = bool(comparison.endpoint) or (
+        comparison.longitudinal and settings.longitudinal.random == "visits"
+    )
+    is_harmonized = bool(settings.harmonization.column) or site_effects is not None
+    if has_visits:
+        _check_visits(comparison, settings, maps=model.maps, is_harmonized=is_harmonized)
     table = data.modeled_table(cohort.table, comparison)
     plan = harmonize.plan_sites(
         cohort,
@@ -102,10 +108,7 @@ def analyze_cohort(
         design = replace(design, contrasts=with_mean(design))
 
     make_rows: Callable[[designs.Design], RowModel] = partial(RowModel, settings=settings.glm)
-    if comparison.endpoint or (
-        comparison.longitudinal and settings.longitudinal.random == "visits"
-    ):
-        _check_visits(comparison, settings, maps=model.maps, is_harmonized=plan is not None)
+    if has_visits:
         arms = groups.column if groups and comparison.endpoint[:1] == ("clda",) else None
         make_rows = partial(
             visit_model,
@@ -261,8 +264,8 @@ def _check_margins(design: designs.Design, cohort: data.Cohort, measures: data.M
     units = {cohort.units[name] for name in (*measures.maps, *summaries) if name in cohort.units}
     if names and len(units) > 1:
         raise ModelError(
-            f"contrast {names[0]!r}: a margin has one unit, but the measures have"
-            f" {listed(sorted(units))}; choose some by --measures"
+            f"contrast {names[0]!r}: a margin has one unit, but maps and summary measures have"
+            f" {listed(sorted(units))}; choose both, as --measures thickness thickness_mean"
         )
 
 

@@ -57,7 +57,8 @@ def run_group(options: studies.GroupOptions, settings: GroupSettings) -> studies
 
 def _analyze(options: studies.GroupOptions, settings: GroupSettings) -> studies.GroupResult:
     """Analyze and write all but the page, for which the memory that it takes is free again."""
-    study = studies.read_study(options, settings)
+    study = studies.read_study(options, settings).with_alignment()
+    settings = study.settings
     fitting.check_joint(study.maps, options.comparison, settings)
     cohort = study.cohort
     document, model, groups, references = designs.choose_model(

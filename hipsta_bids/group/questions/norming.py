@@ -88,7 +88,7 @@ def run_norms(
     dataset.check_own_dataset(options.out_dir)
     if path is not None:
         return _score_people(options, path, settings, among, controls)
-    study = studies.read_study(options, settings, among)
+    study = studies.read_study(options, settings, among).with_alignment()
     file, people = _planned(study)
     study = with_mixes(study, study.cohort.table[people.known], (file.age,))
     template, tables, cohorts, values = _registered(

@@ -162,8 +162,8 @@ def fit_summaries(
         rows = model.design.rows
         for hemi in data.hemispheres(cohort):
             values = data.summary_values(cohort, hemi, names).iloc[rows]
-            included = [is_included(str(name)) for name in values]
-            values = values.loc[:, included & (values.max() > values.min()).to_numpy()]
+            varied = values.columns[(values.max() > values.min()).to_numpy(dtype=bool)]
+            values = values[[name for name in varied if is_included(str(name))]]
             if not values.columns.size:
                 continue
             fit_values = model.fit_measures
@@ -183,7 +183,9 @@ def fit_summaries(
             )
 
     fit(model.formula, rows_of(design), lambda _: True)
-    if not fits:
+    if not any(
+        data.grows_with_head(str(name)) for columns, *_ in fits.values() for name in columns
+    ):
         return fits, []
     if icv is None:
         return fits, [f"{data.SIZES} are not adjusted: no intracranial volume is known"]

@@ -26,6 +26,7 @@ from hipsta_bids.group.output.citations import REFERENCES
 from hipsta_bids.group.output.results import templates_of
 from hipsta_bids.group.output.saved import templates_from_json
 from hipsta_bids.group.output.tables import registration_tables
+from hipsta_bids.group.output.template import template_file
 from hipsta_bids.group.questions import analysis
 from hipsta_bids.group.stats.arrays import Bool
 from hipsta_bids.group.stats.warps import Template
@@ -158,6 +159,25 @@ class Study:
         left_out = dict.fromkeys(map(str, self.cohort.table.index[~keep]), reason)
         cohorts = {surface: one.take(keep) for surface, one in self.cohorts.items()}
         return replace(self, cohorts=cohorts, left_out=self.left_out | left_out)
+
+    def with_alignment(self) -> "Study":
+        """Choose registration, or none where sheets are too few for a template, with a note."""
+        rules = self.settings.registration
+        if rules.align != "auto":
+            return self
+        counts = {hemi: len(side.rows) for hemi, side in self.cohort.sides.items()}
+        hemi = min(counts, key=lambda name: counts[name], default="")
+        is_small = bool(self.measures.maps and hemi) and counts[hemi] < rules.min_subjects
+        align = "none" if is_small and self.options.template is None else "registr"
+        note = (
+            f"maps are not registered: hemisphere {hemi} has {counts.get(hemi)} sheets, a template"
+            f" needs {rules.min_subjects}; --template FILE takes another cohort's"
+        )
+        return replace(
+            self,
+            settings=self.settings.changed(registration={"align": align}),
+            notes=(*self.notes, *[note] * (align == "none")),
+        )
 
     def register(
         self, templates: Mapping[str, Template] | None
@@ -438,6 +458,7 @@ def read_templates(path: Path | None, cohort: Cohort) -> Mapping[str, Template] 
     """Read the templates of an earlier analysis, if one is named."""
     if path is None:
         return None
+    path = template_file(path)
     content = files.read_json(path)
     content = content.get("template") or content  # in the summary of another site
     templates = templates_from_json(content, str(path))

@@ -314,6 +314,7 @@ def run_trial(
         source = Retested(study.cohort, settings, has_visits=visits)
         message = "the participant lacks one of the sessions " + " ".join(source.sessions)
         study = study.take(source.complete, ("incomplete-sessions", message))
+    study = study.with_alignment()
     cohort = study.cohort
     templates, cohorts, tables = study.register(studies.read_templates(options.template, cohort))
     tell("points and measures")

@@ -337,6 +337,16 @@ class Discoveries:
         """Whether raw p-values above ``alpha`` pass, as they may when effects are widespread."""
         return bool(self.rejected.any()) and self.cutoff > self.alpha
 
+    def at_least(self, p: Float) -> "Discoveries":
+        """Raise adjusted p-values to the raw ones, as of a margin, which a single point may miss.
+
+        Two-stage procedures reject raw p-values above ``alpha`` where most hypotheses are false.
+        """
+        rejected = self.rejected & (p <= self.alpha)
+        cutoff = p[rejected].max() if rejected.any() else min(self.cutoff, self.alpha)
+        adjusted = np.maximum(self.adjusted, p)
+        return replace(self, adjusted=adjusted, rejected=rejected, cutoff=float(cutoff))
+
 
 def control_fdr(p: Float, alpha: float, method: str = "fdr2") -> Discoveries:
     """Control the false discovery rate of tests; NaN is no test.
@@ -477,7 +487,11 @@ def correct(
         for test in fit.tests
     }
     if rules.method not in PERMUTATIONS:
-        return discover({key: test.p for key, test in tests.items()}, rules)
+        discoveries = discover({key: test.p for key, test in tests.items()}, rules)
+        return {
+            key: discoveries[key].at_least(test.p) if test.contrast.side else discoveries[key]
+            for key, test in tests.items()
+        }
     permuted = _permuted(
         {key: test.contrast for key, test in tests.items()},
         lambda key: _part(fitted[key.hemi], key.measure, model, rules),

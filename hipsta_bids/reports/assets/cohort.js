@@ -61,7 +61,7 @@
       if (row.tile === null) tile.textContent = "no map";
       else tile.style.backgroundPosition = `${-(row.tile % grid.columns) * width}px ${-Math.floor(row.tile / grid.columns) * height}px`;
       const title = make("span", { className: "name", textContent: `${row.participant.slice(4)}${row.session ? ` ${row.session.slice(4)}` : ""} ${row.hemi}${several ? ` ${row.seg}` : ""}` });
-      const link = make("a", { href: `${row.page}#${row.key}`, title: `${whose(row)}: ${row.verdict}`, ariaLabel: `${whose(row)}, ${row.verdict}` }, tile, title);
+      const link = make("a", { href: `${row.page}#${row.key}`, title: `${whose(row)}: ${row.verdict}`, ariaLabel: `${tile.textContent}${title.textContent}: ${whose(row)}, ${row.verdict}` }, tile, title);
       const far = row.distance > apart ? " apart" : "";
       row.item = make("li", { className: row.decision + far }, link);
     }

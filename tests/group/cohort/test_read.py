@@ -146,7 +146,7 @@ def test_figures_are_those_of_the_measures(dataset, quick):
     code, group = run(dataset, quick, "--measures", "T2", "--name", "drawn")
     assert code == 0
     names = {path.stem for path in (group / "drawn" / "figures").glob("*.svg")}
-    assert names == {"T2_maps", "registration", "roc"}
+    assert names == {"T2_maps", "T2_alignment", "registration", "roc"}
     drawing = (group / "drawn" / "figures" / "T2_maps.svg").read_text()
     assert ">T2 [arbitrary]<" in drawing
 

@@ -1,5 +1,11 @@
 """Average surfaces and cross-sections of the group level, from files to files."""
 
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import nibabel as nib
 import numpy as np
 import pandas as pd
@@ -9,6 +15,7 @@ from small_cohorts import NODES, PLAN, place_of, write_dataset
 from hipsta_bids.cli.main import main
 from hipsta_bids.io import files, gifti
 
+AVERAGE = "hemi-L_desc-average_midthickness.surf.gii"
 RADII = np.array([3.0, 4.0, 5.0])
 
 
@@ -60,6 +67,49 @@ def test_average_surface_is_that_of_all_and_takes_the_maps(results):
     outward = (corners.mean(axis=1) - _center(flat)) * [1, 0, 1]
     assert (np.sum(normals * outward, axis=1) > 0).all()
     assert not (results / "hemi-R_desc-average_midthickness.surf.gii").exists()
+
+
+def test_template_is_a_dataset_to_which_others_are_registered(results, tmp_path, capsys):
+    """Registration to the dataset is that to the file of the analysis."""
+    data, out = results.parents[2] / "bids", results.parents[1]
+    line = [str(data), str(out), "group", "--formula", "group", "--measures", "thickness"]
+    line += ["--no-classification", "--no-reports", "--name"]
+    assert main([*line, "made"]) == 0
+    made, root = out / "group" / "made", tmp_path / "tpl"
+    command = ["export", str(made), str(root), "--format", "template", "--name", "lab"]
+    assert main(command) == 0
+    assert "3 files" in capsys.readouterr().out
+    start = root / "tpl-lab" / "anat"
+    copied = [start / "tpl-lab_hemi-L_midthickness.surf.gii", made.joinpath(AVERAGE)]
+    first, second = (nib.load(path).agg_data() for path in copied)
+    np.testing.assert_array_equal(first[0], second[0])
+    for template, name in ((root, "dataset"), (made / "template.json", "file")):
+        assert main([*line, name, "--template", str(template)]) == 0
+    maps = [out / "group" / name / "warps.tsv" for name in ("dataset", "file")]
+    assert maps[0].read_bytes() == maps[1].read_bytes()
+    record = json.loads((out / "group" / "dataset" / "analysis.json").read_text())
+    assert record["inputs"]["template"] == str(root)
+    validator = Path(sys.executable).with_name("bids-validator-deno")
+    environment = os.environ | {"DENO_DIR": str(tmp_path / "deno"), "DENO_NO_UPDATE_CHECK": "1"}
+    call = [str(validator), str(root), "--json"]
+    done = subprocess.run(call, capture_output=True, text=True, check=False, env=environment)
+    issues = json.loads(done.stdout)["issues"]["issues"]
+    assert [one["code"] for one in issues if one["severity"] == "error"] == []
+    # A second template of the dataset: the option has to name a file.
+    assert main([*command[:-1], "other"]) == 0
+    assert main([*line, "two", "--template", str(root)]) == 64
+    assert "has 2 templates of registration" in capsys.readouterr().err
+
+
+def test_template_is_not_written_into_other_datasets(results, tmp_path, capsys):
+    data, out = results.parents[2] / "bids", results.parents[1]
+    command = ["export", str(results), "--format", "template"]
+    before = (out / "dataset_description.json").read_bytes()
+    assert main([*command, str(out)]) == 64
+    assert "is another dataset" in capsys.readouterr().err
+    assert (out / "dataset_description.json").read_bytes() == before
+    assert main(["export", str(data), str(tmp_path / "t"), "--format", "template"]) == 66
+    assert main([*command, str(tmp_path / "t"), "--name", "my_lab"]) == 64
 
 
 def _center(flat):

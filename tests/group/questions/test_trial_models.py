@@ -200,6 +200,25 @@ def test_non_inferiority_in_tables_and_text(trial):
     assert "ni (&gt; -0.05)" in group_page(folder)
 
 
+def test_equivalence_has_two_sides_of_one_difference(trial, capsys):
+    """Without names; no point that misses a margin by its own p is significant."""
+    difference = "arm[active]-arm[placebo]"
+    contrasts = (f"{difference} > -0.05", f"{difference} < 0.05", f"{difference} > 0.08")
+    options = ("--endpoint", "ancova", "base", "m12", "--formula", "arm + age", "--contrast")
+    folder = run(trial, *options, *contrasts, name="equivalence")
+    assert "head size" not in capsys.readouterr().out  # the mean of thickness is none of a size
+    maps = table(folder / "maps.tsv")
+    assert set(maps["contrast"]) == set(contrasts)
+    for name in maps["file"]:
+        points = table(folder / f"{name}.tsv")
+        assert (points["p_corrected"] >= points["p"] * (1 - 1e-6)).all()
+        assert (
+            points.loc[points["significant"], "p"].max() <= 0.05 or not points["significant"].any()
+        )
+    measures = table(folder / "measures.tsv")
+    assert (measures["p_fdr"] >= measures["p"] * (1 - 1e-6)).all()
+
+
 @pytest.mark.parametrize(
     ("options", "code", "words"),
     [
@@ -229,6 +248,7 @@ def test_non_inferiority_in_tables_and_text(trial):
             "one-sided tests are not permuted",
         ),
         (["--contrast", "age > 0.1", "--measures", "curvature"], 65, "a margin has one unit"),
+        (["--endpoint", "mmrm", *SESSIONS, "--harmonize", "arm"], 65, "not with --harmonize"),
         (["--endpoint", "mmrm", "base", "m12", "--retest"], 64, "has no effect with --retest"),
     ],
 )

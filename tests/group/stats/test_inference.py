@@ -15,6 +15,20 @@ P = np.concatenate(
 )
 
 
+def test_one_sided_tests_survive_at_their_own_level_only():
+    """Two stages estimate that nearly all hypotheses are false, and reject what has a large p."""
+    p = np.append(np.full(99, 1e-4), 0.4)
+    found = control_fdr(p, 0.05)
+    assert found.rejected.all()
+    assert found.lenient
+    strict = found.at_least(p)
+    np.testing.assert_array_equal(strict.rejected, p <= 0.05)
+    assert strict.cutoff == 1e-4
+    assert strict.adjusted[-1] == 0.4
+    np.testing.assert_array_equal(strict.adjusted[:-1], found.adjusted[:-1].clip(1e-4))
+    assert not strict.lenient
+
+
 def test_published_example():
     found = control_fdr(P, 0.05)
     assert found.rejected.sum() == 8  # Benjamini, Krieger, Yekutieli 2006, section 6
