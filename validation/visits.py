@@ -23,6 +23,7 @@ from hipsta_bids.protocols.protocol import Tissue
 from hipsta_bids.settings import Settings
 from hipsta_bids.types import Bool, Float, HemisphereMaps, LabelVolume, Sheet
 from validation import cases
+from validation.hippunfold import draw_template
 from validation.labelings import revisions
 from validation.report import Cell, Cells, Content, suite, table
 from validation.thick_slices import slice_frame
@@ -52,6 +53,8 @@ MEGABYTE = 1e6
 
 
 Voxel = tuple[float, float, float]
+Source = HemisphereInput | PhantomSpec | tuple[Path, str]
+"""A segmentation, a phantom, or a template's folder and side."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,7 +62,7 @@ class Person:
     """Visits to be drawn: a segmentation scanned anew, two segmentations, or phantoms."""
 
     name: str
-    sources: tuple[HemisphereInput | PhantomSpec, ...]
+    sources: tuple[Source, ...]
     """Of each visit."""
     voxels: tuple[Voxel, ...] = (FINE,) * 3
     """Of each visit, mm; without any, segmentations are taken as they are and share a space."""
@@ -131,10 +134,18 @@ def scan(
     return LabelVolume(tissue=tissue, part=part, affine=pose @ affine, protocol=volume.protocol)
 
 
+def load(source: Source) -> tuple[LabelVolume, str]:
+    """Load the labels of a source; return the hemisphere, too."""
+    if isinstance(source, tuple):
+        return draw_template(*source)[0], source[1]
+    return cases.load_body(source, 0.3)
+
+
 def draw(person: Person) -> tuple[list[LabelVolume], str]:
     """Draw the visits of a person; return the hemisphere, too."""
     random = np.random.default_rng((SEED, person.seed))
-    loaded = [cases.load_body(source, 0.3) for source in person.sources]
+    bodies = {source: load(source) for source in dict.fromkeys(person.sources)}
+    loaded = [bodies[source] for source in person.sources]
     volumes = [volume for volume, _ in loaded]
     if person.voxels:
         volumes = [
@@ -284,7 +295,7 @@ def run(full: bool, labels: Path | None = None) -> Iterator[Content]:
     """Measure people on common and separate sheets, planted change, and invariances."""
     sets = people(full, labels)
     results = cases.run_groups(measure_person, sets, timeout=300.0)
-    yield _noise({name: group for name, group in results.items() if group}, sets)
+    yield noise_table({name: group for name, group in results.items() if group}, sets)
     count = 8 if full else 2
     planted = {
         name: [
@@ -316,9 +327,10 @@ def run(full: bool, labels: Path | None = None) -> Iterator[Content]:
 
 
 @table("visits.noise")
-def _noise(
+def noise_table(
     results: Mapping[str, Sequence[Result | cases.Refusal]], sets: Mapping[str, Sequence[Person]]
 ) -> Iterator[Cells | str]:
+    """Compare the noise of common and separate sheets by set."""
     for name, group in results.items():
         measured = [result for result in group if isinstance(result, Result)]
         sums = {key: _pooled(measured, key) for key in ("separate", "smooth", "frame")}

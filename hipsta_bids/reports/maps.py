@@ -106,6 +106,8 @@ class Picture:
     """CSS pixels at which its letters have their size."""
     pins: tuple[tuple[float, float], ...] = ()
     """Places in it, percent from its left and upper edge."""
+    maps: tuple[tuple[float, float], ...] = ()
+    """Left and right end of each map with the numbers beside it, percent from its left edge."""
 
     @property
     def address(self) -> str:
@@ -151,6 +153,10 @@ def draw_map(
         f" {high:.3g} {kind.unit}",
         caption=kind.title,
     )
+    places = [axis.get_position() for axis in axes[0]]
+    gap = min((b.x0 - a.x1 for a, b in pairwise(places)), default=0.0) - 0.015
+    shares = tuple((100 * (box.x0 - gap), 100 * (box.x1 + 0.01)) for box in places)
+    picture = replace(picture, maps=shares)
     if not pins:
         return picture
     return replace(picture, pins=tuple(_pins(axes[0, 0], hemispheres[0].sheet, pins)))

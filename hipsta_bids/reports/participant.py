@@ -403,8 +403,8 @@ def _uncertainty(hemisphere: Hemisphere) -> str:
 
 
 def _visits(series: Series) -> Mapping[str, Any] | None:
-    pictures = [picture for h in series.measured for picture in draw_visits(h)]
-    return {"pictures": pictures} if pictures else None
+    sides = list(filter(None, (draw_visits(h, series.bids_dir) for h in series.measured)))
+    return {"sides": sides} if sides else None
 
 
 def _view(series: Series) -> Mapping[str, Any] | None:

@@ -1,7 +1,13 @@
 """Visits of a participant that share a sheet, side by side on the same columns."""
 
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from hipsta_bids.errors import InputError
+from hipsta_bids.io import files
 from hipsta_bids.reports.display import THICKNESS, THICKNESS_CHANGE
-from hipsta_bids.reports.maps import Picture, draw_map
+from hipsta_bids.reports.maps import draw_map
 from hipsta_bids.reports.results import Hemisphere, find_results
 
 
@@ -19,10 +25,26 @@ def sharing(hemisphere: Hemisphere) -> list[Hemisphere]:
     ]
 
 
-def draw_visits(hemisphere: Hemisphere) -> list[Picture]:
+def draw_visits(hemisphere: Hemisphere, bids_dir: Path | None) -> dict[str, Any] | None:
     """Draw thickness at all visits that share a sheet, and its difference from their mean."""
     visits = sharing(hemisphere)
     if len(visits) < 2:  # noqa: PLR2004 -- nothing to compare
-        return []
-    titles = [f"{visit.side}, ses-{visit.result.name.session}" for visit in visits]
-    return [draw_map(kind, visits, titles=titles) for kind in (THICKNESS, THICKNESS_CHANGE)]
+        return None
+    names = [f"ses-{visit.result.name.session}" for visit in visits]
+    dates = _dates(f"sub-{hemisphere.result.name.subject}", bids_dir)
+    titles = [f"{hemisphere.side}, {name}" for name in names]
+    return {
+        "side": hemisphere.side,
+        "visits": [", ".join(filter(None, (name, dates.get(name)))) for name in names],
+        "pictures": [draw_map(k, visits, titles=titles) for k in (THICKNESS, THICKNESS_CHANGE)],
+    }
+
+
+def _dates(participant: str, bids_dir: Path | None) -> dict[str, str]:
+    """Read the dates of sessions, as far as the dataset has them."""
+    path = (bids_dir or Path()) / participant / f"{participant}_sessions.tsv"
+    with suppress(InputError):  # maps have no need of dates
+        rows = files.read_tsv(path) if bids_dir and path.exists() else []
+        dates = {row.get("session_id", ""): row.get("acq_time", "n/a") for row in rows}
+        return {name: date[:10] for name, date in dates.items() if not files.is_missing(date)}
+    return {}

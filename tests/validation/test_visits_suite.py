@@ -72,7 +72,7 @@ def test_tables_say_which_targets_are_met():
     random = np.random.default_rng(2)
     group = [result(0.05, 0.1, random) for _ in range(4)]
     people = {"set": [Person(name=str(n), sources=()) for n in range(4)]}
-    (row,) = visits._noise({"set": group}, people).rows
+    (row,) = visits.noise_table({"set": group}, people).rows
     assert row["ratio"] == pytest.approx(0.5, rel=0.1)
     assert row["lower in"] == "4 of 4"
     assert row["cost met"] is row["memory met"] is True
