@@ -1,7 +1,9 @@
 """Other volumes and regions on the sheet, through the command line."""
 
 import json
+import re
 import shutil
+from fnmatch import fnmatch
 from pathlib import Path
 
 import nibabel as nib
@@ -377,7 +379,13 @@ def test_sessions_are_filled_in(bids_dir, tmp_path, capsys):
 
 def test_the_page_lists_the_extra_outputs():
     name = HemisphereName(subject="X", session=None, hemi="L", seg="P")
-    page = (Path(__file__).parents[2] / "docs" / "maps.md").read_text(encoding="utf-8")
+    docs = Path(__file__).parents[2] / "docs"
+    page = (docs / "maps.md").read_text(encoding="utf-8")
+    visits = (docs / "longitudinal-maps.md").read_text(encoding="utf-8")
+    patterns = re.findall(r"`[^`]*/(\*_desc-[^`.]*)\.", visits)  # sidecars have the same stem
+    assert len(patterns) == 6
     for row in EXTRA_OUTPUTS:
         spelled = output_name(name, row.key, "NAME" if row.desc == "*" else None)
-        assert f"`{spelled.removeprefix(name.stem)}`" in page
+        stem = spelled.partition(".")[0]
+        listed = f"`{spelled.removeprefix(name.stem)}`" in page
+        assert listed or any(fnmatch(stem, pattern) for pattern in patterns), spelled
