@@ -80,6 +80,11 @@ def statistic_text(row: Mapping[str, Any]) -> str:
     return f"{row['test']} {value}, error df {row['df']:.0f}"
 
 
+def counted(number: int, singular: str, plural: str = "") -> str:
+    """Write a number of things, in the singular or the plural."""
+    return f"{number} {singular if number == 1 else plural or singular + 's'}"
+
+
 def number_text(value: float, digits: int | None = None) -> str:
     """Write a number with three digits, or with as many decimals."""
     if not np.isfinite(value):
@@ -223,6 +228,7 @@ FILTERS: dict[str, Callable[..., str]] = {
     "p": p_text,
     "percent": percent_text,
     "count": _count,
+    "counted": counted,
     "limits": limits_text,
     "quartiles": _quartiles,
     "deviations": _deviations,

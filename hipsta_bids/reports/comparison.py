@@ -18,8 +18,8 @@ _HEADINGS = {
     "n_excluded": "Excluded otherwise", "n_shared": "Shared participants", "r": "r", "n": "n",
     "other": "Compared with", "n_points": "Points", "n_significant": "Significant", "p": "p",
     "n_significant_other": "in the other", "n_both": "in both", "p_fdr": "p, FDR",
-    "auc_base": "Area, base", "auc_full": "with it", "auc_base_cv": "Cross-validated, base",
-    "auc_full_cv": "with it",
+    "auc_base": "Area, base", "auc_full": "Area, with added",
+    "auc_base_cv": "Cross-validated, base", "auc_full_cv": "Cross-validated, with added",
 }  # fmt: skip
 
 

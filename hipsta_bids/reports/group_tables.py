@@ -2,7 +2,7 @@
 
 import csv
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from string import ascii_uppercase
@@ -88,8 +88,6 @@ def records(table: pd.DataFrame) -> list[dict[str, Any]]:
 def direction(results: GroupResults, contrast: str, hemi: str, sign: float) -> str:
     """Describe what a contrast above or below zero means."""
     comparison = results.record.get("comparison") or {}
-    if side := (results.record.get("one_sided") or {}).get(contrast):
-        return str(side)
     if contrast == "mean" and hemi == cells.DIFFERENCE:
         return "larger on the left" if sign > 0 else "larger on the right"
     if contrast == "mean" and comparison.get("pair"):
@@ -122,6 +120,10 @@ def findings(results: GroupResults) -> Mapping[str, Any] | None:
     scope = multiplicity.get("scope", "map")
     family = list(FAMILY.get(scope, FAMILY["map"]))
     measures = results.table("measures")
+    tests, unknown = measures, []
+    if len(measures):
+        tests, unknown = estimated(measures), records(measures[measures["statistic"].isna()])
+    sided = results.record.get("one_sided") or {}
     return {
         "n": len(cards),
         "cards": [card for card in cards if card["share"] >= _LEAST_SHARE],
@@ -130,8 +132,13 @@ def findings(results: GroupResults) -> Mapping[str, Any] | None:
         "least": _LEAST_SHARE,
         "families": maps[family].drop_duplicates().shape[0] if len(maps) else 0,
         "scope": scope,
-        "tested": len(measures),
-        "contrasts": measures["contrast"].nunique() if len(measures) else 0,
+        "tested": len(tests),
+        "contrasts": tests["contrast"].nunique() if len(tests) else 0,
+        "unknown": [f"{name}, {sides}" for name, sides in _names_and_sides(unknown)],
+        "covariance": _has_covariance(results),
+        "sites": "sites" in results.record,
+        "signed": set(results.record["contrasts"]) > set(sided) or not sided,
+        "margins": [(str(name), side_words(text)) for name, text in sided.items()],
         "summaries": list(_summaries(results)),
         "opposite": opposite_changes(measures),
         "classification": list(_classification(results)),
@@ -139,6 +146,33 @@ def findings(results: GroupResults) -> Mapping[str, Any] | None:
         "alpha": multiplicity.get("alpha"),
         "joint": _joint(settings),
     }
+
+
+def estimated(measures: pd.DataFrame) -> pd.DataFrame:
+    """Select the tests of summary measures whose models could be estimated."""
+    return measures[np.isfinite(measures["statistic"].to_numpy(np.float64))]
+
+
+def _has_covariance(results: GroupResults) -> bool:
+    """Check whether the model has a covariance of visits as categories."""
+    endpoint = (results.record.get("comparison") or {}).get("endpoint") or [""]
+    return endpoint[0] in {"mmrm", "clda"}
+
+
+def _names_and_sides(rows: Sequence[Mapping[str, Any]]) -> Iterator[tuple[str, str]]:
+    """Yield each measure in words, with its sides."""
+    sides: dict[str, dict[str, None]] = {}
+    for row in rows:
+        name = str(row["measure"])
+        sides.setdefault(name, {})[cells.summary_side(row["hemi"], name)] = None
+    for name, words in sides.items():
+        yield cells.display_name(name), " and ".join(words)
+
+
+def side_words(hypothesis: str) -> str:
+    """Write the alternative of a one-sided test: ``> -0.05`` as *above*, with the margin."""
+    sign, margin = hypothesis.split()
+    return f"{'above' if sign == '>' else 'below'} {margin.replace('-', cells.MINUS)}"
 
 
 def _joint(settings: Mapping[str, Any]) -> dict[str, Any] | None:
@@ -161,12 +195,16 @@ def _side(results: GroupResults, row: Mapping[str, Any]) -> dict[str, Any]:
     title, share = cells.SIDES[row["hemi"]].capitalize(), n / total if total else 0.0
     if not len(candidates):
         return {"title": title, "share": 0.0, "text": "nothing could be tested"}
+    sided = (results.record.get("one_sided") or {}).get(row["contrast"])
     if not n:
-        return {"title": title, "share": 0.0, "text": f"none of {total} points survives"}
+        ending = f"is significantly {side_words(sided)}" if sided else "survives"
+        return {"title": title, "share": 0.0, "text": f"none of {total} points {ending}"}
     points = results.table(str(row["file"]))
     first = records(candidates)[int(np.argmax(candidates["statistic"].abs()))]
-    counts = "".join(_directions(results, row, points))
+    counts = "" if sided else "".join(_directions(results, row, points))
     text = f"{n} of {total} points survive ({_percent(share)}){counts}"
+    if sided:
+        text = f"{n} {side_words(sided)}, {total - n} not ({_percent(share)} of {total} points)"
     return {"title": title, "share": share, "text": f"{text}; peak {_peak(results, first, points)}"}
 
 
@@ -342,7 +380,9 @@ def summaries(results: GroupResults) -> Mapping[str, Any] | None:
     table = results.table("measures")
     if not len(table):
         return None
-    table = table[np.isfinite(table["statistic"])].sort_values(["p_fdr", "p"], kind="stable")
+    table = estimated(table).sort_values(["p_fdr", "p"], kind="stable")
+    if not len(table):
+        return None
     low = table["p_fdr"] < _ALPHA
     means = results.table("descriptives")
     models = table["model"].unique()

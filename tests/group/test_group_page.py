@@ -144,7 +144,7 @@ def test_a_map_with_few_points_is_no_finding_of_the_same_rank(copy):
     folded = part.index("contrasts of maps survive in less than 1% of a map</summary>")
     assert part.index("1 of 861 points survive (less than 1%)") > folded
     n = len(pd.read_csv(folder / "maps.tsv", sep="\t"))
-    assert f"{n} families of points were tested" in part
+    assert f"{n} families of points, each map" in part
 
 
 def test_the_largest_part_of_a_map_comes_first(copy):

@@ -436,7 +436,7 @@ def test_the_page_has_the_maps_of_both_models_and_of_heterogeneity(combined):
     assert page.index("Fixed and random effects") < page.index("Findings in maps")
     assert re.search(r"\d+ of 147 points survive", page)
     n_families = len(table(combined / "meta" / "maps.tsv"))
-    assert f"{n_families} families of points were tested" in page
+    assert f"{n_families} families of points, each map" in page
     text = (combined / "meta" / "methods.md").read_text()
     assert f"over the points of each map ({n_families} families of tests)" in text
 
