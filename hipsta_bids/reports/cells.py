@@ -176,6 +176,14 @@ def _count(value: float) -> str:
     return f"{value:,.0f}" if np.isfinite(value) else "more"
 
 
+def _arms(row: Mapping[str, Any], prefix: str = "") -> str:
+    """Write the participants of two unequal arms, and of both together."""
+    smaller, larger = row[f"{prefix}per_arm"], row[f"{prefix}larger_arm"]
+    if not np.isfinite(smaller + larger):
+        return _count(np.nan)
+    return f"{_count(smaller)} and {_count(larger)} participants, {_count(smaller + larger)} in all"
+
+
 def percent_text(share: float) -> str:
     """Write a share in percent."""
     return f"{share:.0%}" if np.isfinite(share) else files.MISSING
@@ -227,6 +235,7 @@ FILTERS: dict[str, Callable[..., str]] = {
     "decimals": _decimals,
     "p": p_text,
     "percent": percent_text,
+    "arms": _arms,
     "count": _count,
     "counted": counted,
     "limits": limits_text,

@@ -256,6 +256,7 @@ def power(results: GroupResults) -> Mapping[str, Any] | None:
     settings = results.record["settings"]
     possible = summary[summary["per_arm"].notna()] if len(summary) else summary
     rows = records(summary)
+    unequal = settings["power"].get("allocation", 1) > 1
     return {
         "kind": effect["kind"],
         "share": f"{100 * effect['share']:g}",
@@ -267,6 +268,8 @@ def power(results: GroupResults) -> Mapping[str, Any] | None:
         "followed": effect["kind"] == "slowing"
         or (bool(len(summary)) and bool(summary["change_per_year"].notna().any())),
         "best": rows[0] if len(possible) else None,
+        "unequal": unequal,
+        "arm": "Smaller arm" if unequal else "Per arm",
         "rows": rows,
         "usual": _USUAL,
         "maps": [{**map_, **_spread(map_["points"])} for map_ in _maps(points)],
