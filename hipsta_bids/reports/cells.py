@@ -136,6 +136,11 @@ def effect_text(row: Mapping[str, Any]) -> str:
     return f"{effect_name(row['effect'])} {number_text(row['effect_size'])} ({limits})"
 
 
+def _size(row: Mapping[str, Any]) -> str:
+    """Write an effect size without its limits."""
+    return f"{effect_name(row['effect'])} {number_text(row['effect_size'])}"
+
+
 def visit_of(row: Mapping[str, Any]) -> str:
     """Name a participant, and the session if there is one."""
     return " ".join(row[name] for name in IDS if isinstance(row[name], str))
@@ -244,6 +249,7 @@ FILTERS: dict[str, Callable[..., str]] = {
     "measure": measures_text,
     "side": _side,
     "effect": effect_text,
+    "size": _size,
     "statistic": statistic_text,
     "position": position_text,
     "visit": visit_of,

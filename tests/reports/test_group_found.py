@@ -1,12 +1,13 @@
 """What a group page says about its tests: counts, margins and models that cannot be estimated."""
 
 import math
+import re
 
 import pandas as pd
 import pytest
 
 from hipsta_bids.reports.cells import MINUS
-from hipsta_bids.reports.group_tables import GroupResults, findings, summaries
+from hipsta_bids.reports.group_tables import GroupResults, findings, slope_of, slope_unit, summaries
 from hipsta_bids.reports.page import render
 
 MISSING = float("nan")
@@ -132,3 +133,37 @@ def test_families_of_a_meta_analysis_are_of_contrasts_and_models(tmp_path):
     page = page_of(results_of(tmp_path, measures=rows, record={"sites": ["a"]}, **tables))
     assert "Summary measures: 2 tests in 2 families, by contrast and model." in page
     assert "<summary>1 contrast of maps has no point that survives</summary>" in page
+
+
+def longitudinal(folder, rows):
+    """A model of visits: slopes over months, and a difference at the mean of months."""
+    record = {
+        "columns": ["Intercept", "arm[T.b]", "months", "arm[T.b]:months"],
+        "contrasts": {"a-b": [[0, -1, 0, -6]], "slope": [[0, 0, 1, 1]], "all": [[1, 0, 0, 0]]},
+    }
+    return results_of(folder, record=record, measures=rows)
+
+
+@pytest.mark.parametrize(("contrast", "variable"), [("slope", "months"), ("a-b", ""), ("all", "")])
+def test_slopes_are_known_by_their_columns(tmp_path, contrast, variable):
+    results = longitudinal(tmp_path, [])
+    assert slope_of(results, contrast) == variable
+    assert slope_unit(results, "mm", contrast) == ("mm per unit of months" if variable else "mm")
+    assert slope_unit(results, "1", contrast) == ("per unit of months" if variable else "1")
+
+
+def test_measures_that_differ_are_a_table_of_twelve_rows_and_the_rest(tmp_path):
+    names = [f"measure{k}" for k in range(20)]
+    rows = [test_row(name, 0.001 * (20 - k), contrast="slope") for k, name in enumerate(names)]
+    rows.append(test_row("other", 0.3, contrast="a-b"))
+    text = render("group/found.html", values=findings(longitudinal(tmp_path, rows)))
+    shown, _, folded = text.partition("<summary>8 more tests</summary>")
+    measures = [re.findall(r'<th scope="row">(\w+) \[mm\]', part) for part in (shown, folded)]
+    assert measures == [names[::-1][:12], names[::-1][12:]]
+    # The quantile .975 of t with 40 degrees of freedom, from tables: 2.0211.
+    assert "<td>-0.2 (-0.402 to 0.00211) per unit of months</td>" in shown.replace(MINUS, "-")
+    assert '<td class="n">d ' in shown
+    assert "other" not in text.replace("another", "")
+    section = render("group/summaries.html", values=summaries(longitudinal(tmp_path, rows)))
+    assert "Estimates of <i>slope</i> are per unit of months." in section
+    assert "Estimates of <i>a-b</i>" not in section
