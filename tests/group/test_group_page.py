@@ -300,8 +300,14 @@ def test_effects_of_two_models_name_their_model(copy):
     change_table(path, "model", lambda content: [models[n % 2] for n in range(len(content))])
     change_table(path, "p_fdr", lambda content: ["0.01"] * len(content))
     text = group_page(copy / "group" / MODEL)
-    found = re.findall(r"<li>[^<]*, model (a \+ b[^:]*): [^<]*</li>", text)
-    assert set(found) == set(models)
+    part, _ = found(text)
+    lettered = dict(zip("AB", models, strict=True))
+    for letter, model in lettered.items():
+        assert f"{letter} <code>{model}</code>" in part
+    rows = re.findall(r'<tr><th scope="row">(.*?)</th>(.*?)</tr>', part)
+    letters = [re.findall(r"<td>(.*?)</td>", row)[-1] for _, row in rows]
+    counts = pd.read_csv(path, sep="\t")["model"].value_counts()
+    assert {lettered[name]: letters.count(name) for name in "AB"} == counts.to_dict()
     _, rows = rows_of(text, "Summary measures")
     assert {row["Model"] for row in rows} == {"A", "B"}
     assert "A <code>a + b</code>; B <code>a + b + icv</code>" in text
