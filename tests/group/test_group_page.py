@@ -447,6 +447,24 @@ def test_no_column_is_cut_off(visit, label):
     assert int(table_of.get_property("scrollWidth")) <= int(table_of.get_property("clientWidth"))
 
 
+@pytest.mark.parametrize(
+    ("label", "width"), [("Clusters and peaks", 1280), ("Other summary measures", 390)]
+)
+def test_boxes_of_tables_end_with_a_whole_row(visit, label, width):
+    browser = visit(width)
+    box = one(browser, f"[aria-label='{label}']")
+    browser.execute_script("arguments[0].closest('details, main').open = true", box)
+    until(lambda: box.get_property("clientHeight") > 0)
+    edge = "const edge = arguments[0].getBoundingClientRect().top + arguments[0].clientHeight;"
+    rows = (
+        "[...arguments[0].querySelectorAll('tbody tr')].map((row) => row.getBoundingClientRect())"
+    )
+    cut = "((row) => row.top < edge - 1 && row.bottom > edge + 1)"
+    until(lambda: not browser.execute_script(f"{edge} return {rows}.some{cut}", box))
+    assert browser.execute_script(f"{edge} return {rows}.some((row) => row.bottom < edge)", box)
+    assert box.get_property("scrollHeight") > box.get_property("clientHeight")
+
+
 def test_figures_are_few_and_the_page_is_short(visit):
     """Of four measures here; two figures, of a column's width in print, have 2,200 pixels."""
     browser = visit()
