@@ -157,7 +157,8 @@ def findings(results: GroupResults) -> Mapping[str, Any] | None:
 
 def estimated(measures: pd.DataFrame) -> pd.DataFrame:
     """Select the tests of summary measures whose models could be estimated."""
-    return measures[np.isfinite(measures["statistic"].to_numpy(np.float64))]
+    tests: pd.DataFrame = measures[np.isfinite(measures["statistic"])]
+    return tests
 
 
 def _has_covariance(results: GroupResults) -> bool:
