@@ -332,9 +332,10 @@ def _spread(points: pd.DataFrame) -> dict[str, Any]:
 
 
 def _pictures(results: GroupResults, points: pd.DataFrame, question: str) -> list[Picture]:
+    arm = "of the smaller arm" if "larger_arm" in points else "per arm"
     caption = {
         "retest": "agreement between sessions at each point",
-        "power": "participants per arm at each point",
+        "power": f"participants {arm} at each point",
     }[question]
     return [
         picture

@@ -177,6 +177,13 @@ def test_sample_sizes_of_unequal_arms(dataset):
     assert f'<td class="n">{2 * n:,}</td><td class="n">{3 * n:,}</td>' in page
 
 
+def test_a_plan_of_unequal_arms_draws_the_smaller_arm(dataset):
+    options = ["--power", "thinning=5%", "--measures", "thickness", "--allocation", "2:1"]
+    page = group_page(run(dataset, *ALIGNED, *options))
+    assert "Thickness: participants of the smaller arm at each point" in page
+    assert "participants per arm at each point" not in page
+
+
 def test_sample_size_of_slowing_among_patients_draws_a_map(dataset):
     options = ["--power", "slowing=25%", "--visits", "0,12,24", "--among", "group=AD"]
     options += ["--measures", "thickness", "thickness_mean", "volume"]
