@@ -80,6 +80,11 @@ def statistic_text(row: Mapping[str, Any]) -> str:
     return f"{row['test']} {value}, error df {row['df']:.0f}"
 
 
+def counted(number: int, singular: str, plural: str = "") -> str:
+    """Write a number of things, in the singular or the plural."""
+    return f"{number} {singular if number == 1 else plural or singular + 's'}"
+
+
 def number_text(value: float, digits: int | None = None) -> str:
     """Write a number with three digits, or with as many decimals."""
     if not np.isfinite(value):
@@ -131,6 +136,11 @@ def effect_text(row: Mapping[str, Any]) -> str:
     return f"{effect_name(row['effect'])} {number_text(row['effect_size'])} ({limits})"
 
 
+def _size(row: Mapping[str, Any]) -> str:
+    """Write an effect size without its limits."""
+    return f"{effect_name(row['effect'])} {number_text(row['effect_size'])}"
+
+
 def visit_of(row: Mapping[str, Any]) -> str:
     """Name a participant, and the session if there is one."""
     return " ".join(row[name] for name in IDS if isinstance(row[name], str))
@@ -169,6 +179,14 @@ def _decimals(value: float, digits: int) -> str:
 def _count(value: float) -> str:
     """Write a number of participants, which may be beyond all that was tried."""
     return f"{value:,.0f}" if np.isfinite(value) else "more"
+
+
+def _arms(row: Mapping[str, Any], prefix: str = "") -> str:
+    """Write the participants of two unequal arms, and of both together."""
+    smaller, larger = row[f"{prefix}per_arm"], row[f"{prefix}larger_arm"]
+    if not np.isfinite(smaller + larger):
+        return _count(np.nan)
+    return f"{_count(smaller)} and {_count(larger)} participants, {_count(smaller + larger)} in all"
 
 
 def percent_text(share: float) -> str:
@@ -222,13 +240,16 @@ FILTERS: dict[str, Callable[..., str]] = {
     "decimals": _decimals,
     "p": p_text,
     "percent": percent_text,
+    "arms": _arms,
     "count": _count,
+    "counted": counted,
     "limits": limits_text,
     "quartiles": _quartiles,
     "deviations": _deviations,
     "measure": measures_text,
     "side": _side,
     "effect": effect_text,
+    "size": _size,
     "statistic": statistic_text,
     "position": position_text,
     "visit": visit_of,

@@ -13,13 +13,14 @@ from hipsta_bids.reports.group_tables import GroupResults, records
 from hipsta_bids.reports.page import Section, build_sections, render
 
 _TEMPLATE = "comparison/table.html"
+_MOST_LINES = 12  # of findings; all are in the table of effect maps
 _HEADINGS = {
     "seg": "Protocol", "n_L": "Left", "n_R": "Right", "n_failed": "Failed", "hemi": "Side",
     "n_excluded": "Excluded otherwise", "n_shared": "Shared participants", "r": "r", "n": "n",
     "other": "Compared with", "n_points": "Points", "n_significant": "Significant", "p": "p",
     "n_significant_other": "in the other", "n_both": "in both", "p_fdr": "p, FDR",
-    "auc_base": "Area, base", "auc_full": "with it", "auc_base_cv": "Cross-validated, base",
-    "auc_full_cv": "with it",
+    "auc_base": "Area, base", "auc_full": "Area, with added",
+    "auc_base_cv": "Cross-validated, base", "auc_full_cv": "Cross-validated, with added",
 }  # fmt: skip
 
 
@@ -55,6 +56,24 @@ def _cell(row: Mapping[str, Any], name: str) -> str:
     if name == "effect_size":
         return cells.effect_text(row)
     return cells.p_text(value) if name in {"p", "p_fdr"} else cells.number_text(value)
+
+
+def _findings(results: GroupResults) -> Mapping[str, Any] | None:
+    """Write how many points are significant in two analyses, and how far their effects agree."""
+    lines = []
+    for row in records(results.table("agreement")):
+        title = f"{cells.measure_title(row['measure'])}, {row['contrast']}"
+        total, first, second, shared = (
+            cells.number_text(row[f"n_{name}"], 0)
+            for name in ("points", "significant", "significant_other", "both")
+        )
+        text = (
+            f"{first} of {total} points are significant in {row['analysis']}, {second} in"
+            f" {row['other']}, {shared} in both; r {cells.number_text(row['r'], 2)}, Dice"
+            f" {cells.number_text(row['dice'], 2)}"
+        )
+        lines.append((f"{title}, {cells.SIDES[row['hemi']]}", text))
+    return {"lines": lines[:_MOST_LINES], "more": len(lines[_MOST_LINES:])} if lines else None
 
 
 def _analyses(results: GroupResults) -> Mapping[str, Any] | None:
@@ -117,6 +136,7 @@ def _classification(results: GroupResults) -> Mapping[str, Any] | None:
 
 #: Sections of the page, from top to bottom.
 SECTIONS: tuple[Section[GroupResults], ...] = (
+    Section("found", "What was found", "comparison/found.html", _findings),
     Section("analyses", "Analyses", _TEMPLATE, _analyses),
     Section("maps", "Effect maps", _TEMPLATE, _maps),
     Section("effects", "Summary measures", _TEMPLATE, _effects),

@@ -256,6 +256,7 @@ def power(results: GroupResults) -> Mapping[str, Any] | None:
     settings = results.record["settings"]
     possible = summary[summary["per_arm"].notna()] if len(summary) else summary
     rows = records(summary)
+    unequal = settings["power"].get("allocation", 1) > 1
     return {
         "kind": effect["kind"],
         "share": f"{100 * effect['share']:g}",
@@ -267,6 +268,8 @@ def power(results: GroupResults) -> Mapping[str, Any] | None:
         "followed": effect["kind"] == "slowing"
         or (bool(len(summary)) and bool(summary["change_per_year"].notna().any())),
         "best": rows[0] if len(possible) else None,
+        "unequal": unequal,
+        "arm": "Smaller arm" if unequal else "Per arm",
         "rows": rows,
         "usual": _USUAL,
         "maps": [{**map_, **_spread(map_["points"])} for map_ in _maps(points)],
@@ -329,9 +332,10 @@ def _spread(points: pd.DataFrame) -> dict[str, Any]:
 
 
 def _pictures(results: GroupResults, points: pd.DataFrame, question: str) -> list[Picture]:
+    arm = "of the smaller arm" if "larger_arm" in points else "per arm"
     caption = {
         "retest": "agreement between sessions at each point",
-        "power": "participants per arm at each point",
+        "power": f"participants {arm} at each point",
     }[question]
     return [
         picture

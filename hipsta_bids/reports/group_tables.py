@@ -2,7 +2,7 @@
 
 import csv
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from string import ascii_uppercase
@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from scipy import stats
 
 from hipsta_bids.io import files
 from hipsta_bids.reports import cells
@@ -17,6 +18,9 @@ from hipsta_bids.types import FAMILY
 
 _ALPHA = 0.05  # of tests of summary measures and of models, for a word only
 _LEAST_SHARE = 0.01  # share of a map; what survives in less of it is no finding of the same rank
+#: How meta-analyses end the names of contrasts.
+_MODELS = re.compile(r" \((fixed|random) effects?\)$")
+_VISIBLE_ROWS = 12  # of summary measures in what was found; more are folded
 _MOST_ROWS = 200  # of lists, so that pages stay small
 #: Summary measures of the thickness of the whole sheet.
 _THICKNESS = ("thickness_mean", "thickness_nodes")
@@ -88,14 +92,12 @@ def records(table: pd.DataFrame) -> list[dict[str, Any]]:
 def direction(results: GroupResults, contrast: str, hemi: str, sign: float) -> str:
     """Describe what a contrast above or below zero means."""
     comparison = results.record.get("comparison") or {}
-    if side := (results.record.get("one_sided") or {}).get(contrast):
-        return str(side)
     if contrast == "mean" and hemi == cells.DIFFERENCE:
         return "larger on the left" if sign > 0 else "larger on the right"
     if contrast == "mean" and comparison.get("pair"):
         return "with an increase" if sign > 0 else "with a decrease"
     # Contrasts as users write them, and as the default model names them: of change in time, too.
-    short = re.sub(r" \((fixed|random) effects?\)$", "", contrast)
+    short = _MODELS.sub("", contrast)
     short = re.sub(r"\w+\[([^\]]*)\]", r"\1", short).replace(" - ", "-")
     for first in results.levels:
         for second in results.levels:
@@ -122,6 +124,10 @@ def findings(results: GroupResults) -> Mapping[str, Any] | None:
     scope = multiplicity.get("scope", "map")
     family = list(FAMILY.get(scope, FAMILY["map"]))
     measures = results.table("measures")
+    tests, unknown = measures, []
+    if len(measures):
+        tests, unknown = estimated(measures), records(measures[measures["statistic"].isna()])
+    sided = results.record.get("one_sided") or {}
     return {
         "n": len(cards),
         "cards": [card for card in cards if card["share"] >= _LEAST_SHARE],
@@ -130,15 +136,51 @@ def findings(results: GroupResults) -> Mapping[str, Any] | None:
         "least": _LEAST_SHARE,
         "families": maps[family].drop_duplicates().shape[0] if len(maps) else 0,
         "scope": scope,
-        "tested": len(measures),
-        "contrasts": measures["contrast"].nunique() if len(measures) else 0,
-        "summaries": list(_summaries(results)),
+        "tested": len(tests),
+        "contrasts": tests["contrast"].nunique() if len(tests) else 0,
+        "unknown": [f"{name}, {sides}" for name, sides in _names_and_sides(unknown)],
+        "covariance": _has_covariance(results),
+        "sites": "sites" in results.record,
+        "signed": set(results.record["contrasts"]) > set(sided) or not sided,
+        "margins": [(str(name), side_words(text)) for name, text in sided.items()],
+        "summaries": _summaries(results),
+        "visible": _VISIBLE_ROWS,
+        "letters": letters_of(measures),
+        "slopes": _slopes(results, measures),
         "opposite": opposite_changes(measures),
         "classification": list(_classification(results)),
         "method": multiplicity.get("method"),
         "alpha": multiplicity.get("alpha"),
         "joint": _joint(settings),
     }
+
+
+def estimated(measures: pd.DataFrame) -> pd.DataFrame:
+    """Select the tests of summary measures whose models could be estimated."""
+    tests: pd.DataFrame = measures[np.isfinite(measures["statistic"])]
+    return tests
+
+
+def _has_covariance(results: GroupResults) -> bool:
+    """Check whether the model has a covariance of visits as categories."""
+    endpoint = (results.record.get("comparison") or {}).get("endpoint") or [""]
+    return endpoint[0] in {"mmrm", "clda"}
+
+
+def _names_and_sides(rows: Sequence[Mapping[str, Any]]) -> Iterator[tuple[str, str]]:
+    """Yield each measure in words, with its sides."""
+    sides: dict[str, dict[str, None]] = {}
+    for row in rows:
+        name = str(row["measure"])
+        sides.setdefault(name, {})[cells.summary_side(row["hemi"], name)] = None
+    for name, words in sides.items():
+        yield cells.display_name(name), " and ".join(words)
+
+
+def side_words(hypothesis: str) -> str:
+    """Write the alternative of a one-sided test: ``> -0.05`` as *above*, with the margin."""
+    sign, margin = hypothesis.split()
+    return f"{'above' if sign == '>' else 'below'} {margin.replace('-', cells.MINUS)}"
 
 
 def _joint(settings: Mapping[str, Any]) -> dict[str, Any] | None:
@@ -161,12 +203,16 @@ def _side(results: GroupResults, row: Mapping[str, Any]) -> dict[str, Any]:
     title, share = cells.SIDES[row["hemi"]].capitalize(), n / total if total else 0.0
     if not len(candidates):
         return {"title": title, "share": 0.0, "text": "nothing could be tested"}
+    sided = (results.record.get("one_sided") or {}).get(row["contrast"])
     if not n:
-        return {"title": title, "share": 0.0, "text": f"none of {total} points survives"}
+        ending = f"is significantly {side_words(sided)}" if sided else "survives"
+        return {"title": title, "share": 0.0, "text": f"none of {total} points {ending}"}
     points = results.table(str(row["file"]))
     first = records(candidates)[int(np.argmax(candidates["statistic"].abs()))]
-    counts = "".join(_directions(results, row, points))
+    counts = "" if sided else "".join(_directions(results, row, points))
     text = f"{n} of {total} points survive ({_percent(share)}){counts}"
+    if sided:
+        text = f"{n} {side_words(sided)}, {total - n} not ({_percent(share)} of {total} points)"
     return {"title": title, "share": share, "text": f"{text}; peak {_peak(results, first, points)}"}
 
 
@@ -198,7 +244,7 @@ def _peak(results: GroupResults, peak: Mapping[str, Any], points: pd.DataFrame) 
     point = point_of(peak, points)
     effects = [f"{cells.effect_name(peak['effect'])} {cells.number_text(peak['effect_size'])}"]
     if point is not None and np.isfinite(point["estimate"]):
-        unit = map_unit(results, str(peak["measure"]))
+        unit = slope_unit(results, map_unit(results, peak["measure"]), peak["contrast"])
         effects.insert(0, cells.with_unit(cells.number_text(point["estimate"]), unit))
     return f"{place}: {', '.join([*effects, corrected])}"
 
@@ -220,22 +266,52 @@ def point_of(peak: Mapping[str, Any], points: pd.DataFrame) -> pd.Series | None:
     return points[matches].iloc[0] if matches.any() else None
 
 
-def _summaries(results: GroupResults) -> Iterator[str]:
-    """List summary measures that differ, corrected for their number."""
+def _summaries(results: GroupResults) -> list[dict[str, Any]]:
+    """List summary measures that differ, corrected for their number, the smallest p first."""
     table = results.table("measures")
     if not len(table):
-        return
-    by = ["contrast", "measure", "model"]
-    for (contrast, measure, model), rows in table.groupby(by, sort=False):
-        texts = [
-            f"{cells.summary_side(row['hemi'], str(measure))} {cells.effect_name(row['effect'])}"
-            f" {cells.number_text(row['effect_size'])}, p {cells.p_text(row['p_fdr'])}"
-            for row in records(rows[rows["p_fdr"] < _ALPHA])
-        ]
-        if texts:
-            suffix = f", model {model}" if len(table["model"].unique()) > 1 else ""
-            title = f"{cells.display_name(str(measure))}, {contrast}{suffix}"
-            yield f"{title}: {'; '.join(texts)}"
+        return []
+    model = (results.record.get("settings") or {}).get("model") or {}
+    low = table[table["p_fdr"] < _ALPHA].sort_values(["p_fdr", "p"], kind="stable")
+    if "estimate_low" not in low:
+        df = low["df"].where(np.isfinite(low["df"]), np.inf)
+        reach = stats.t.isf((1 - model.get("confidence", 0.95)) / 2, df) * low["se"]
+        limits = {"low": low["estimate"] - reach, "high": low["estimate"] + reach}
+        low = low.assign(**{f"estimate_{end}": values for end, values in limits.items()})
+    return records(low)
+
+
+def slope_of(results: GroupResults, contrast: str) -> str:
+    """Name the variable that a contrast is a slope over; empty for other contrasts.
+
+    All its columns are products of this variable and levels of factors.
+    """
+    weights = (results.record.get("contrasts") or {}).get(_MODELS.sub("", contrast))
+    names = results.record.get("columns") or ()
+    if weights is None or np.atleast_2d(weights).shape != (1, len(names)):
+        return ""
+    columns = (name.split(":") for name, w in zip(names, np.ravel(weights), strict=True) if w)
+    numbers = {tuple(part for part in column if "[" not in part) for column in columns}
+    variable = numbers.pop() if len(numbers) == 1 else ()
+    return variable[0] if len(variable) == 1 and variable != ("Intercept",) else ""
+
+
+def letters_of(measures: pd.DataFrame) -> dict[str, str]:
+    """Give letters to the models of summary measures, if there are several."""
+    models = measures["model"].unique().tolist() if len(measures) else []
+    return dict(zip(models, ascii_uppercase, strict=False)) if len(models) > 1 else {}
+
+
+def _slopes(results: GroupResults, measures: pd.DataFrame) -> dict[str, str]:
+    """List the contrasts of summary measures that are slopes, with their variables."""
+    names = measures["contrast"].unique().tolist() if len(measures) else []
+    return {name: slope_of(results, name) for name in names if slope_of(results, name)}
+
+
+def slope_unit(results: GroupResults, unit: str, contrast: str) -> str:
+    """Write the unit of the estimate of a contrast: of a slope, by unit of its variable."""
+    variable = slope_of(results, contrast)
+    return f"{'' if unit == '1' else unit} per unit of {variable}".lstrip() if variable else unit
 
 
 def opposite_changes(measures: pd.DataFrame) -> list[str]:
@@ -342,10 +418,11 @@ def summaries(results: GroupResults) -> Mapping[str, Any] | None:
     table = results.table("measures")
     if not len(table):
         return None
-    table = table[np.isfinite(table["statistic"])].sort_values(["p_fdr", "p"], kind="stable")
+    table = estimated(table).sort_values(["p_fdr", "p"], kind="stable")
+    if not len(table):
+        return None
     low = table["p_fdr"] < _ALPHA
     means = results.table("descriptives")
-    models = table["model"].unique()
     return {
         "groups": list(means["group"].unique()) if len(means) else [],
         "means": {(row["measure"], row["hemi"], row["group"]): row for row in records(means)},
@@ -353,7 +430,8 @@ def summaries(results: GroupResults) -> Mapping[str, Any] | None:
         "more": records(table[~low]),
         "alpha": _ALPHA,
         "families": table["contrast"].nunique(),
-        "letters": dict(zip(models, ascii_uppercase, strict=False)) if len(models) > 1 else {},
+        "letters": letters_of(results.table("measures")),
+        "slopes": _slopes(results, table),
         "repeated": bool((table["visits"] > table["n"]).any()),
     }
 

@@ -218,10 +218,10 @@ def _sites(results: GroupResults) -> Mapping[str, Any]:
 
 #: Sections of the page, from top to bottom.
 SECTIONS: tuple[Section[GroupResults], ...] = (
+    Section("found", "What was found", "group/found.html", group_tables.findings),
     Section("effects", "Fixed and random effects", "meta/effects.html", _explained),
     Section("summaries", "Summary measures", "meta/summaries.html", _measures),
     Section("between", "Maps: points and heterogeneity", "meta/heterogeneity.html", _heterogeneity),
-    Section("found", "Findings in maps", "group/found.html", group_tables.findings),
     Section("sites", "Sites", "meta/sites.html", _sites),
     Section("forests", "Peaks by site", "meta/forests.html", _peak_forests),
     Section("measures", "Summary measures by site", "meta/forests.html", _summary_forests),

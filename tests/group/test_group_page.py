@@ -144,7 +144,7 @@ def test_a_map_with_few_points_is_no_finding_of_the_same_rank(copy):
     folded = part.index("contrasts of maps survive in less than 1% of a map</summary>")
     assert part.index("1 of 861 points survive (less than 1%)") > folded
     n = len(pd.read_csv(folder / "maps.tsv", sep="\t"))
-    assert f"{n} families of points were tested" in part
+    assert f"{n} families of points, each map" in part
 
 
 def test_the_largest_part_of_a_map_comes_first(copy):
@@ -300,8 +300,14 @@ def test_effects_of_two_models_name_their_model(copy):
     change_table(path, "model", lambda content: [models[n % 2] for n in range(len(content))])
     change_table(path, "p_fdr", lambda content: ["0.01"] * len(content))
     text = group_page(copy / "group" / MODEL)
-    found = re.findall(r"<li>[^<]*, model (a \+ b[^:]*): [^<]*</li>", text)
-    assert set(found) == set(models)
+    part, _ = found(text)
+    lettered = dict(zip("AB", models, strict=True))
+    for letter, model in lettered.items():
+        assert f"{letter} <code>{model}</code>" in part
+    rows = re.findall(r'<tr><th scope="row">(.*?)</th>(.*?)</tr>', part)
+    letters = [re.findall(r"<td>(.*?)</td>", row)[-1] for _, row in rows]
+    counts = pd.read_csv(path, sep="\t")["model"].value_counts()
+    assert {lettered[name]: letters.count(name) for name in "AB"} == counts.to_dict()
     _, rows = rows_of(text, "Summary measures")
     assert {row["Model"] for row in rows} == {"A", "B"}
     assert "A <code>a + b</code>; B <code>a + b + icv</code>" in text
@@ -439,6 +445,24 @@ def test_no_column_is_cut_off(visit, label):
     table_of = one(browser, f"[aria-label='{label}']")
     browser.execute_script("arguments[0].closest('details, main').open = true", table_of)
     assert int(table_of.get_property("scrollWidth")) <= int(table_of.get_property("clientWidth"))
+
+
+@pytest.mark.parametrize(
+    ("label", "width"), [("Clusters and peaks", 1280), ("Other summary measures", 390)]
+)
+def test_boxes_of_tables_end_with_a_whole_row(visit, label, width):
+    browser = visit(width)
+    box = one(browser, f"[aria-label='{label}']")
+    browser.execute_script("arguments[0].closest('details, main').open = true", box)
+    until(lambda: box.get_property("clientHeight") > 0)
+    edge = "const edge = arguments[0].getBoundingClientRect().top + arguments[0].clientHeight;"
+    rows = (
+        "[...arguments[0].querySelectorAll('tbody tr')].map((row) => row.getBoundingClientRect())"
+    )
+    cut = "((row) => row.top < edge - 1 && row.bottom > edge + 1)"
+    until(lambda: not browser.execute_script(f"{edge} return {rows}.some{cut}", box))
+    assert browser.execute_script(f"{edge} return {rows}.some((row) => row.bottom < edge)", box)
+    assert box.get_property("scrollHeight") > box.get_property("clientHeight")
 
 
 def test_figures_are_few_and_the_page_is_short(visit):

@@ -386,8 +386,7 @@ def _draw_row(
     """Draw a row at a place from the top, of a height, with its letter."""
     top, height, letter = position
     _text(figure, 1.0 * MM, top - 3.2 * MM, letter, fontsize=LETTER, weight="bold", ha="left")
-    title = _text(figure, _LEFT * MM, top - 3.2 * MM, row.title, fontsize=TITLE, ha="left")
-    style.fit_text(title, _size(figure)[0] - (_LEFT + 1) * MM)
+    _write_title(figure, top, row.title)
     ground = columns[0].ground
     if columns[0].seen is not None or ground.mesh is None:
         short = height < _LEAST_HEIGHT * MM
@@ -422,6 +421,18 @@ def _draw_row(
             _enclose(axes, ground, survive)
     edge = sum(columns[-1].box) + _BAR * MM
     _draw_bar(_axes(figure, edge, top, _BAR_WIDTH * MM, height), row)
+
+
+def _write_title(figure: "Figure", top: int, words: str) -> None:
+    """Write the title of a row; what follows a semicolon is a second line if one is too long."""
+    room = _size(figure)[0] - (_LEFT + 1) * MM
+    title = _text(figure, _LEFT * MM, top - 3.2 * MM, words, fontsize=TITLE, ha="left")
+    first, semicolon, second = words.partition("; ")
+    if semicolon and title.get_window_extent().width > room:
+        title.remove()
+        title = _text(figure, _LEFT * MM, top - 4.5 * MM, first, fontsize=TITLE, ha="left")
+        style.fit_text(_text(figure, _LEFT * MM, top - 1.6 * MM, second, ha="left"), room)
+    style.fit_text(title, room)
 
 
 def _draw_sheet(axes: "Axes", ground: Ground, values: Float, scale: Mapping[str, Any]) -> None:
@@ -490,7 +501,7 @@ def _draw_bar(axes: "Axes", row: Row) -> None:
         digits = max(len(text.partition(".")[2]) for text in texts)
         ticks = {at: f"{at / 10.0**power:.{digits}f}" for at in places}
     ticks = _spaced({at: text for at, text in ticks.items() if low <= at <= high}, axes, row)
-    bar.set_ticks(list(ticks), labels=[text.replace("-", MINUS) for text in ticks.values()])
+    bar.set_ticks(list(ticks), labels=[_tick_text(text) for text in ticks.values()])
     _label_bar(axes, _with_power(row.label, power))
 
 
@@ -504,6 +515,14 @@ def _spaced(ticks: Mapping[float, str], axes: "Axes", row: Row) -> dict[float, s
         if all(abs(at - other) >= gap for other in places):
             places.append(at)
     return {at: ticks[at] for at in sorted(places)}
+
+
+def _tick_text(text: str) -> str:
+    """Write a number on a color bar; powers of ten are short, so that labels have room."""
+    digits, power, exponent = ("1e-04" if text == "0.0001" else text).partition("e")
+    if not power or digits != "1":
+        return text.replace("-", MINUS)
+    return f"10{str(int(exponent)).translate(_SUPERSCRIPTS)}"
 
 
 def _with_power(label: str, power: int) -> str:

@@ -7,6 +7,7 @@ import numpy as np
 
 from hipsta_bids.group.output.panels import Row, spanned
 from hipsta_bids.group.stats.arrays import Float
+from hipsta_bids.group.stats.trials import MOST_PARTICIPANTS
 from hipsta_bids.reports.cells import with_brackets
 
 #: Ticks of numbers of participants.
@@ -29,16 +30,26 @@ def agreement_rows(
 
 
 def size_rows(tables: Mapping[str, Mapping[str, Any]], measure: str, _: str) -> Iterator[Row]:
-    """Show participants per arm, by their logarithm."""
+    """Show participants of each arm, or of the smaller one, by their logarithm."""
     values = {hemi: np.log10(n) for hemi, n in _values(tables, "per_arm").items()}
     if any(np.isfinite(n).any() for n in values.values()):
         scale = spanned("viridis_r", values)
+        arm = (
+            "of the smaller arm"
+            if any("larger_arm" in table for table in tables.values())
+            else "per arm"
+        )
+        beyond = any(
+            (np.isnan(n) & (table["n"] > 0)).any()
+            for n, table in zip(values.values(), tables.values(), strict=True)
+        )
+        ending = f" (gray: more than {MOST_PARTICIPANTS:,})" if beyond else ""
         ticks = [n for n in _COUNTS if scale["vmin"] <= np.log10(n) <= scale["vmax"]]
         yield Row(
             kind="size",
             index=0,
-            title="Participants per arm",
-            label=f"participants per arm,\n{measure}",
+            title=f"Participants {arm}{ending}",
+            label=f"participants {arm},\n{measure}",
             scale=scale,
             values=values,
             ticks={float(np.log10(n)): f"{n:,}" for n in ticks},

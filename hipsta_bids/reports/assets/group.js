@@ -1,4 +1,22 @@
 "use strict";
+// Lets boxes of long tables end with a whole row.
+(() => {
+  function fit() {
+    for (const box of document.querySelectorAll(".tall")) {
+      box.style.removeProperty("--rows");
+      const most = parseFloat(getComputedStyle(box).maxHeight);
+      if (!(box.scrollHeight > most)) continue;
+      const room = most - (box.offsetHeight - box.clientHeight);
+      const top = box.getBoundingClientRect().top - box.scrollTop;
+      const ends = [...box.querySelectorAll("tbody tr")].map((row) => row.getBoundingClientRect().bottom - top);
+      const last = ends.filter((end) => end <= room).pop();
+      if (last) box.style.setProperty("--rows", `${last + most - room}px`);
+    }
+  }
+  fit();
+  window.addEventListener("resize", fit);
+  document.addEventListener("toggle", fit, true);
+})();
 // Says what is at a point of the maps of an analysis.
 (() => {
   const holder = document.getElementById("maps");

@@ -1,5 +1,6 @@
 """No text of a figure lies on another or leaves the page, whatever it shows."""
 
+from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 
@@ -9,12 +10,14 @@ import pytest
 from matplotlib.lines import Line2D
 from matplotlib.text import Text
 
+from hipsta_bids.group.output import panels
 from hipsta_bids.group.output.figures import draw_registration, draw_roc
 from hipsta_bids.group.output.ground import Ground
 from hipsta_bids.group.output.maps import ContrastMap, contrasts
 from hipsta_bids.group.output.panels import Row, draw_pages, spanned
 from hipsta_bids.group.output.style import ONE_COLUMN, TWO_COLUMNS, style
 from hipsta_bids.io.gifti import sheet_triangles
+from hipsta_bids.reports.cells import MINUS
 from hipsta_bids.reports.group_tables import GroupResults
 from hipsta_bids.types import Mesh
 
@@ -47,7 +50,7 @@ def ground(hemi, names=FIVE, *, surface=True, mesh=None, whole=False):
     )
 
 
-def rows_of(grounds, n_groups, n_contrasts, *, kind="t", name="CN-AD", scale=1.0):
+def rows_of(grounds, n_groups, n_contrasts, *, kind="t", name="CN-AD", scale=1.0, smallest=1e-6):
     """Means of groups, and effects and significance of contrasts."""
     random = np.random.default_rng(0)
     n = {hemi: one.subfield.size for hemi, one in grounds.items()}
@@ -65,7 +68,7 @@ def rows_of(grounds, n_groups, n_contrasts, *, kind="t", name="CN-AD", scale=1.0
                     effect=np.abs(random.normal(0, 1, size)),
                     statistic=np.abs(random.normal(0, 3, size)),
                     df=np.full(size, 30.0),
-                    adjusted=10 ** random.uniform(-6, 0, size),
+                    adjusted=10 ** random.uniform(np.log10(smallest), 0, size),
                     rejected=np.arange(size) < 90,
                     alpha=0.05,
                 )
@@ -77,11 +80,18 @@ def rows_of(grounds, n_groups, n_contrasts, *, kind="t", name="CN-AD", scale=1.0
     yield from contrasts(tests, "thickness")
 
 
+def titled():
+    """A row with the subfields of one protocol in its title."""
+    (row,) = next(rows_of({"L": ground("L", surface=False)}, 1, 0))
+    return [replace(row, title=f"control-patient: freesurfer (n = 14); {', '.join(NINE)}")] * 2
+
+
 def maps(sides="LR", n_groups=2, n_contrasts=1, *, width=None, like=None, kind="t", name="CN-AD",
-         scale=1.0):  # fmt: skip
+         scale=1.0, smallest=1e-6):  # fmt: skip
     names = {"D": "LR", "B": "both"}
     grounds = {names.get(hemi, hemi): ground(hemi, **(like or {})) for hemi in sides}
-    blocks = list(rows_of(grounds, n_groups, n_contrasts, kind=kind, name=name, scale=scale))
+    options = {"kind": kind, "name": name, "scale": scale, "smallest": smallest}
+    blocks = list(rows_of(grounds, n_groups, n_contrasts, **options))
     return draw_pages(grounds, blocks, width=width)
 
 
@@ -138,6 +148,10 @@ LAYOUTS = {
     "three sides in one column": lambda: maps("LRD", width=ONE_COLUMN),
     "four sides": lambda: maps("LRDB", 0, 2, kind="z"),
     "many contrasts": lambda: maps("LR", 3, 5),
+    "one side with small p": lambda: maps("L", 0, 2, kind="t", smallest=1e-12),
+    "subfields of several protocols": lambda: draw_pages(
+        {"L": ground("L", (), surface=False)}, [titled()]
+    ),
     "six rows": lambda: maps("LR", 6, 0),
     "long names": lambda: maps("LR", 2, 2, name=LONG),
     "long names in one column": lambda: maps("L", 1, 1, name=LONG, width=ONE_COLUMN),
@@ -200,6 +214,33 @@ def test_no_texts_overlap_or_leave_the_figure(layout):
                 or at.x1 > box.x1 + ROUNDING or at.y1 > box.y1 + ROUNDING
             ]  # fmt: skip
             assert outside == []
+
+
+def test_titles_of_two_lines_are_whole():
+    with style():
+        (figure,) = LAYOUTS["subfields of several protocols"]()
+        figure.draw_without_rendering()
+    texts = [text for text, _ in texts_of(figure)]
+    assert texts.count(", ".join(NINE)) == 2
+    assert texts.count("control-patient: freesurfer (n = 14)") == 2
+
+
+@pytest.mark.parametrize(
+    ("number", "tick"),
+    [("0.0001", "10⁻⁴"), ("1e-12", "10⁻¹²"), ("0.00015", "0.00015"), ("5e-05", f"5e{MINUS}05"),
+     ("-2.5", f"{MINUS}2.5"), ("10,000", "10,000")],
+)  # fmt: skip
+def test_ticks_are_short(number, tick):
+    assert panels._tick_text(number) == tick
+
+
+def test_small_p_are_powers_of_ten_on_the_color_bar():
+    with style():
+        (figure,) = LAYOUTS["one side with small p"]()
+        figure.draw_without_rendering()
+    texts = {text for text, _ in texts_of(figure)}
+    assert {"10⁻⁴", "10⁻⁸", "0.05"} <= texts
+    assert not any(text.startswith(("1e", "0.000")) for text in texts)
 
 
 def test_what_is_written_is_beside_maps_and_the_ruler_is_clear_of_the_color_bar():

@@ -433,10 +433,10 @@ def test_the_page_has_the_maps_of_both_models_and_of_heterogeneity(combined):
     page = (combined / "meta.html").read_text(encoding="utf-8")
     assert page.count('data-kind="effect"') == page.count('data-kind="significance"') > 0
     assert "not drawn" not in page
-    assert page.index("Fixed and random effects") < page.index("Findings in maps")
+    assert page.index("What was found") < page.index("Fixed and random effects")
     assert re.search(r"\d+ of 147 points survive", page)
     n_families = len(table(combined / "meta" / "maps.tsv"))
-    assert f"{n_families} families of points were tested" in page
+    assert f"{n_families} families of points, each map" in page
     text = (combined / "meta" / "methods.md").read_text()
     assert f"over the points of each map ({n_families} families of tests)" in text
 

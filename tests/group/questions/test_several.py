@@ -180,6 +180,15 @@ def test_page_links_analyses_and_figure_names_subfields_of_each(compared):
     assert not page.unlabeled
     assert "could not be" not in text
     assert "<h3>Thickness: effect maps</h3>" in text
+    lead = text[text.index('id="comparison-found-title"') : text.index('id="comparison-analyses"')]
+    agreement = table(group / MODEL / "agreement.tsv")
+    for row in agreement.itertuples():
+        assert (
+            f"{row.n_significant:.0f} of {row.n_points:.0f} points are significant in"
+            f" {row.analysis}, {row.n_significant_other:.0f} in {row.other},"
+            f" {row.n_both:.0f} in both"
+        ) in lead
+    assert lead.count("<li>") == len(agreement) == 6
     for seg in PROTOCOLS:
         assert f"{MODEL}_seg-{seg}.html" in page.addresses
     figure = (group / MODEL / "figures" / "thickness_maps.svg").read_text()

@@ -164,7 +164,24 @@ def test_sample_sizes_of_unequal_arms(dataset):
     ]
     assert exact[0] < 0.8 <= exact[1]
     assert "two arms allocated 2:1" in (folder / "methods.md").read_text()
-    assert "arms of sizes 2 to 1 (numbers of the smaller arm)" in group_page(folder)
+    page = group_page(folder)
+    assert "arms of sizes 2 to 1, power" in page
+    n = int(first["per_arm"])
+    assert f"needs fewest: {n:,} and {2 * n:,} participants, {3 * n:,} in all</b>, limits" in page
+    heads = [
+        '<th scope="col" class="n">Smaller arm</th>',
+        '<th scope="col" class="n">Larger arm</th>',
+        '<th scope="col" class="n">Total</th>',
+    ]
+    assert [page.count(head) for head in heads] == [1, 1, 1]
+    assert f'<td class="n">{2 * n:,}</td><td class="n">{3 * n:,}</td>' in page
+
+
+def test_a_plan_of_unequal_arms_draws_the_smaller_arm(dataset):
+    options = ["--power", "thinning=5%", "--measures", "thickness", "--allocation", "2:1"]
+    page = group_page(run(dataset, *ALIGNED, *options))
+    assert "Thickness: participants of the smaller arm at each point" in page
+    assert "participants per arm at each point" not in page
 
 
 def test_sample_size_of_slowing_among_patients_draws_a_map(dataset):
