@@ -213,6 +213,8 @@ def _side(results: GroupResults, row: Mapping[str, Any]) -> dict[str, Any]:
     text = f"{n} of {total} points survive ({_percent(share)}){counts}"
     if sided:
         text = f"{n} {side_words(sided)}, {total - n} not ({_percent(share)} of {total} points)"
+    if str(row.get("lenient", "")).lower() == "true":
+        text += f", uncorrected p up to {row['p_cutoff']:.2g} since the effect is widespread"
     return {"title": title, "share": share, "text": f"{text}; peak {_peak(results, first, points)}"}
 
 

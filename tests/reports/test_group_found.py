@@ -67,6 +67,16 @@ def page_of(results):
     return " ".join(text.split())
 
 
+@pytest.mark.parametrize("lenient", [True, False])
+def test_uncorrected_p_above_the_level_is_written_beside_the_count(tmp_path, lenient):
+    """Two-stage corrections allow it where most points differ; readers should know."""
+    tables = map_tables(858, 861)
+    tables["maps"][0] |= {"lenient": lenient, "p_cutoff": 0.5612}
+    page = page_of(results_of(tmp_path, **tables))
+    assert "858 of 861 points survive" in page
+    assert ("uncorrected p up to 0.56 since the effect is widespread" in page) == lenient
+
+
 @pytest.mark.parametrize(
     ("endpoint", "reason"),
     [(["clda", "ses-1", "ses-2"], "the covariance of visits"), ([], "the model")],
