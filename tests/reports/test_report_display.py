@@ -106,7 +106,10 @@ def test_maps_of_both_hemispheres_lie_alike(out, monkeypatch):
     np.testing.assert_array_equal(tile, pictures[0][:, 4:])
     assert tile[-1].tolist() == sorted(tile[-1].tolist())  # posterior below, medial left
     drawn = []
-    monkeypatch.setattr(maps_module, "_encode", lambda figure, **_: drawn.append(figure))
+    encode = maps_module._encode
+    monkeypatch.setattr(
+        maps_module, "_encode", lambda *a, **b: drawn.append(a[0]) or encode(*a, **b)
+    )
     maps_module.draw_map(THICKNESS, [left, right])
     for axis in drawn[0].axes[:2]:
         assert not axis.xaxis_inverted()

@@ -154,13 +154,16 @@ def _formula(model: Mapping[str, Any]) -> str:
     return " + ".join(["1" if len(names) < len(terms) else "0", *names])
 
 
+#: Sign of a one-sided test in the name of a contrast, and the sign of its margin.
+_MARGIN = re.compile(r"\s([<>])\s(-?)(?=[\d.]+(?:e[-+]?\d+)?(?:\s\||$))")
+
+
 def file_label(text: str) -> str:
     """Write a name in ASCII letters and digits, as BIDS has it; other scripts as ``u5973``."""
-    text = re.sub(r"([<>])\s*-", r"\1 minus ", text)
-    for sign, word in (("+", " plus "), (">", " above "), ("<", " below ")):
-        text = text.replace(sign, word)
-    words = ascii_letters(text).split()
-    return "".join(word[:1].upper() + word[1:] for word in words)
+    words = {">": "above", "<": "below", "-": "minus", "": ""}
+    text = _MARGIN.sub(lambda side: f" {words[side[1]]} {words[side[2]]} ", text)
+    words_of_name = ascii_letters(text.replace("+", " plus ")).split()
+    return "".join(word[:1].upper() + word[1:] for word in words_of_name)
 
 
 def ascii_letters(text: str, filler: str = " ") -> str:
