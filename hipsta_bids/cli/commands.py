@@ -286,12 +286,12 @@ def _site(text: str) -> tuple[str | None, Path]:
 def run_compare(arguments: Sequence[str]) -> ExitCode:
     """Compare finished analyses."""
     options = compare_parser().parse_intermixed_args(arguments)
-    from hipsta_bids.group.questions.several import check_folder, compare_analyses  # noqa: PLC0415  (heavy)
+    from hipsta_bids.group.questions import several  # noqa: PLC0415  (heavy)
 
-    check_folder(options.out)
-    analyses = [_site(text) for text in options.analyses]
+    several.check_folder(options.out)
+    entries = several.read_entries([_site(text) for text in options.analyses])
     command = "hipsta-bids", "compare", *arguments
-    for note in compare_analyses(analyses, options.out, command, figures=options.figures):
+    for note in several.compare_analyses(entries, options.out, command, figures=options.figures):
         echo(f"note: {note}")
     echo(f"results: {options.out}")
     echo(f"report: {options.out}.html")
@@ -361,26 +361,23 @@ def run_export(arguments: Sequence[str]) -> ExitCode:
     if options.format == "template":
         from hipsta_bids.group.output.template import export_template  # noqa: PLC0415  (heavy)
 
-        files = export_template(options.output_dir, options.folder, options.name)
-        echo(f"{options.folder}: {len(files)} files")
-        return ExitCode.OK
-    if options.format == "prov":
+        paths = export_template(options.output_dir, options.folder, options.name)
+    elif options.format == "prov":
         from hipsta_bids.derivatives.provenance import export_provenance  # noqa: PLC0415  (heavy)
 
-        files = export_provenance(options.output_dir, options.folder)
-        echo(f"{options.folder}: {len(files)} files")
-        return ExitCode.OK
-    from hipsta_bids.participant.export import export_surfaces  # noqa: PLC0415  (heavy)
+        paths = export_provenance(options.output_dir, options.folder)
+    else:
+        from hipsta_bids.participant.export import export_surfaces  # noqa: PLC0415  (heavy)
 
-    paths = export_surfaces(
-        options.output_dir,
-        options.folder,
-        options.format,
-        protocol=options.seg,
-        region=options.region,
-        participants=options.participant_label,
-        image=options.space_of,
-    )
+        paths = export_surfaces(
+            options.output_dir,
+            options.folder,
+            options.format,
+            protocol=options.seg,
+            region=options.region,
+            participants=options.participant_label,
+            image=options.space_of,
+        )
     echo(f"{options.folder}: {len(paths)} files")
     return ExitCode.OK
 

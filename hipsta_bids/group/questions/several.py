@@ -36,15 +36,15 @@ def run_protocols(
     }
     first = results[protocols[0]].folder
     folder = first.with_name(first.name.removesuffix(f"_seg-{protocols[0]}"))
-    analyses = {seg: result.folder for seg, result in results.items()}
+    entries = read_entries([(seg, result.folder) for seg, result in results.items()])
     notes = compare_analyses(
-        list(analyses.items()),
+        entries,
         folder,
         options.command,
         figures=options.figures,
         reports=options.reports,
     )
-    people = set[str]().union(*(entry.people for entry in read_entries(list(analyses.items()))))
+    people = set[str]().union(*(entry.people for entry in entries))
     return GroupResult(
         folder=folder,
         n_participants=len(people),
@@ -87,7 +87,7 @@ def read_entries(analyses: Sequence[tuple[str | None, Path]]) -> list[Entry]:
 
 
 def compare_analyses(
-    analyses: Sequence[tuple[str | None, Path]],
+    entries: Sequence[Entry],
     folder: Path,
     command: Sequence[str] = (),
     *,
@@ -95,7 +95,6 @@ def compare_analyses(
     reports: bool = True,
 ) -> list[str]:
     """Compare finished analyses, write tables, a figure and a page, and return notes."""
-    entries = read_entries(analyses)
     tables = {
         "analyses": agreement.analyses_table(entries),
         "effects": agreement.effects_table(entries),
