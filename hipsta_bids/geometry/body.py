@@ -380,6 +380,19 @@ def _apply_mask(
     return replace(volume, tissue=labels), edited, change
 
 
+def relabel_by_mask(volume: LabelVolume, settings: BodySettings) -> LabelVolume:
+    """Return labels whose body is their edited mask, if they have one.
+
+    GeometryError as from :func:`extract_body`.
+    """
+    if volume.edited_mask is None:
+        return volume
+    tissue, _ = _merge_layer(volume, settings)
+    ends = find_end_planes(volume, tissue, settings)
+    changed, _, _ = _apply_mask(volume, tissue, volume.edited_mask, ends)
+    return replace(changed, edited_mask=None)
+
+
 def check_mask(
     mask: EditedMask, change: MaskChange, voxel: float, settings: BodySettings
 ) -> list[Finding]:

@@ -18,13 +18,21 @@ from hipsta_bids.types import Bool, Coordinates, Float, Sheet, TetMesh
 BEYOND = 1.5
 #: Steps along and beyond a column.
 STEPS, STEPS_BEYOND = 40, 30
-#: Walls farther from that of the participant's sheet are not those of this column, mm.
+#: A wall farther than this from the wall of the participant's sheet may belong to another turn, mm:
+#: its weight falls smoothly, to 1/e here.
+NEAR = 0.5
+#: Columns with a wall farther away than this are counted as filled from their neighbors, mm.
 FARTHEST = 0.7
 #: Full width at half maximum of the Gaussian that smooths the moves of walls on the sheet, mm.
 SMOOTHING = 1.0
+#: The same of edges, which are smoothed along them, and are less certain, mm.
+NEAR_EDGE, EDGE_SMOOTHING = 1.0, 6.0
+#: Columns follow an edge less the farther they are from it: 1/e at this distance, mm.
+EDGE_REACH = 3.0
 
-_SIGMA = SMOOTHING / np.sqrt(8 * np.log(2))
-_LEAST_WEIGHT = 1e-3  # mm2 of known columns, by the Gaussian, that make a mean
+_FWHM = float(np.sqrt(8 * np.log(2)))  # of a Gaussian, in standard deviations
+_TAIL = 1e-4  # weight of a Gaussian of four times the width, for places without a wall near
+_ROW_STEP = 4  # columns from point to point of a row: between near ones, a row's direction is rough
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -34,17 +42,22 @@ class Walls:
     moves: Float
     """(Nx, Ny, 2) of the interior and exterior wall, mm, smoothed; to the exterior is positive."""
     raw: Float
-    """(Nx, Ny, 2) before smoothing; NaN where no wall is near."""
+    """(Nx, Ny, 2) before smoothing; NaN where there is no wall."""
+
+    @property
+    def distances(self) -> Float:
+        """Distances (Nx, Ny, 2) of the walls, mm, up to the farthest one that is counted."""
+        return np.asarray(np.fmin(np.abs(self.raw), FARTHEST))
 
     @property
     def known(self) -> Bool:
         """Columns (Nx, Ny) with both walls."""
-        return np.asarray(np.isfinite(self.raw).all(axis=-1))
+        return np.asarray((self.distances < FARTHEST).all(axis=-1))
 
     @property
     def distance(self) -> float:
         """Distance of the walls, RMS over the sheet, mm."""
-        return float(np.sqrt(np.nanmean(self.raw**2)))
+        return float(np.sqrt((self.distances**2).mean()))
 
 
 def find_walls(sheet: Sheet, motion: Float, field: Field) -> Walls:
@@ -53,20 +66,57 @@ def find_walls(sheet: Sheet, motion: Float, field: Field) -> Walls:
     ``motion`` (4, 4) leads from the sheet to the visit, and ``field`` is positive in its body. The
     walls are the ends of the piece of a column inside the body that overlaps the sheet's most.
     """
-    points, depth = _continued(sheet)
-    nodes = field.grid.to_nodes(to_ras(points.reshape(-1, 3), motion))
-    values = ndimage.map_coordinates(field.values, nodes.T, order=3, mode="nearest")
-    at_nodes = np.asarray(values, dtype=np.float64).reshape(depth.shape)
-    low, high = _piece(at_nodes, depth)
-    moves = np.stack([low, high - _length(sheet)], axis=-1)
-    moves = np.where(np.abs(moves) <= FARTHEST, moves, np.nan)
-    if not np.isfinite(moves).all(axis=-1).any():
+    raw = _ends_inside(sheet, motion, field)
+    middle = sheet.points[:, :, sheet.middle].reshape(-1, 3)
+    squared = ((middle[:, None] - middle[None]) ** 2).sum(axis=-1)
+    smooth = _smoothed(raw.reshape(-1, 2), squared, column_area(sheet).ravel(), SMOOTHING, NEAR)
+    walls = Walls(moves=smooth.reshape(raw.shape), raw=raw)
+    if not walls.known.any():
         raise GeometryError(
             "no column of the common sheet meets the walls of this visit: compare the labels of "
             "the visits",
             reason="visit-unlike",
         )
-    return Walls(moves=_smoothed(moves, sheet), raw=moves)
+    return walls
+
+
+def find_edges(whole: Sheet, motion: Float, field: Field) -> Float:
+    """Find where rows of the mid-surface of a sheet from edge to edge leave the body.
+
+    Returns distances (Ny, 2), mm, of the medial and lateral edge of a visit from the edges of the
+    sheet; to lateral is positive, and NaN is no edge. ``motion`` and ``field`` are as for
+    :func:`find_walls`.
+    """
+    last = len(whole.points) - 1
+    index = np.linspace(0, last, max(last // _ROW_STEP, 1) + 1).round().astype(np.intp)
+    rows = whole.points[index, :, whole.middle].swapaxes(0, 1)[None]
+    valid = np.ones(rows.shape[:2], dtype=bool)
+    edges: Float = _ends_inside(Sheet(points=rows, valid=valid), motion, field)[0]
+    return edges
+
+
+def smooth_edges(edges: Float, whole: Sheet) -> Float:
+    """Smooth distances (Ny, 2) of edges along the sheet, mm."""
+    place = _places(whole.points[whole.points.shape[0] // 2, :, whole.middle])
+    squared = (place[:, None] - place) ** 2
+    return _smoothed(edges, squared, np.ones(len(edges)), EDGE_SMOOTHING, NEAR_EDGE)
+
+
+def move_edges(sheet: Sheet, edges: Float, x_extent: float, y_extent: float) -> Sheet:
+    """Move columns along the rows: at the edges by (M, 2) mm, and less the farther from them.
+
+    The M rows are equally spaced from end to end. The sheet reaches from -extent to extent.
+    """
+    at_y = _positions(1.0, sheet.points.shape[1], len(edges), y_extent)
+    medial, lateral = (np.interp(at_y, np.arange(len(edges)), side) for side in edges.T)
+    middle = sheet.points[:, :, sheet.middle]
+    place = _places(middle)
+    beyond = place[-1] * (1 / x_extent - 1) / 2  # from the first and the last column to the edges
+    distance = medial * np.exp(-(place + beyond) / EDGE_REACH)
+    distance += lateral * np.exp(-(place[-1] + beyond - place) / EDGE_REACH)
+    along = np.gradient(middle, axis=0)
+    along *= (distance / np.maximum(np.linalg.norm(along, axis=-1), 1e-9))[..., None]
+    return Sheet(points=sheet.points + along[:, :, None], valid=sheet.valid)
 
 
 def move_walls(sheet: Sheet, moves: Float, motion: Float) -> Sheet:
@@ -96,9 +146,9 @@ def moves_at(moves: Float, sheet: Sheet, whole: Sheet, x_extent: float, y_extent
     return np.moveaxis(inner * share, 0, -1)
 
 
-def _positions(extent: float, count: int, nodes: int) -> Float:
-    """Place lines from -1 to 1 among nodes within plus and minus an extent, as node numbers."""
-    coordinate = np.clip(np.linspace(-1, 1, count) / extent, -1, 1)
+def _positions(extent: float, count: int, nodes: int, reach: float = 1.0) -> Float:
+    """Place lines within plus and minus a reach among nodes within an extent, as node numbers."""
+    coordinate = np.clip(np.linspace(-reach, reach, count) / extent, -1, 1)
     return np.asarray((coordinate + 1) / 2 * (nodes - 1))
 
 
@@ -156,6 +206,24 @@ def _along(sheet: Sheet, depth: Float) -> Float:
     return np.asarray(start + (place - below)[..., None] * (end - start))
 
 
+def _places(points: Float) -> Float:
+    """Distance (N, ...) of points (N, ..., 3) from the first one, along the line of all, mm."""
+    steps = np.linalg.norm(np.diff(points, axis=0), axis=-1)
+    return np.concatenate([np.zeros_like(steps[:1]), steps.cumsum(axis=0)])
+
+
+def _ends_inside(sheet: Sheet, motion: Float, field: Field) -> Float:
+    """Find where columns enter and leave the body of a visit.
+
+    Returns distances (Nx, Ny, 2), mm, from the ends of the columns; NaN without such a place.
+    """
+    points, depth = _continued(sheet)
+    nodes = field.grid.to_nodes(to_ras(points.reshape(-1, 3), motion))
+    values = ndimage.map_coordinates(field.values, nodes.T, order=3, mode="nearest")
+    low, high = _piece(np.asarray(values, dtype=np.float64).reshape(depth.shape), depth)
+    return np.stack([low, high - _length(sheet)], axis=-1)
+
+
 def _piece(values: Float, depth: Float) -> tuple[Float, Float]:
     """Find where the piece of each column inside the body, values (Nx, Ny, M), begins and ends.
 
@@ -197,21 +265,15 @@ def _crossing(
     return np.asarray(s + share * (t - s))
 
 
-def _smoothed(moves: Float, sheet: Sheet) -> Float:
-    """Smooth moves (Nx, Ny, 2) on the sheet; what is unknown gets the mean of its surroundings."""
-    middle = sheet.points[:, :, sheet.middle].reshape(-1, 3)
-    squared = ((middle[:, None] - middle[None]) ** 2).sum(axis=-1)
-    area = column_area(sheet).ravel()
-    flat = moves.reshape(-1, 2)
-    smooth = np.full(flat.shape, np.nan)
-    sigma = _SIGMA
-    while np.isnan(smooth).any():
-        kernel = np.exp(-squared / (2 * sigma**2)) * area
-        for wall in range(2):
-            finite = np.isfinite(flat[:, wall])
-            weight = kernel[:, finite].sum(axis=1)
-            lacking = np.isnan(smooth[:, wall]) & (weight > _LEAST_WEIGHT)
-            total = kernel[np.ix_(lacking, finite)] @ flat[finite, wall]
-            smooth[lacking, wall] = total / weight[lacking]
-        sigma *= 2
-    return smooth.reshape(moves.shape)
+def _smoothed(moves: Float, squared: Float, size: Float, width: float, near: float) -> Float:
+    """Smooth moves (N, 2), mm, by a Gaussian of a width at half maximum, mm.
+
+    ``squared`` (N, N) are distances between their places, and ``size`` (N,) is their area or
+    length. Moves farther than ``near`` weigh less, and what is unknown nothing: it is filled by
+    wider Gaussians of little weight.
+    """
+    exponent = -squared / (2 * (width / _FWHM) ** 2)
+    kernel = sum(_TAIL**level * np.exp(exponent / 16**level) for level in range(3)) * size
+    weight = np.where(np.isfinite(moves), np.exp(-((moves / near) ** 4)), 0.0)
+    total = kernel @ (weight * np.nan_to_num(moves))
+    return np.asarray(total / np.maximum(kernel @ weight, np.finfo(float).tiny))

@@ -74,6 +74,11 @@ class Frame:
         cells = subfield_volumes(mesh, self.evidence.body)
         return {t: v / cells[t] for t, v in self.evidence.volumes.items() if cells.get(t)}
 
+    @cached_property
+    def edges(self) -> Float:
+        """(Ny, 2) where rows leave the body of the mean, mm from the edges of its sheet."""
+        return columns.find_edges(self.evidence.whole, np.eye(4), self.evidence.solid.field)
+
     def ends(self, motion: Float) -> tuple[GivenEnd, ...]:
         """Return the end planes in a visit."""
         body = self.evidence.body
@@ -163,8 +168,13 @@ def measure_visit(
         field = resample_body(body, hemi, settings.grid, settings.slices)
         solid = measure.make_solid(field, body, settings)
     with clock("sheet"):
-        walls = columns.find_walls(common.sheet, motion, solid.field)
-        carried = columns.move_walls(common.sheet, walls.moves, motion)
+        extents = settings.sheet.x_extent, settings.sheet.y_extent
+        edges = columns.find_edges(common.whole, motion, solid.field) - frame.edges
+        edges = columns.smooth_edges(edges, common.whole)
+        mean_sheet = columns.move_edges(common.sheet, edges, *extents)
+        mean_whole = columns.move_edges(common.whole, edges, 1.0, 1.0)
+        walls = columns.find_walls(mean_sheet, motion, solid.field)
+        carried = columns.move_walls(mean_sheet, walls.moves, motion)
         sheet = Sheet(points=carried.points, valid=common.sheet.valid & walls.known)
         filled = 1 - float(sheet.valid.mean())
         if filled > settings.sheet.max_filled:
@@ -173,9 +183,8 @@ def measure_visit(
                 "compare the labels of the visits",
                 reason="visit-unlike",
             )
-        extents = settings.sheet.x_extent, settings.sheet.y_extent
-        moves = columns.moves_at(walls.moves, common.sheet, common.whole, *extents)
-        whole = columns.move_walls(common.whole, moves, motion)
+        moves = columns.moves_at(walls.moves, mean_sheet, mean_whole, *extents)
+        whole = columns.move_walls(mean_whole, moves, motion)
         mesh, coordinates = columns.grid_mesh(whole)
         measured = _Visit(
             factors=frame.factors,
@@ -195,6 +204,7 @@ def measure_visit(
         findings = [
             *image,
             *checks.check_image(body),
+            *measure.check_edits(volume, body, settings),
             *_of_visit(body, solid, settings),
             *_fits(walls, sheet, overlap, settings),
             *folded_layers,
@@ -274,16 +284,14 @@ def _overlap(body: Body, frame: Frame, motion: Float) -> float:
 
 def _fits(walls: columns.Walls, sheet: Sheet, overlap: float, settings: Settings) -> list[Finding]:
     """Check whether a visit resembles the mean of all visits."""
-    moves = np.where(np.isfinite(walls.raw), np.abs(walls.raw), columns.FARTHEST)
-    far = sheet.points[:, :, sheet.middle][(moves > FAR).any(axis=-1)]
-    distance = float(np.sqrt((moves**2).mean()))
+    far = sheet.points[:, :, sheet.middle][(walls.distances > FAR).any(axis=-1)]
     remedy = "compare the labels of the visits there"
     return [
         Finding(
             reason="visits-differ",
-            value=max(distance / FLAG_DISTANCE, (1 - overlap) / (1 - FLAG_OVERLAP)),
+            value=max(walls.distance / FLAG_DISTANCE, (1 - overlap) / (1 - FLAG_OVERLAP)),
             limit=1.0,
-            text=f"the walls lie {distance:.2f} mm from the walls of the mean visit, and "
+            text=f"the walls lie {walls.distance:.2f} mm from the walls of the mean visit, and "
             f"{overlap:.0%} of the bodies overlap",
             remedy=remedy,
             points=far,

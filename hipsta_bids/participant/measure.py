@@ -497,19 +497,22 @@ def measure_hemisphere(
 def _find(volume: LabelVolume, hemi: str, evidence: Evidence) -> list[Finding]:
     """List what the checks of a body found, within its limit or not."""
     body, settings, checks = evidence.body, evidence.settings, evidence.settings.checks
-    mask = volume.edited_mask
     return [
         *evidence.image,
         *check_end_labels(volume, body, checks),
         *check_thickness(evidence.thickness, evidence.boundaries.sheet_thickness, checks),
         *([check_flipped(evidence.sheet, hemi)] if body.region == "extended" else []),
-        *(
-            check_mask(mask, body.mask_change, in_plane_voxel(body.affine), settings.body)
-            if mask and body.mask_change
-            else []
-        ),
+        *check_edits(volume, body, settings),
         *find_all(evidence),
     ]
+
+
+def check_edits(volume: LabelVolume, body: Body, settings: Settings) -> list[Finding]:
+    """Check what an edited mask changed of a body, if there is one."""
+    mask, change = volume.edited_mask, body.mask_change
+    if mask is None or change is None:
+        return []
+    return check_mask(mask, change, in_plane_voxel(body.affine), settings.body)
 
 
 def _flags(evidence: Evidence, findings: list[Finding]) -> tuple[Flag, ...]:

@@ -53,7 +53,8 @@ def run_visits(jobs: tuple[Job, ...]) -> list[Outcome]:
 
 def _measure_visits(jobs: tuple[Job, ...]) -> list[Outcome]:
     """Lay out the mean of the visits, measure each visit on it, and write what they share."""
-    from hipsta_bids.inputs.labels import read_label_volume  # noqa: PLC0415  (workers only)
+    from hipsta_bids.geometry.body import relabel_by_mask  # noqa: PLC0415  (workers only)
+    from hipsta_bids.inputs.labels import read_label_volume  # noqa: PLC0415  (likewise)
     from hipsta_bids.participant import longitudinal  # noqa: PLC0415  (likewise)
     from hipsta_bids.participant.measure import quality_metrics  # noqa: PLC0415  (likewise)
 
@@ -63,7 +64,8 @@ def _measure_visits(jobs: tuple[Job, ...]) -> list[Outcome]:
     usable, volumes = [], []
     for job in jobs:
         with suppress(HipstaError):  # its own job reports it
-            volumes.append(read_label_volume(job.item, settings.body.region))
+            volume = read_label_volume(job.item, settings.body.region)
+            volumes.append(relabel_by_mask(volume, settings.body))
             usable.append(job)
     frame, problem = None, None
     try:
@@ -80,7 +82,8 @@ def _measure_visits(jobs: tuple[Job, ...]) -> list[Outcome]:
 
     def measure(job: Job) -> Measure:
         def run(volume: Any, hemi: str, _settings: Any, clock: Any) -> HemisphereMaps:  # noqa: ANN401
-            if frame is None:
+            if frame is None or job not in usable:
+                relabel_by_mask(volume, settings.body)  # names what is wrong with a mask
                 raise problem or HipstaError("no visit can be read", reason="internal-error")
             maps = longitudinal.measure_visit(frame, usable.index(job), volume, hemi, clock)
             measured[job.item.session] = maps

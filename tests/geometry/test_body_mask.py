@@ -8,7 +8,7 @@ from geometry_cases import short_phantom
 from scipy import ndimage
 
 from hipsta_bids.errors import GeometryError
-from hipsta_bids.geometry.body import MaskChange, check_mask, extract_body
+from hipsta_bids.geometry.body import MaskChange, check_mask, extract_body, relabel_by_mask
 from hipsta_bids.participant.measure import find_body
 from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.protocols.protocol import Tissue
@@ -149,3 +149,17 @@ def test_the_body_is_found_where_it_can_be(volume, body):
     )
     nothing = replace(volume, tissue=np.zeros_like(volume.tissue))
     assert find_body(nothing, Settings()) is None
+
+
+def test_labels_can_be_those_of_the_mask(volume, body):
+    mask = body.inside.copy()
+    index = np.argwhere(mask)
+    mask[tuple(index[index[:, 1] > np.median(index[:, 1]) + 6].T)] = False
+    masked = replace(volume, edited_mask=EditedMask(inside=mask, voxel=0.4))
+    relabeled = relabel_by_mask(masked, SETTINGS)
+    assert relabeled.edited_mask is None
+    assert np.array_equal(
+        extract_body(relabeled, SETTINGS).inside, extract_body(masked, SETTINGS).inside
+    )
+    assert (relabeled.tissue != volume.tissue).any()
+    assert relabel_by_mask(volume, SETTINGS) is volume

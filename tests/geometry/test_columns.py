@@ -34,6 +34,14 @@ def plate_field(low, high, further=()):
     return Field(grid=grid, values=depth.astype(np.float32))
 
 
+def bounded_field(edges):
+    """A field of the plate, with its own edges along the rows (along y of RAS), mm."""
+    field = plate_field(at(LOW), at(HIGH))
+    along = field.grid.node_points()[..., 1]
+    depth = np.minimum(field.values, np.minimum(along - edges[0], edges[1] - along))
+    return Field(grid=field.grid, values=depth.astype(np.float32))
+
+
 def at(value):
     return lambda points: np.full(points.shape[:-1], value)
 
@@ -69,6 +77,53 @@ def test_columns_that_run_into_a_fold_follow_their_neighbors(sheet):
     assert 0 < (~walls.known).sum() < NX * NY / 4
     # Where the field turns from one wall to the other, it is not exact.
     assert walls.moves[~walls.known][:, 1] == pytest.approx(0.1, abs=0.15)
+
+
+def test_a_wall_that_moves_away_loses_its_weight_gradually(sheet):
+    def moves(distance):
+        field = plate_field(
+            at(LOW), lambda p: HIGH + distance * np.exp(-((p[..., 1] - 10) ** 2) / 0.72)
+        )
+        return columns.find_walls(sheet, np.eye(4), field).moves[..., 1]
+
+    distances, spacing = np.arange(0.0, 1.45, 0.02), 12 / (NX - 1)
+    maps = np.stack([moves(distance) for distance in distances])
+    largest = np.abs(np.diff(maps, axis=0)).max(axis=(1, 2))
+    assert largest.max() < 2 * 0.02
+    assert maps[distances.searchsorted(0.4)].max() == pytest.approx(0.4, abs=0.12)
+    # There, the neighbors decide.
+    assert maps[-1].max() == pytest.approx(distances[-1] * np.exp(-(spacing**2) / 0.72), abs=0.05)
+
+
+def test_edges_of_a_visit_are_found(sheet):
+    edges = columns.find_edges(sheet, np.eye(4), bounded_field((4.3, 15.6)))
+    # Steps along a row are 0.3 mm.
+    assert edges[:, 0] == pytest.approx(0.3, abs=2 * BENT)
+    assert edges[:, 1] == pytest.approx(-0.4, abs=2 * BENT)
+
+
+def test_edges_are_smoothed_past_places_without_one(sheet):
+    edges = np.tile([0.3, -0.2], (NY, 1))
+    edges[2] = np.nan
+    edges[5, 0] = 3.0  # of another turn
+    smooth = columns.smooth_edges(edges, sheet)
+    assert smooth == pytest.approx(np.tile([0.3, -0.2], (NY, 1)))
+    assert not columns.smooth_edges(np.full((NY, 2), np.nan), sheet).any()
+
+
+def test_columns_follow_the_edges_less_the_farther_away(sheet):
+    edges = np.tile([0.3, -0.2], (5, 1))
+    moved = columns.move_edges(sheet, edges, 1.0, 1.0)
+    distance = moved.points - sheet.points
+    assert distance[..., [0, 2]] == pytest.approx(0.0, abs=1e-12)
+    far = np.exp(-12 / columns.EDGE_REACH)
+    assert distance[0, ..., 1] == pytest.approx(0.3 - 0.2 * far)
+    assert distance[-1, ..., 1] == pytest.approx(-0.2 + 0.3 * far)
+    assert (np.diff(moved.points[:, 0, 0, 1]) > 0).all()
+    # A sheet that ends before the edges moves as that part of the whole one.
+    short = Sheet(points=sheet.points[1:-1], valid=sheet.valid[1:-1])
+    part = columns.move_edges(short, edges, (NX - 3) / (NX - 1), 1.0)
+    assert part.points == pytest.approx(moved.points[1:-1])
 
 
 def test_a_visit_far_from_the_sheet_is_refused(sheet):
