@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -17,9 +17,9 @@ from hipsta_bids.geometry.measures import column_area
 from hipsta_bids.group.stats.trials import participants_needed
 from hipsta_bids.inputs.search import HemisphereInput
 from hipsta_bids.participant.job import peak_memory, reset_peak_memory
-from hipsta_bids.participant.longitudinal import make_frame, measure_visit
+from hipsta_bids.participant.longitudinal import Frame, make_frame, measure_visit
 from hipsta_bids.phantom import PhantomSpec, Thinning
-from hipsta_bids.protocols.protocol import Tissue
+from hipsta_bids.protocols.protocol import Part, Tissue
 from hipsta_bids.settings import Settings
 from hipsta_bids.types import Bool, Float, HemisphereMaps, LabelVolume, Sheet
 from validation import cases
@@ -35,6 +35,8 @@ YEARS = np.array([0.0, 1.0, 2.0])
 NOISE, STRONG = 0.2, 0.3
 """mm, SD along each axis of displacements of the labels, correlated over ``CORRELATION`` mm."""
 CORRELATION = 1.0
+LAYER = 0.1
+"""mm, lost from all sides of the sheet's labels at a second visit."""
 SLOPE, LOCAL = -0.1, -0.15
 """mm per year, planted everywhere, and in CA1 only: so large that noise of voxels hides no bias."""
 LOSS = 0.02
@@ -43,6 +45,8 @@ TRUE_SD = 0.01
 """mm per year, SD of that loss between participants."""
 SLOWED = 0.25
 """Share of the loss that treatment stops."""
+DRAWS = 3
+"""Times that the visits in thick slices are drawn: their mean thickness varies much."""
 UNCHANGED = 40
 """People without change, for false positives."""
 MAX_BIAS, MAX_LEAKAGE = 0.05, 0.002
@@ -73,6 +77,10 @@ class Person:
     """Whether the visits are also measured on sheets of their own."""
     coarse: bool = False
     """Whether the working grid is coarse, which saves time."""
+    true: bool = False
+    """Whether the visits are also measured on the sheet of the labels before the scans."""
+    layers: tuple[float, ...] = ()
+    """mm, lost at each visit from all sides of the sheet's labels."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -85,6 +93,16 @@ class Result:
     """On separate sheets, smoothed as the walls of the common sheet are; None if not measured."""
     separate: Float | None
     """On separate sheets."""
+    true: Float | None
+    """On the sheet of the labels before the scans, by the true motions; None if not measured."""
+    smoother: tuple[Float, Float] | None
+    """Maps of separate sheets and of the common one, all smoothed in the same way."""
+    volume: Float
+    """(visits,) of the sheet on the common sheet, mm3."""
+    separate_volume: Float | None
+    """(visits,) of the sheet on separate sheets, mm3."""
+    labels_volume: Float
+    """(visits,) of the labels between the ends of the common sheet, mm3."""
     ca1: Bool
     """(Nx, Ny) columns in CA1."""
     filled: float
@@ -106,8 +124,11 @@ def scan(
     voxel: tuple[float, float, float],
     noise: float,
     random: np.random.Generator,
-) -> LabelVolume:
-    """Take the labels in new voxels: position and direction of the grid, pose, errors of labels."""
+) -> tuple[LabelVolume, Float]:
+    """Take the labels in new voxels: position and direction of the grid, pose, errors of labels.
+
+    Also returns the pose (4, 4), RAS mm.
+    """
     hippocampal = (volume.tissue > 0) & (volume.tissue <= Tissue.HIPPOCAMPUS)
     points = apply_affine(volume.affine, np.argwhere(hippocampal))
     axis = long_axis(points, volume.part[hippocampal])
@@ -131,7 +152,24 @@ def scan(
         row[inside] = labels[tuple(nearest[inside].T)]
     pose = from_matvec(cases.turned(random, 6.0), random.uniform(-4, 4, 3))
     tissue, part = values.reshape(2, *shape)
-    return LabelVolume(tissue=tissue, part=part, affine=pose @ affine, protocol=volume.protocol)
+    scanned = LabelVolume(tissue=tissue, part=part, affine=pose @ affine, protocol=volume.protocol)
+    return scanned, pose
+
+
+def lose_layer(volume: LabelVolume, layer: float) -> LabelVolume:
+    """Take a layer, mm, from all sides of the sheet's labels, in voxels of about ``LAYER``."""
+    edges = np.linalg.norm(volume.affine[:3, :3], axis=0)
+    divided = np.maximum(np.rint(edges / LAYER), 1).astype(int)
+    tissue, part = (
+        np.kron(labels, np.ones(divided, dtype=np.uint8)) for labels in (volume.tissue, volume.part)
+    )
+    affine = volume.affine @ from_matvec(np.diag(1 / divided), (1 / divided - 1) / 2)
+    sheet = np.isin(tissue, volume.protocol.sheet)
+    edges = np.linalg.norm(affine[:3, :3], axis=0)
+    # Distances are from centers of voxels to centers of voxels outside.
+    lost = sheet & (ndimage.distance_transform_edt(sheet, sampling=edges) < layer + edges.min() / 2)
+    tissue[lost], part[lost] = Tissue.BACKGROUND, Part.UNKNOWN
+    return replace(volume, tissue=tissue, part=part, affine=affine)
 
 
 def load(source: Source) -> tuple[LabelVolume, str]:
@@ -143,32 +181,51 @@ def load(source: Source) -> tuple[LabelVolume, str]:
 
 def draw(person: Person) -> tuple[list[LabelVolume], str]:
     """Draw the visits of a person; return the hemisphere, too."""
+    volumes, _, hemi = draw_posed(person)
+    return volumes, hemi
+
+
+def draw_posed(person: Person) -> tuple[list[LabelVolume], list[Float], str]:
+    """Draw the visits of a person; return their poses (4, 4), RAS mm, and the hemisphere, too."""
     random = np.random.default_rng((SEED, person.seed))
     bodies = {source: load(source) for source in dict.fromkeys(person.sources)}
     loaded = [bodies[source] for source in person.sources]
     volumes = [volume for volume, _ in loaded]
+    if person.layers:
+        volumes = [lose_layer(v, layer) for v, layer in zip(volumes, person.layers, strict=True)]
+    poses: list[Float] = []
     if person.voxels:
-        volumes = [
+        scans = [
             scan(volume, voxel, person.noise, random)
             for volume, voxel in zip(volumes, person.voxels, strict=True)
         ]
-    return volumes, loaded[0][1]
+        volumes, poses = [volume for volume, _ in scans], [pose for _, pose in scans]
+    return volumes, poses, loaded[0][1]
 
 
 def measure_frame(
     volumes: Sequence[LabelVolume], hemi: str, settings: Settings, *, shared: bool = False
 ) -> list[HemisphereMaps]:
     """Measure visits on a common sheet."""
-    frame = make_frame(volumes, hemi, settings, lambda _: nullcontext(), shared=shared)
+    frame = make_frame(volumes, hemi, settings, _untimed, shared=shared)
+    return measure_on(frame, volumes, hemi)
+
+
+def measure_on(frame: Frame, volumes: Sequence[LabelVolume], hemi: str) -> list[HemisphereMaps]:
+    """Measure visits on a sheet."""
     return [
-        measure_visit(frame, number, volume, hemi, lambda _: nullcontext())
+        measure_visit(frame, number, volume, hemi, _untimed)
         for number, volume in enumerate(volumes)
     ]
 
 
+def _untimed(_stage: str) -> AbstractContextManager[None]:
+    return nullcontext()
+
+
 def measure_person(person: Person) -> Result:
-    """Measure the visits of a person on a common sheet, and perhaps on separate ones."""
-    volumes, hemi = draw(person)
+    """Measure the visits of a person on a common sheet, and perhaps on further ones."""
+    volumes, poses, hemi = draw_posed(person)
     settings = Settings().changed(grid={"spacing": 0.5}) if person.coarse else Settings()
     separate: list[HemisphereMaps] = []
     start = time.process_time()
@@ -176,21 +233,48 @@ def measure_person(person: Person) -> Result:
         separate = [cases.measure_body(volume, hemi, settings) for volume in volumes]
     middle = time.process_time()
     reset_peak_memory()
-    maps = measure_frame(volumes, hemi, settings, shared=not person.voxels)
-    end = time.process_time()
-    stacked = np.stack([m.thickness for m in separate]) if separate else None
+    frame = make_frame(volumes, hemi, settings, _untimed, shared=not person.voxels)
+    maps = measure_on(frame, volumes, hemi)
+    end, memory = time.process_time(), peak_memory()
+    true = None
+    if person.true:
+        drawn = make_frame([load(person.sources[0])[0]], hemi, settings, _untimed, shared=True)
+        posed = replace(drawn, motions=tuple(pose @ drawn.motions[0] for pose in poses))
+        true = _stacked(measure_on(posed, volumes, hemi))
+    smoothed = _smoothed(separate) if separate else None
     return Result(
-        frame=np.stack([m.thickness for m in maps]),
-        separate=stacked,
-        smooth=np.stack([smooth(m.sheet, m.thickness) for m in separate]) if separate else None,
+        frame=_stacked(maps),
+        separate=_stacked(separate) if separate else None,
+        smooth=smoothed,
+        true=true,
+        smoother=None if smoothed is None else (smoothed, _smoothed(maps)),
+        volume=np.array([m.summary["volume"] for m in maps]),
+        separate_volume=np.array([m.summary["volume"] for m in separate]) if separate else None,
+        labels_volume=np.array(
+            [
+                np.count_nonzero(m.body_mask.inside)
+                * abs(np.linalg.det(m.body_mask.affine[:3, :3]))
+                for m in maps
+            ]
+        ),
         ca1=maps[0].subfield == Tissue.CA1,
         filled=max(m.qc["filled_fraction"] for m in maps),
         overlap=min(m.qc["frame_overlap"] for m in maps),
         distance=max(m.qc["frame_distance_mm"] for m in maps),
         flagged=sum("visits-differ" in {f.reason for f in m.flags} for m in maps),
         cost=(end - middle) / (middle - start) if separate else np.nan,
-        memory=peak_memory() / MEGABYTE,
+        memory=memory / MEGABYTE,
     )
+
+
+def _stacked(maps: Sequence[HemisphereMaps]) -> Float:
+    """Stack maps of thickness (visits, Nx, Ny), mm."""
+    return np.stack([m.thickness for m in maps])
+
+
+def _smoothed(maps: Sequence[HemisphereMaps]) -> Float:
+    """Stack smoothed maps of thickness (visits, Nx, Ny), mm."""
+    return np.stack([smooth(m.sheet, m.thickness) for m in maps])
 
 
 def smooth(sheet: Sheet, values: Float) -> Float:
@@ -270,8 +354,16 @@ def people(full: bool, labels: Path | None) -> dict[str, list[Person]]:
 
     pairs = revisions(labels, Settings())
     return {
-        "real, 0.4 mm": real([*items, *beside][few]),
-        "real, 2 mm slices": real(items[few], voxels=(THICK,) * 3) if full else [],
+        "real, 0.4 mm": real([*items, *beside][few], true=True),
+        "real, 2 mm slices": (
+            [
+                replace(person, seed=person.seed + 1000 * draw)
+                for draw in range(DRAWS)
+                for person in real(items, voxels=(THICK,) * 3, true=True)
+            ]
+            if full
+            else []
+        ),
         "real, third visit in 2 mm slices": (
             real(items[:3], voxels=(FINE, FINE, THICK)) if full else []
         ),
@@ -290,12 +382,45 @@ def people(full: bool, labels: Path | None) -> dict[str, list[Person]]:
     }
 
 
+def loss_people(full: bool, labels: Path | None) -> dict[str, list[Person]]:
+    """List people of real shapes who lose a layer between two visits."""
+    items = cases.fine_segmentations(labels, 0.6) if labels else []
+    folders = cases.hippunfold_beside(labels) if labels else []
+    others: list[Source] = [i for f in folders for i in cases.fine_segmentations(f, 0.6)]
+    others += [
+        (path, hemi) for f in folders for path in sorted(f.glob("templates/tpl-*")) for hemi in "LR"
+    ]
+
+    def drawn(sources: Sequence[Source], voxel: Voxel) -> list[Person]:
+        return [
+            Person(
+                name=str(n),
+                sources=(source,) * 2,
+                voxels=(voxel,) * 2,
+                layers=(0.0, LAYER),
+                seed=300 + n,
+            )
+            for n, source in enumerate(sources)
+        ]
+
+    if not full:
+        return {"three brains, 0.4 mm": drawn(items[:1], FINE)}
+    return {
+        "three brains, 0.4 mm": drawn(items, FINE),
+        "other brains, 0.4 mm": drawn(others, FINE),
+        "three brains, 2 mm slices": drawn(items, THICK),
+        "other brains, 2 mm slices": drawn(others, THICK),
+    }
+
+
 @suite("visits")
 def run(full: bool, labels: Path | None = None) -> Iterator[Content]:
     """Measure people on common and separate sheets, planted change, and invariances."""
     sets = people(full, labels)
     results = cases.run_groups(measure_person, sets, timeout=300.0)
     yield noise_table({name: group for name, group in results.items() if group}, sets)
+    losses = cases.run_groups(measure_person, loss_people(full, labels), timeout=300.0)
+    yield _losses(losses, [r for r in results["real, 0.4 mm"] if isinstance(r, Result)])
     count = 8 if full else 2
     planted = {
         name: [
@@ -333,7 +458,8 @@ def noise_table(
     """Compare the noise of common and separate sheets by set."""
     for name, group in results.items():
         measured = [result for result in group if isinstance(result, Result)]
-        sums = {key: _pooled(measured, key) for key in ("separate", "smooth", "frame")}
+        keys = ("separate", "smooth", "frame", *(("true",) if measured[0].true is not None else ()))
+        sums = {key: _pooled(measured, key) for key in keys}
         means = {key: _pooled(measured, key, mean=True) for key in ("separate", "frame")}
         arms = {key: per_arm(value) for key, value in means.items()}
         cells: dict[str, Cell] = {"set": name, "hemispheres": f"{len(measured)} of {len(group)}"}
@@ -343,6 +469,8 @@ def noise_table(
             "common, mm": sums["frame"],
             "ratio": sums["frame"] / sums["separate"],
             "ratio, equal smoothing": sums["frame"] / sums["smooth"],
+            "ratio, true sheet": sums["true"] / sums["smooth"] if "true" in sums else None,
+            "ratio, all smoothed": _smoother(measured),
             "lower in": f"{sum(_lower(result) for result in measured)} of {len(measured)}",
             "mean, separate, mm": means["separate"],
             "mean, common, mm": means["frame"],
@@ -369,6 +497,15 @@ def _pooled(results: Sequence[Result], key: str, *, mean: bool = False) -> float
     return cases.rms([noise_of(getattr(result, key), mean=mean) for result in results])
 
 
+def _smoother(results: Sequence[Result]) -> float:
+    """Compute the ratio of the SD within people where maps of both kinds are smoothed."""
+    pairs = [result.smoother for result in results if result.smoother is not None]
+    separate, common = (
+        cases.rms([noise_of(maps) for maps in kind]) for kind in zip(*pairs, strict=True)
+    )
+    return common / separate
+
+
 def _lower(result: Result) -> bool:
     """Whether a person has less noise on the common sheet, at equal smoothing."""
     return result.smooth is not None and noise_of(result.frame) < noise_of(result.smooth)
@@ -378,6 +515,46 @@ def _level(result: Result) -> float:
     """Mean thickness on the common sheet minus that on separate sheets, mm."""
     separate = result.frame if result.separate is None else result.separate
     return float(result.frame.mean() - separate.mean())
+
+
+@table("visits.losses")
+def _losses(
+    results: Mapping[str, Sequence[Result | cases.Refusal]], unchanged: Sequence[Result]
+) -> Iterator[Cells | str]:
+    """Compare the change that is measured where all walls lose a layer."""
+    kinds = ("separate", "frame") if unchanged else ()
+    noise = {key: _pooled(unchanged, key, mean=True) for key in kinds}
+    for name, group in results.items():
+        measured = [result for result in group if isinstance(result, Result)]
+        if not measured:
+            continue
+        change = {
+            key: np.array([np.diff(getattr(r, key).mean(axis=(1, 2)))[0] for r in measured])
+            for key in kinds
+        }
+        volume = {
+            key: float(np.mean([getattr(r, key)[1] / getattr(r, key)[0] - 1 for r in measured]))
+            for key in ("labels_volume", "separate_volume", "volume")
+        }
+        response = {key: float(values.mean() / (-2 * LAYER)) for key, values in change.items()}
+        arms = {key: per_arm(noise[key] / response[key]) for key in noise}
+        fine = name.endswith("0.4 mm")
+        yield {
+            "set": name,
+            "hemispheres": f"{len(measured)} of {len(group)}",
+            "planted, mm": -2 * LAYER,
+            "separate, mm": float(change["separate"].mean()),
+            "common, mm": float(change["frame"].mean()),
+            "standard error": float(stats.sem(change["frame"])) if len(measured) > 1 else None,
+            "bias": f"{response['frame'] - 1:+.1%}",
+            "volume of labels": f"{volume['labels_volume']:+.1%}",
+            "volume, separate": f"{volume['separate_volume']:+.1%}",
+            "volume, common": f"{volume['volume']:+.1%}",
+            "per arm, separate": f"{arms['separate']:.0f}" if fine else None,
+            "per arm, common": f"{arms['frame']:.0f}" if fine else None,
+            "bias met": abs(response["frame"] - 1) <= MAX_BIAS,
+        }
+    yield cases.refusal_notes(results)
 
 
 @table("visits.slopes")
