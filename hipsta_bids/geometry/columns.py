@@ -27,8 +27,9 @@ FARTHEST = 0.7
 SMOOTHING = 1.0
 #: The same of edges, which are smoothed along them, and are less certain, mm.
 NEAR_EDGE, EDGE_SMOOTHING = 1.0, 6.0
-#: Columns follow an edge less the farther they are from it: 1/e at this distance, mm.
-EDGE_REACH = 3.0
+#: Columns follow an edge less the farther they are from it: 1/e at this distance, mm, and at a
+#: larger one where the edge moves far, so that columns do not change places.
+EDGE_REACH = 1.0
 
 _FWHM = float(np.sqrt(8 * np.log(2)))  # of a Gaussian, in standard deviations
 _TAIL = 1e-4  # weight of a Gaussian of four times the width, for places without a wall near
@@ -112,8 +113,8 @@ def move_edges(sheet: Sheet, edges: Float, x_extent: float, y_extent: float) -> 
     middle = sheet.points[:, :, sheet.middle]
     place = _places(middle)
     beyond = place[-1] * (1 / x_extent - 1) / 2  # from the first and the last column to the edges
-    distance = medial * np.exp(-(place + beyond) / EDGE_REACH)
-    distance += lateral * np.exp(-(place[-1] + beyond - place) / EDGE_REACH)
+    from_edges = (medial, place + beyond), (lateral, place[-1] + beyond - place)
+    distance = sum(move * np.exp(-far / np.hypot(EDGE_REACH, 2 * move)) for move, far in from_edges)
     along = np.gradient(middle, axis=0)
     along *= (distance / np.maximum(np.linalg.norm(along, axis=-1), 1e-9))[..., None]
     return Sheet(points=sheet.points + along[:, :, None], valid=sheet.valid)

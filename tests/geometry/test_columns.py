@@ -111,15 +111,18 @@ def test_edges_are_smoothed_past_places_without_one(sheet):
     assert not columns.smooth_edges(np.full((NY, 2), np.nan), sheet).any()
 
 
-def test_columns_follow_the_edges_less_the_farther_away(sheet):
-    edges = np.tile([0.3, -0.2], (5, 1))
+@pytest.mark.parametrize("far", [0.3, 1.4])
+def test_columns_follow_the_edges_less_the_farther_away(sheet, far):
+    edges = np.tile([far, -0.2], (5, 1))
     moved = columns.move_edges(sheet, edges, 1.0, 1.0)
     distance = moved.points - sheet.points
     assert distance[..., [0, 2]] == pytest.approx(0.0, abs=1e-12)
-    far = np.exp(-12 / columns.EDGE_REACH)
-    assert distance[0, ..., 1] == pytest.approx(0.3 - 0.2 * far)
-    assert distance[-1, ..., 1] == pytest.approx(-0.2 + 0.3 * far)
-    assert (np.diff(moved.points[:, 0, 0, 1]) > 0).all()
+    assert distance[0, ..., 1] == pytest.approx(far, abs=1e-4)
+    assert distance[-1, ..., 1] == pytest.approx(-0.2, abs=0.03)
+    reach = np.hypot(columns.EDGE_REACH, 2 * far)
+    assert distance[1, ..., 1] == pytest.approx(far * np.exp(-12 / (NX - 1) / reach), abs=1e-4)
+    # Columns do not change places.
+    assert np.diff(moved.points[:, 0, 0, 1]).min() > 0.4 * 12 / (NX - 1)
     # A sheet that ends before the edges moves as that part of the whole one.
     short = Sheet(points=sheet.points[1:-1], valid=sheet.valid[1:-1])
     part = columns.move_edges(short, edges, (NX - 3) / (NX - 1), 1.0)
