@@ -136,7 +136,7 @@ def test_defaults(seen, tmp_path):
     command = f"hipsta-bids in {tmp_path} participant"
     assert [row["status"] for row in seen["options"].inputs] == ["used", "not used"]
     assert replace(seen["options"], inputs=()) == RunOptions(
-        n_procs=n_procs, reports=True, anatomy=Path("in"), command=command
+        n_procs=n_procs, reports=True, bids_dir=Path("in"), command=command
     )
     assert seen["out"] == tmp_path
 
@@ -174,6 +174,8 @@ def test_everything_reaches_its_place(seen, tmp_path):
     )
     assert replace(seen["options"], inputs=()) == RunOptions(
         is_whole=False,
+        bids_dir=Path("in"),
+        anatomy=False,
         pybids=True,
         n_procs=3,
         mem_gb=4.0,
