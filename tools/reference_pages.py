@@ -72,9 +72,13 @@ segmentation, in mm."""
 
 GROUP_FILES = (Path(__file__).parent / "group_files.md").read_text("utf-8").strip()
 
+NODES_TEXT = """\
+In all tables of hemispheres, and in tables for `--roi` and `--mask`, `x` and `y` are numbers of
+nodes. At the group level these are `node_x` and `node_y`; `x` and `y` are coordinates there."""
+
 TABLES_TEXT = """\
-`desc-sections_morph.tsv` has one row per cross-section from posterior to anterior, with `y` and
-{sections}.
+`desc-sections_morph.tsv` has one row per cross-section from posterior to anterior, with the number
+`y` of the section, and {sections}.
 
 `desc-summary_morph.tsv` has one row, with {summary}, and per subfield {subfields}.
 
@@ -182,6 +186,7 @@ def outputs_page() -> str:
         "## Columns of `desc-sheet_morph.tsv`",
         f"One row per grid point, with the measures {_measures(MAPS)}, and:",
         table(columns, _named([*place, *state])),
+        NODES_TEXT,
         "## Columns of the other tables",
         TABLES_TEXT.format(
             sections=_measures(SECTIONS),
