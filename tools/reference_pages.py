@@ -61,10 +61,10 @@ folders at the path that they have outside (`-v /data:/data`).
 
 IGNORED_TEXT = """\
 The dataset passes the [BIDS validator](https://github.com/bids-standard/bids-validator) without
-errors. BIDS 1.11 has no names for some files. `.bidsignore` lists 8 patterns of these files, with
-the reason. The validator checks the others: 4 files of the dataset, and the subfields on each
-surface with their sidecar. The entities of all files follow the order of BIDS, and their suffixes
-the proposal for structural derivatives (BEP011).
+errors. BIDS 1.11 has no names for some files. `.bidsignore` lists 8 patterns, with the
+reason and the files that each pattern hides. The validator checks the others: 4 files of the
+dataset, and the subfields on each surface with their sidecar. The entities of all files follow the
+order of BIDS, and their suffixes the proposal for structural derivatives (BEP011).
 
 Properties of all images with one suffix (`Description`, `Units`, `SpatialReference`) are in the
 root, for example in `thickness.json`. `SpatialReference` is `orig` for the scanner RAS space of the
