@@ -76,6 +76,18 @@ class UsageError(HipstaError):
     exit_code = ExitCode.USAGE
 
 
+class ArgumentError(UsageError, ValueError):
+    """An argument of a Python function is wrong; the command line names its option instead."""
+
+    def __init__(self, argument: str, problem: str) -> None:
+        super().__init__(f"{argument} {problem}")
+        self.argument, self.problem = argument, problem
+
+    def __reduce__(self) -> tuple[object, tuple[object, ...]]:
+        """Survive pickling between processes."""
+        return type(self), (self.argument, self.problem)
+
+
 class SettingsError(UsageError):
     """A setting is unknown or out of range."""
 

@@ -61,10 +61,10 @@ folders at the path that they have outside (`-v /data:/data`).
 
 IGNORED_TEXT = """\
 The dataset passes the [BIDS validator](https://github.com/bids-standard/bids-validator) without
-errors. BIDS 1.11 has no names for some files. `.bidsignore` lists 8 patterns of these files, with
-the reason. The validator checks the others: 4 files of the dataset, and the subfields on each
-surface with their sidecar. The entities of all files follow the order of BIDS, and their suffixes
-the proposal for structural derivatives (BEP011).
+errors. BIDS 1.11 has no names for some files. `.bidsignore` lists 8 patterns, with the
+reason and the files that each pattern hides. The validator checks the others: 4 files of the
+dataset, and the subfields on each surface with their sidecar. The entities of all files follow the
+order of BIDS, and their suffixes the proposal for structural derivatives (BEP011).
 
 Properties of all images with one suffix (`Description`, `Units`, `SpatialReference`) are in the
 root, for example in `thickness.json`. `SpatialReference` is `orig` for the scanner RAS space of the
@@ -72,9 +72,13 @@ segmentation, in mm."""
 
 GROUP_FILES = (Path(__file__).parent / "group_files.md").read_text("utf-8").strip()
 
+NODES_TEXT = """\
+In all tables of hemispheres, and in tables for `--roi` and `--mask`, `x` and `y` are numbers of
+nodes. At the group level these are `node_x` and `node_y`; `x` and `y` are coordinates there."""
+
 TABLES_TEXT = """\
-`desc-sections_morph.tsv` has one row per cross-section from posterior to anterior, with `y` and
-{sections}.
+`desc-sections_morph.tsv` has one row per cross-section from posterior to anterior, with the number
+`y` of the section, and {sections}.
 
 `desc-summary_morph.tsv` has one row, with {summary}, and per subfield {subfields}.
 
@@ -182,6 +186,7 @@ def outputs_page() -> str:
         "## Columns of `desc-sheet_morph.tsv`",
         f"One row per grid point, with the measures {_measures(MAPS)}, and:",
         table(columns, _named([*place, *state])),
+        NODES_TEXT,
         "## Columns of the other tables",
         TABLES_TEXT.format(
             sections=_measures(SECTIONS),

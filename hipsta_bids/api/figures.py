@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hipsta_bids.api.maps import attributes, check_choice, node_axes
-from hipsta_bids.errors import NothingToDoError, UsageError, did_you_mean
+from hipsta_bids.errors import ArgumentError, NothingToDoError, did_you_mean
 from hipsta_bids.geometry.catalog import MAPS
 from hipsta_bids.group.cohort.collect import grid_of
 from hipsta_bids.group.output import figures, maps, panels, style
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 FIGURES = ("participant", "group", "contrast", "registration", "roc")
 WIDTHS = {1: style.ONE_COLUMN, 2: style.TWO_COLUMNS}
 _DEFAULT = ("thickness", "curvature")
+_MOST_DPI = 2400  # a page has 0.4 gigapixels
 
 
 def figure(
@@ -70,7 +71,7 @@ def figure(
         Values at both ends of the colors of the maps of a participant, the mean maps of
         ``group`` and the effects of ``contrast``; else percentiles of the values that are shown.
     dpi : float
-        Dots per inch of pictures.
+        Dots per inch of pictures, from 1 to 2400.
     file : str or Path, optional
         Where to write the figure, as PDF, SVG or PNG by its extension.
 
@@ -81,7 +82,8 @@ def figure(
     Raises
     ------
     ValueError
-        If the figure, measure, contrast or format is unknown.
+        If an argument lacks, or has a value that the files do not allow; the attribute
+        ``argument`` of the error names this argument.
     NothingToDoError
         If the folder lacks the participant or the analysis.
 
@@ -93,8 +95,12 @@ def figure(
     """
     check_choice("what", what, dict.fromkeys(FIGURES))
     check_choice("columns", columns or 2, dict.fromkeys(WIDTHS))
+    if limits and not (np.isfinite(limits).all() and limits[0] < limits[1]):
+        raise ArgumentError("limits", f"is {limits}; give two numbers, the smaller one first")
+    if not 1 <= dpi <= _MOST_DPI:
+        raise ArgumentError("dpi", f"is {dpi}; give 1 to {_MOST_DPI}, such as 300 for print")
     root = Path(out_dir)
-    kind = check_format(Path(file)) if file is not None else None
+    kind = _format_of(Path(file)) if file is not None else None
     width = None if columns is None else WIDTHS[columns]
     with style.style():
         if what == "participant":
@@ -118,11 +124,11 @@ def figure(
         return _written(drawing, file, kind, dpi)
 
 
-def check_format(path: Path) -> str:
-    """Return the format of a figure by its file's name; UsageError for other formats."""
+def _format_of(path: Path) -> str:
+    """Return the format of a figure by its file's name; ArgumentError for other formats."""
     kind = path.suffix.removeprefix(".").lower()
     if kind not in style.KINDS:
-        raise UsageError(f"{path}: no format of figures; use .pdf, .svg or .png")
+        raise ArgumentError("file", f"is {path}, no format of figures; use .pdf, .svg or .png")
     return kind
 
 
@@ -140,7 +146,7 @@ def _analysis(root: Path, name: str | None) -> GroupResults:
     if not models:
         raise NothingToDoError(f"{root}: no analysis; run the group level first")
     if name is None and len(models) > 1:
-        raise UsageError(f"{root}: several analyses; give the name of one: {', '.join(models)}")
+        raise ArgumentError("name", f"is missing; {root} has the analyses {', '.join(models)}")
     if name is not None and name not in models:
         near = did_you_mean([name], models)
         raise NothingToDoError(f"{root}: no analysis {name}{near}; see the folder group")
@@ -153,7 +159,7 @@ def _measure(results: GroupResults, measures: Sequence[str]) -> str:
     if not known_maps:
         raise NothingToDoError(f"{results.folder}: no maps in this analysis")
     if len(measures) > 1:
-        raise UsageError("measures: give one map, as a figure of an analysis shows one")
+        raise ArgumentError("measures", "has several maps; a figure of an analysis shows one")
     measure = measures[0] if measures else known_maps[0]
     check_choice("measures", measure, dict.fromkeys(known_maps))
     return measure
@@ -175,7 +181,7 @@ def _group_rows(
     chosen_names = list(contrasts or pairs)
     if what == "contrast":
         if len(contrasts) > 1:
-            raise UsageError("contrasts: give one contrast for this figure")
+            raise ArgumentError("contrasts", "has several names; give one for this figure")
         effect, significance = pairs[chosen_names[0]]
         yield _with_limits(effect, limits)
         yield significance
@@ -183,8 +189,9 @@ def _group_rows(
     means = [row for row in maps.mean_rows(results, measure) if row.kind == "mean"]
     n_rows = len(means) + len(chosen_names)
     if n_rows > panels.MOST_ROWS:
-        raise UsageError(
-            f"{n_rows} rows do not fit a page of {panels.MOST_ROWS}; name fewer contrasts"
+        raise ArgumentError(
+            "contrasts",
+            f"gives {n_rows} rows, more than the {panels.MOST_ROWS} of a page; name fewer",
         )
     yield from (_with_limits(row, limits) for row in means)
     yield from (pairs[contrast][0] for contrast in chosen_names)
@@ -205,15 +212,23 @@ def _with_limits(row: panels.Row, limits: tuple[float, float] | None) -> panels.
 def _hemispheres(root: Path, participant: str | None, session: str | None) -> list[Hemisphere]:
     """Find the measured hemispheres of one participant and session, left first."""
     if participant is None:
-        raise UsageError("participant: name the participant of this figure")
+        raise ArgumentError("participant", "is missing; name the participant of this figure")
     label = participant.removeprefix("sub-")
-    visit = None if session is None else session.removeprefix("ses-")
-    sides = [side for side in find_results(root, label, visit) if side.measured]
+    folders = sorted(path.name for path in root.glob(f"sub-{label}/ses-*"))
+    names = [None, *folders] if session is None else [session]
+    sides = [
+        side
+        for name in names
+        for side in find_results(root, label, name and name.removeprefix("ses-"))
+        if side.measured
+    ]
     visits = sorted({str(side.result.name.session) for side in sides})
     if not sides:
         raise NothingToDoError(f"{root}: no map of sub-{label}; run the participant level first")
     if len(visits) > 1:
-        raise UsageError(f"sub-{label}: give the session, one of {', '.join(visits)}")
+        raise ArgumentError(
+            "session", f"is missing; sub-{label} has the sessions {', '.join(visits)}"
+        )
     first = sides[0].result.name
     sides = [
         side

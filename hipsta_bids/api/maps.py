@@ -20,7 +20,7 @@ from hipsta_bids.derivatives import hemisphere as outputs
 from hipsta_bids.derivatives.hemisphere import POSITION, STATE
 from hipsta_bids.derivatives.measures import write_measures
 from hipsta_bids.derivatives.names import HemisphereName, output_name, write_shared
-from hipsta_bids.errors import InputError, in_python
+from hipsta_bids.errors import ArgumentError, InputError, in_python
 from hipsta_bids.geometry.catalog import MAPS, SUMMARY
 from hipsta_bids.geometry.sheet import is_left_handed, layer_depth
 from hipsta_bids.group.cohort.read import node_coordinates
@@ -282,7 +282,7 @@ def node_axes(grid: SheetSettings, region: str) -> dict[str, Any]:
 def check_choice(name: str, value: object, choices: Mapping[Any, object]) -> None:
     """Refuse a value that is not among the choices."""
     if value not in choices:
-        raise ValueError(f"{name} is {value!r}; choose {' or '.join(map(repr, choices))}")
+        raise ArgumentError(name, f"is {value!r}; choose {' or '.join(map(repr, choices))}")
 
 
 @in_python()

@@ -1,7 +1,6 @@
 """The other commands: protocols, settings, the demonstration, phantoms and others."""
 
 import argparse
-import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -9,7 +8,7 @@ from hipsta_bids.cli import parser as parsing
 from hipsta_bids.cli import participant
 from hipsta_bids.cli.console import echo, echo_table, warn
 from hipsta_bids.cli.parser import Parser, bids_label, from_namespace, given_settings, parser_of
-from hipsta_bids.errors import ExitCode, MissingFileError, UsageError
+from hipsta_bids.errors import ArgumentError, ExitCode, MissingFileError, UsageError
 
 _DEMO_PROTOCOL = "freesurfer"  # the layout that the demo dataset has
 
@@ -298,25 +297,19 @@ def run_compare(arguments: Sequence[str]) -> ExitCode:
     return ExitCode.OK
 
 
-#: Options of ``figure`` by the words of Python's messages about its arguments.
+#: Options of ``figure`` that have another name than its arguments in Python.
 _FIGURE_OPTIONS = {
-    "^(measures|contrasts)(?= is|: )": r"--\1",
-    "^participant: ": "--participant-label: ",
-    "; give the name of one: ": "; give one by --name: ",
-    ": give the session, one of ": ": give --session-label, one of ",
+    "file": "output",
+    "participant": "participant-label",
+    "session": "session-label",
 }
 
 
 def draw_figure(arguments: Sequence[str]) -> ExitCode:
     """Draw a figure for a paper from results."""
     options = figure_parser().parse_intermixed_args(arguments)
-    if options.dpi < 1:
-        raise UsageError(f"--dpi: {options.dpi} is not above 0; use 300 for print")
-    if options.limits and not options.limits[0] < options.limits[1]:
-        raise UsageError("--limits: the first value is not below the second; exchange them")
-    from hipsta_bids.api.figures import check_format, figure  # noqa: PLC0415  (heavy)
+    from hipsta_bids.api.figures import figure  # noqa: PLC0415  (heavy)
 
-    check_format(options.output)
     try:
         figure(
             options.what,
@@ -331,11 +324,9 @@ def draw_figure(arguments: Sequence[str]) -> ExitCode:
             dpi=options.dpi,
             file=options.output,
         )
-    except (ValueError, UsageError) as error:  # a name that is not there
-        message = str(error)
-        for words, option in _FIGURE_OPTIONS.items():
-            message = re.sub(words, option, message)
-        raise UsageError(message) from error
+    except ArgumentError as error:
+        option = _FIGURE_OPTIONS.get(error.argument, error.argument)
+        raise UsageError(f"--{option} {error.problem}") from error
     echo(f"figure: {options.output}")
     return ExitCode.OK
 

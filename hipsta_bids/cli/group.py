@@ -312,7 +312,8 @@ def _add_reports(parser: Parser) -> None:
     add(
         "--reports-only",
         "",
-        "make these pages again from existing results, of all analyses or of --name, and end",
+        "make these pages again from existing results, of all analyses and comparisons in"
+        " OUT_DIR/group or of --name, and end",
     )
     adder(group)(
         "--figures",
@@ -408,19 +409,23 @@ def _run(parsed: argparse.Namespace, arguments: Sequence[str]) -> ExitCode:
 
 
 def _rebuild_reports(root: Path, name: str | None) -> ExitCode:
-    """Make the pages of analyses again from their files, of all or of one."""
-    from hipsta_bids.derivatives.names import group_report  # noqa: PLC0415  (start-up time)
+    """Make the pages of analyses and comparisons again from their files, of all or of one."""
+    from hipsta_bids.derivatives.names import COMPARISON, group_report  # noqa: PLC0415  (start-up time)
     from hipsta_bids.io.files import check_writable  # noqa: PLC0415  (start-up time)
-    from hipsta_bids.reports.group import group_models, write_group_report  # noqa: PLC0415  (heavy)
+    from hipsta_bids.reports import group as pages  # noqa: PLC0415  (heavy)
+    from hipsta_bids.reports.comparison import comparison_page  # noqa: PLC0415  (heavy)
 
-    models = [model for model in group_models(root) if name in {None, model}]
+    makers = dict.fromkeys(pages.group_models(root), pages.group_page)
+    # Last, as they link the pages of analyses that exist.
+    makers |= dict.fromkeys(pages.group_models(root, COMPARISON), comparison_page)
+    models = [model for model in makers if name in {None, model}]
     if not models:
         raise NothingToDoError(
             f"{root}: no analysis{f' of the name {name}' if name else ''}; run the group level"
             " without --reports-only first"
         )
     check_writable(root)
-    problems = [write_group_report(root, model) for model in models]
+    problems = [pages.write_group_report(root, model, makers[model]) for model in models]
     for model, problem in zip(models, problems, strict=True):
         if problem is None:
             echo(f"report: {root / group_report(model)}")

@@ -128,9 +128,21 @@ def _dispatch(arguments: list[str]) -> ExitCode:
     near = did_you_mean(arguments[:1], COMMANDS)
     if near and not is_app and not Path(arguments[0]).exists():
         raise UsageError(f"{arguments[0]!r} is no command and no dataset{near}")
+    _check_order(arguments)
     if is_group_level(arguments):
         return run_group_level(arguments)
     return run_participant_level(build_parser(EPILOG).parse_args(arguments), arguments)
+
+
+def _check_order(arguments: Sequence[str]) -> None:
+    """Refuse a level before the folders; a dataset may have its name if a level follows."""
+    levels = {*LEVELS, LEVEL}
+    level, words = "".join(arguments[:1]), arguments[1:]
+    if level not in levels or (levels | {"-h", "--help", "--version"}).intersection(words):
+        return
+    options = [text.partition("=")[0] for text in words if text.startswith("-")]
+    call = " ".join(["hipsta-bids BIDS_DIR OUT_DIR", level, *options[:1]])
+    raise UsageError(f"{level}: the folders precede the level; write {call}")
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """The parser of every command, and the way from its options to a dataclass."""
 
 import argparse
+import math
 import re
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
@@ -21,6 +22,9 @@ if TYPE_CHECKING:
 _PATHS = ("DIR", "FILE", "FILE.tsv", "FILE.toml", "FILE.json")
 #: argparse's message about a word that is none of some.
 _CHOICE = re.compile(r"invalid choice: '(?P<word>.*)' \(choose from (?P<known>.*)\)")
+#: argparse's message about arguments without dashes that are missing.
+_LACKING = re.compile(r"the following arguments are required: (?P<names>[^-].*)")
+_WORDS = 5  # of a call that a message repeats
 
 
 class Parser(argparse.ArgumentParser):
@@ -34,6 +38,7 @@ class Parser(argparse.ArgumentParser):
             allow_abbrev=False,
             **options,
         )
+        self._words: list[str] = []
 
     def parse_known_args(self, args: Sequence[str], namespace: Any = None) -> Any:  # type: ignore[override]  # noqa: ANN401  (as in argparse, but without its overloads)
         """Parse options in either spelling; the value of ``--slurm`` may begin with a dash.
@@ -59,11 +64,17 @@ class Parser(argparse.ArgumentParser):
         ]
         if unknown:
             self.error(f"unrecognized arguments: {' '.join(unknown)}")
+        if namespace is None:  # the second pass of intermixed arguments lacks the options
+            self._words = spelled
         return super().parse_known_args(spelled, namespace)
 
     def error(self, message: str) -> NoReturn:
         """Turn argparse's message into the package's own error; name words like unknown ones."""
         hint = ""
+        option, values = self._longest_values()
+        if values and (lacking := _LACKING.match(message)):
+            text = " ".join(["...", *values[-_WORDS:]] if len(values) > _WORDS else values)
+            message = f"{option}: its values are {text}; write {option} after {lacking['names']}"
         unknown = message.removeprefix("unrecognized arguments: ")
         if unknown != message:
             words = [text.partition("=")[0] for text in unknown.split() if text.startswith("-")]
@@ -72,6 +83,20 @@ class Parser(argparse.ArgumentParser):
             choices = [name.strip("'\"") for name in choice["known"].split(", ")]
             hint = did_you_mean([choice["word"]], choices)
         raise UsageError(f"{message}{hint} (see {self.prog} --help)")
+
+    def _longest_values(self) -> tuple[str, list[str]]:
+        """Return the option with most values in a call, and these values."""
+        options: list[tuple[str, list[str]]] = [("", [])]
+        room = 0.0
+        for word in self._words:
+            if word.startswith("-"):
+                nargs = getattr(self._option_string_actions.get(word), "nargs", None)
+                room = {"+": math.inf, "?": 1.0}.get(str(nargs), 0.0)
+                options.append((word, []))
+            elif room > 0:
+                options[-1][1].append(word)
+                room -= 1
+        return max(options, key=lambda pair: len(pair[1]))
 
 
 def accept(parser: argparse.ArgumentParser, options: Mapping[str, str]) -> None:

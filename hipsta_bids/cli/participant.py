@@ -348,8 +348,13 @@ def _rebuild_reports(options: "Namespace") -> ExitCode:
     check_writable(root)
     progress = console.Progress(-1 if options.quiet else options.verbose)
     with log_file(root, options.verbose) as log, progress:
-        bids_dir = None if options.no_anatomy else options.bids_dir
-        plan = PagePlan(root=root, n_workers=options.n_procs, log=log, bids_dir=bids_dir)
+        plan = PagePlan(
+            root=root,
+            n_workers=options.n_procs,
+            log=log,
+            bids_dir=options.bids_dir,
+            anatomy=not options.no_anatomy,
+        )
         problems = list(write_reports(plan, visits))
     for problem in problems:
         console.warn(f"report: {problem}")
@@ -435,7 +440,7 @@ def _run_options(
         verbosity=options.verbose,
         cluster=cluster,
         reports=not options.no_reports,
-        anatomy=None if options.no_anatomy else options.bids_dir,
+        anatomy=not options.no_anatomy,
         # The home folder names a person.
         command=hide_home(shlex.join(("hipsta-bids", *arguments))) if arguments else None,
         notes=tuple(map(hide_home, notes)),

@@ -8,6 +8,7 @@ import re
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
+from fnmatch import fnmatchcase
 from importlib.resources import files as files_of
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -263,7 +264,9 @@ COMPARISON = "comparison.json"
 IGNORED: dict[str, str] = TEXTS["ignored"]
 
 _IGNORE_HEAD = """\
-# For the BIDS validator: files of this dataset without a name in BIDS 1.11."""
+# For the BIDS validator: files of this dataset without a name in BIDS 1.11. Patterns that begin
+# with a slash are about this folder, the others about folders of participants, too. In a pattern,
+# * stands for any characters, and [ab] for a or b."""
 
 _RECORD = re.compile(
     r"sub-(?P<subject>[^_]+)(?:_ses-(?P<session>[^_]+))?_hemi-(?P<hemi>[LR])_seg-(?P<seg>[^_]+)"
@@ -333,7 +336,12 @@ def group_report(model: str) -> str:
 
 def ignore_file() -> str:
     """Compose ``.bidsignore``: patterns of names that BIDS 1.11 has no rule for, and why."""
-    lines = [_IGNORE_HEAD, *(f"# {why}\n{pattern}" for pattern, why in IGNORED.items())]
+    endings = {f"_{row.suffix}{row.extension}" for row in _BY_KEY.values()}
+    names = [*(f"/{name}" for name in DATASET_FILES.values()), *sorted(endings)]
+    lines = [_IGNORE_HEAD]
+    for pattern, reason in IGNORED.items():
+        hidden = " ".join(name for name in names if fnmatchcase(name, pattern))
+        lines += ["", f"# {reason}", *([f"# Hides {hidden}"] if hidden else ()), pattern]
     return "\n".join(lines) + "\n"
 
 

@@ -39,7 +39,7 @@ ROUNDS = 2
 #: ... with at most so many steps each, until the labels move by less than this, mm.
 STEPS, CONVERGED = 15, 1e-5
 #: Visits on the same voxel grid that move by less than this (RMS) share a space, mm: aligning them
-#: would add noise only.
+#: would add noise only. Their motions shrink smoothly, to 1 - 1/e at this distance.
 SHARED = 0.3
 
 _REACH = 10.0  # mm, from the center to a point on the long axis, and so the scale of angles
@@ -80,9 +80,17 @@ def align(volumes: Sequence[LabelVolume], hemi: str, *, shared: bool = False) ->
     motions = _procrustes(marks, hemi)
     for sigma in SIGMAS:
         motions = _register(volumes, motions, sigma)
-    if _on_one_grid(volumes) and _spread(volumes, motions) < SHARED:
-        return common
+    if _on_one_grid(volumes):
+        share = -np.expm1(-((_spread(volumes, motions) / SHARED) ** 4))
+        motions = [_part(frame, m, share) for frame, m in zip(common, motions, strict=True)]
     return motions
+
+
+def _part(start: Float, end: Float, share: float) -> Float:
+    """Return the motion (4, 4) that is a share of the way from one to another."""
+    way = np.linalg.inv(start) @ end
+    turn = Rotation.from_matrix(way[:3, :3]) ** share
+    return np.asarray(start @ digital.affine_of(turn.as_matrix(), share * way[:3, 3]))
 
 
 def _landmarks(volume: LabelVolume) -> Float:

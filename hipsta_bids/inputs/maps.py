@@ -213,8 +213,8 @@ def map_requests(
             pattern=pattern,
             sampling=sampling_of.get(name, sampling_of[None]),
             interpolation=interpolation_of.get(name, interpolation_of[None]),
-            transform=dict(transforms).get(name),
-            reference=dict(references).get(name),
+            transform_pattern=dict(transforms).get(name),
+            reference_pattern=dict(references).get(name),
         )
         for name, pattern in patterns
     )
@@ -250,14 +250,17 @@ def attach(
 
 
 def _source(item: HemisphereInput, request: MapSource, bids_dir: Path) -> MapSource:
-    patterns = {"path": request.pattern, "transform": request.transform}
-    patterns["reference"] = request.reference
+    patterns = {
+        "path": request.pattern,
+        "transform": request.transform_pattern,
+        "reference": request.reference_pattern,
+    }
     paths: dict[str, Path | None] = {}
     missing = None
     for key, pattern in patterns.items():
         if pattern is None:
             continue
-        name = fill(str(pattern), item.subject, item.session, item.hemi)
+        name = fill(pattern, item.subject, item.session, item.hemi)
         matches = find(name, bids_dir)
         if not matches:
             missing = missing or f"no file {name}"

@@ -109,10 +109,14 @@ class MapSource:
     """Why there is no path, in one phrase."""
     source_path: Path | None = None
     """The dataset that it is in, if it is in the one that was given."""
-    transform: str | Path | None = None
-    """From the volume to the space of the labels: a pattern, and then a path."""
-    reference: str | Path | None = None
-    """The image that FSL registered the volume to; likewise."""
+    transform_pattern: str | None = None
+    """As ``pattern``, for the registration of the volume to the space of the labels."""
+    transform: Path | None = None
+    """The file of this registration, where there is one."""
+    reference_pattern: str | None = None
+    """As ``pattern``, for the image that FSL registered the volume to."""
+    reference: Path | None = None
+    """The file of this image, where there is one."""
 
 
 @dataclass(frozen=True, kw_only=True)

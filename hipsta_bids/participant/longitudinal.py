@@ -19,7 +19,7 @@ from hipsta_bids.geometry.align import align
 from hipsta_bids.geometry.average import average_labels
 from hipsta_bids.geometry.body import Body, check_side, extract_body
 from hipsta_bids.geometry.ends import EndPlanes
-from hipsta_bids.geometry.grid import resample_body
+from hipsta_bids.geometry.grid import Field, resample_body
 from hipsta_bids.geometry.label_checks import check_label_image
 from hipsta_bids.geometry.measures import bending_angle, subfield_volumes
 from hipsta_bids.geometry.topology import SolidField, repaired_columns
@@ -28,7 +28,16 @@ from hipsta_bids.participant.measure import Clock, Evidence
 from hipsta_bids.protocols.load import for_region
 from hipsta_bids.protocols.protocol import Tissue
 from hipsta_bids.settings import Settings
-from hipsta_bids.types import End, Finding, Float, GivenEnd, HemisphereMaps, LabelVolume, Sheet
+from hipsta_bids.types import (
+    Coordinates,
+    End,
+    Finding,
+    Float,
+    GivenEnd,
+    HemisphereMaps,
+    LabelVolume,
+    Sheet,
+)
 
 #: A visit whose walls lie farther from the mean's is flagged: RMS over both walls, mm. Walls that
 #: are not found count as the largest distance.
@@ -45,6 +54,8 @@ _ENDS: tuple[End, ...] = ("posterior", "anterior")
 class _Visit(catalog.Measured):
     """The common sheet at the walls of a visit."""
 
+    coordinates: Coordinates
+    """Of the vertices of the mesh."""
     factors: dict[Tissue, float]
     """Volume of each subfield of the mean over the volume of its cells, which lack the rounded
     edges."""
@@ -168,33 +179,8 @@ def measure_visit(
         field = resample_body(body, hemi, settings.grid, settings.slices)
         solid = measure.make_solid(field, body, settings)
     with clock("sheet"):
-        extents = settings.sheet.x_extent, settings.sheet.y_extent
-        edges = columns.find_edges(common.whole, motion, solid.field) - frame.edges
-        edges = columns.smooth_edges(edges, common.whole)
-        mean_sheet = columns.move_edges(common.sheet, edges, *extents)
-        mean_whole = columns.move_edges(common.whole, edges, 1.0, 1.0)
-        walls = columns.find_walls(mean_sheet, motion, solid.field)
-        carried = columns.move_walls(mean_sheet, walls.moves, motion)
-        sheet = Sheet(points=carried.points, valid=common.sheet.valid & walls.known)
-        filled = 1 - float(sheet.valid.mean())
-        if filled > settings.sheet.max_filled:
-            raise GeometryError(
-                f"{filled:.0%} of the columns meet no wall near the wall of the mean visit: "
-                "compare the labels of the visits",
-                reason="visit-unlike",
-            )
-        moves = columns.moves_at(walls.moves, mean_sheet, mean_whole, *extents)
-        whole = columns.move_walls(mean_whole, moves, motion)
-        mesh, coordinates = columns.grid_mesh(whole)
-        measured = _Visit(
-            factors=frame.factors,
-            body=frame.body(motion),
-            mesh=mesh,
-            sheet=sheet,
-            subfield=common.subfield,
-            whole=whole,
-            settings=settings,
-        )
+        measured, walls = _carry(frame, motion, solid.field)
+        sheet = measured.sheet
     with clock("measures"):
         maps = catalog.measure_maps(measured)
         repaired = repaired_columns(sheet, solid)
@@ -204,6 +190,7 @@ def measure_visit(
         findings = [
             *image,
             *checks.check_image(body),
+            *checks.check_end_labels(volume, body, settings.checks),
             *measure.check_edits(volume, body, settings),
             *_of_visit(body, solid, settings),
             *_fits(walls, sheet, overlap, settings),
@@ -216,7 +203,7 @@ def measure_visit(
             maps=maps,
             profiles=catalog.average_profiles(maps, sheet),
             sections=catalog.measure_sections(measured),
-            subfield=common.subfield,
+            subfield=measured.subfield,
             repaired=repaired,
             body_mask=volume.in_file(body.inside),
             summary=catalog.summarize(measured, for_region(volume.protocol, body.region).sheet),
@@ -227,7 +214,7 @@ def measure_visit(
                 "changed_fraction": solid.changed_fraction,
                 "bending_rad": bending_angle(sheet, settings.measures),
                 "filled_columns": int(np.count_nonzero(~sheet.valid)),
-                "filled_fraction": filled,
+                "filled_fraction": 1 - float(sheet.valid.mean()),
                 "regions_outside": "head and tail (as in Diers et al. 2023)",
                 "repaired_fraction": float(repaired.mean()),
                 "repaired_change_mm": checks.change_of_mean(sheet, repaired),
@@ -243,9 +230,44 @@ def measure_visit(
                 *checks.describe_uncus(body, settings.checks),
             ),
             flags=tuple(checks.raise_flags(findings, sheet, partial(checks.name_place, body=body))),
-            mesh=mesh,
-            coordinates=coordinates,
+            mesh=measured.mesh,
+            coordinates=measured.coordinates,
         )
+
+
+def _carry(frame: Frame, motion: Float, field: Field) -> tuple[_Visit, columns.Walls]:
+    """Carry the common sheet to a visit, to its edges and walls.
+
+    GeometryError if too many columns meet no wall.
+    """
+    common, settings = frame.evidence, frame.evidence.settings
+    extents = settings.sheet.x_extent, settings.sheet.y_extent
+    edges = columns.find_edges(common.whole, motion, field) - frame.edges
+    edges = columns.smooth_edges(edges, common.whole)
+    inner = columns.move_edges(common.sheet, edges, *extents)
+    whole = columns.move_edges(common.whole, edges, 1.0, 1.0)
+    walls = columns.find_walls(inner, motion, field)
+    valid = common.sheet.valid & walls.known
+    if 1 - valid.mean() > settings.sheet.max_filled:
+        raise GeometryError(
+            f"{1 - valid.mean():.0%} of the columns meet no wall near the wall of the mean visit: "
+            "compare the labels of the visits",
+            reason="visit-unlike",
+        )
+    moves = columns.moves_at(walls.moves, inner, whole, *extents)
+    whole = columns.move_walls(whole, moves, motion)
+    mesh, coordinates = columns.grid_mesh(whole)
+    visit = _Visit(
+        factors=frame.factors,
+        body=frame.body(motion),
+        mesh=mesh,
+        coordinates=coordinates,
+        sheet=Sheet(points=columns.move_walls(inner, walls.moves, motion).points, valid=valid),
+        subfield=common.subfield,
+        whole=whole,
+        settings=settings,
+    )
+    return visit, walls
 
 
 def _of_visit(body: Body, solid: SolidField, settings: Settings) -> list[Finding]:

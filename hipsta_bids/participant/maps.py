@@ -120,7 +120,7 @@ def signal_hash(item: HemisphereInput) -> list[object]:
     maps = [
         [
             *(source.name, source.sampling, source.interpolation, _content(source.path)),
-            *(_content(Path(path)) for path in (source.transform, source.reference) if path),
+            *(_content(path) for path in (source.transform, source.reference) if path),
         ]
         for source in item.maps
     ]
@@ -151,7 +151,7 @@ def add_signals(
             "sampling": source.sampling,
             "interpolation": source.interpolation,
         }
-        if isinstance(source.transform, Path):
+        if source.transform is not None:
             entry["transform"] = source_address(source.transform, sources)
         entries.append(entry)
         if source.path is None:
@@ -194,9 +194,8 @@ def _sample(
     from hipsta_bids.io.volumes import read_scalars  # noqa: PLC0415  (nibabel, in workers only)
 
     sheet = maps.layers if source.sampling == "depth" else maps.sheet
-    if isinstance(source.transform, Path):
-        reference = Path(source.reference) if source.reference else None
-        to_image = read_transform(source.transform, path, reference)
+    if source.transform is not None:
+        to_image = read_transform(source.transform, path, source.reference)
         points = to_image(sheet.points.reshape(-1, 3)).reshape(sheet.points.shape)
         sheet = replace(sheet, points=points)
     sampled = sampling.sample_on_sheet(

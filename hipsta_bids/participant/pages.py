@@ -41,8 +41,9 @@ class Pages:
     """False where nothing can be written."""
 
 
-#: Output dataset, visit (``None`` for the page of the cohort), dataset with anatomical images.
-PageJob = tuple[Path, VisitKey | None, Path | None]
+#: Output dataset, visit (``None`` for the page of the cohort), input dataset, and whether its
+#: anatomical images are shown.
+PageJob = tuple[Path, VisitKey | None, Path | None, bool]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,7 +57,9 @@ class PagePlan:
     log: Path
     """Receives tracebacks and what libraries print."""
     bids_dir: Path | None = None
-    """The dataset with anatomical images, which are shown behind labels; ``None`` shows none."""
+    """The dataset with anatomical images and dates of sessions; ``None`` shows neither."""
+    anatomy: bool = True
+    """Whether anatomical images are shown behind labels."""
     cohort: bool = True
     """Whether the page of the cohort is made, too."""
     cluster: Cluster | None = None
@@ -74,8 +77,9 @@ def write_reports(plan: PagePlan, visits: Iterable[VisitKey]) -> Iterator[Hipsta
 
     An error of output ends it: the others would fail likewise.
     """
-    jobs: list[PageJob] = [(plan.root, None, None)] if plan.cohort else []
-    jobs += [(plan.root, visit, plan.bids_dir) for visit in dict.fromkeys(visits)]
+    jobs: list[PageJob] = [(plan.root, None, None, False)] if plan.cohort else []
+    source = plan.bids_dir, plan.anatomy
+    jobs += [(plan.root, visit, *source) for visit in dict.fromkeys(visits)]
     workers = WorkerPlan(
         work=make_page,
         n_workers=max(1, min(plan.n_workers, len(jobs))),
@@ -128,7 +132,7 @@ def _try_all(plan: PagePlan, visits: Sequence[VisitKey], problems: list[str]) ->
     for subject, session in dict.fromkeys(visits):
         folder = f"sub-{subject}/{f'ses-{session}/' if session else ''}anat"
         page = root / participant_report(subject, session)
-        shows = plan.bids_dir is None and ANATOMY in _start(page)
+        shows = not (plan.bids_dir and plan.anatomy) and ANATOMY in _start(page)
         if shows or not _is_newer(page, root, f"{folder}/*{_RECORD}"):
             stale.append((subject, session))
     if not stale and (not plan.cohort or _is_newer(root / _COHORT, root, *_RECORDS)):
@@ -176,11 +180,15 @@ def make_page(job: PageJob) -> HipstaError | None:
     from hipsta_bids.reports.cohort import cohort_page  # noqa: PLC0415  (workers only)
     from hipsta_bids.reports.participant import participant_page  # noqa: PLC0415
 
-    root, visit, bids_dir = job
+    root, visit, bids_dir, anatomy = job
     name = _page_name(visit)
     try:
         cohort = _cohort(root)
-        page = participant_page(root, *visit, cohort, bids_dir) if visit else cohort_page(cohort)
+        page = (
+            participant_page(root, *visit, cohort, bids_dir, anatomy=anatomy)
+            if visit
+            else cohort_page(cohort)
+        )
         if page is not None:
             files.write_text(root / name, page)
     except OutputError as error:

@@ -233,8 +233,10 @@ class RunOptions:
     """Workers elsewhere; ``None`` is this machine."""
     reports: bool = False
     """Make pages to look at afterwards."""
-    anatomy: Path | None = None
-    """The BIDS dataset whose anatomical images the pages show; ``None`` shows none."""
+    bids_dir: Path | None = None
+    """The BIDS dataset whose images and dates of sessions the pages show; ``None`` shows none."""
+    anatomy: bool = True
+    """Whether the pages show anatomical images."""
     command: str | None = None
     """The command line, for the log."""
     notes: tuple[str, ...] = ()
@@ -363,7 +365,8 @@ def _run(
             root=out_dir,
             n_workers=n_workers(options, len(visits)),
             log=log,
-            bids_dir=options.anatomy,
+            bids_dir=options.bids_dir,
+            anatomy=options.anatomy,
             cohort=options.shard is None,
             cluster=options.cluster,
         )

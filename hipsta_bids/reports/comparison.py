@@ -146,10 +146,10 @@ SECTIONS: tuple[Section[GroupResults], ...] = (
 )
 
 
-def write_comparison_report(folder: Path) -> None:
-    """Write the page of a comparison, beside its folder."""
+def comparison_page(folder: Path) -> str:
+    """Make the page of a comparison from the files of its folder."""
     results = GroupResults(folder=folder, record=files.read_json(folder / COMPARISON))
-    page = render(
+    return render(
         "group.html",
         title=f"Comparison of {len(results.record['analyses'])} analyses",
         folder=folder.name,
@@ -157,4 +157,8 @@ def write_comparison_report(folder: Path) -> None:
         cohort=False,
         sections=build_sections(SECTIONS, results, "comparison"),
     )
-    files.write_text(folder.with_name(f"{folder.name}.html"), page)
+
+
+def write_comparison_report(folder: Path) -> None:
+    """Write the page of a comparison, beside its folder."""
+    files.write_text(folder.with_name(f"{folder.name}.html"), comparison_page(folder))

@@ -6,7 +6,7 @@ import io
 import logging
 import re
 import shlex
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -300,11 +300,13 @@ SECTIONS: tuple[Section[GroupResults], ...] = (
 )
 
 
-def write_group_report(root: Path, model: str) -> str | None:
+def write_group_report(
+    root: Path, model: str, make: Callable[[Path], str] = group_page
+) -> str | None:
     """Make the page about one analysis of the group level; a failure leaves no page."""
     path = root / group_report(model)
     try:
-        files.write_text(path, group_page(root / DATASET_FILES["group"] / model))
+        files.write_text(path, make(root / DATASET_FILES["group"] / model))
     except Exception as error:  # results are worth more than pages
         if not isinstance(error, HipstaError):  # a bug shows its traceback
             _LOGGER.exception("report: %s", path.name)
@@ -316,7 +318,7 @@ def write_group_report(root: Path, model: str) -> str | None:
     return None
 
 
-def group_models(root: Path) -> list[str]:
-    """List the analyses of the group level that an output dataset holds."""
-    records = (root / DATASET_FILES["group"]).glob("*/analysis.json")
+def group_models(root: Path, record: str = "analysis.json") -> list[str]:
+    """List the analyses of the group level that an output dataset holds, by their record."""
+    records = (root / DATASET_FILES["group"]).glob(f"*/{record}")
     return sorted(path.parent.name for path in records if not path.parent.name.startswith("."))

@@ -175,7 +175,9 @@ class Series:
     """Left before right; one may be missing."""
     cohort: Cohort
     bids_dir: Path | None = None
-    """The dataset with anatomical images; ``None`` shows none."""
+    """The dataset with anatomical images and dates of sessions; ``None`` shows neither."""
+    anatomy: bool = True
+    """Whether anatomical images are shown."""
 
     @property
     def measured(self) -> list[Hemisphere]:
@@ -197,7 +199,8 @@ class Series:
     @cached_property
     def views(self) -> Mapping[str, Views | None]:
         """Labels and mask by hemisphere."""
-        return {h.result.name.hemi: read_views(h, self.bids_dir) for h in self.hemispheres}
+        images = self.bids_dir if self.anatomy else None
+        return {h.result.name.hemi: read_views(h, images) for h in self.hemispheres}
 
     def view(self, hemisphere: Hemisphere) -> Views | None:
         """Labels and mask of one hemisphere."""
@@ -288,16 +291,22 @@ def _quality_numbers(series: Series) -> Mapping[str, Any] | None:
 
 
 def participant_page(
-    root: Path, subject: str, session: str | None, cohort: Cohort, bids_dir: Path | None = None
+    root: Path,
+    subject: str,
+    session: str | None,
+    cohort: Cohort,
+    bids_dir: Path | None = None,
+    *,
+    anatomy: bool = True,
 ) -> str | None:
-    """Make the page about one visit; without ``bids_dir`` it shows no anatomical images."""
+    """Make the page about one visit, with images and dates of sessions of ``bids_dir``."""
     kinds: dict[tuple[str, str], list[Hemisphere]] = {}
     for hemisphere in find_results(root, subject, session):
         name = hemisphere.result.name
         kinds.setdefault((name.seg, name.region), []).append(hemisphere)
     if not kinds:
         return None
-    series = [Series(tuple(found), cohort, bids_dir) for found in kinds.values()]
+    series = [Series(tuple(found), cohort, bids_dir, anatomy) for found in kinds.values()]
     parts = [
         {
             "title": one.title,

@@ -1,5 +1,6 @@
 """Figures on demand, in Python and on the command line, from files alone."""
 
+import pickle
 import sys
 from pathlib import Path
 
@@ -105,7 +106,7 @@ def test_files_are_written_in_the_format_of_their_name(out, tmp_path, capsys, ki
 @pytest.mark.parametrize(
     ("given", "outcome"),
     [
-        (["group"], (64, "several analyses; give one by --name: first, second")),
+        (["group"], (64, "--name is missing; ")),
         (["roc", "--name", "second"], (66, "no classification")),
         (["registration", "--name", "second"], (66, "no registration")),
         (["group", "--name", "fist"], (66, "did you mean first")),
@@ -117,8 +118,22 @@ def test_files_are_written_in_the_format_of_their_name(out, tmp_path, capsys, ki
             ["contrast", "--name", "first", "--contrasts", "AD-CN"],
             (64, "--contrasts is 'AD-CN'; choose 'CN-AD'"),
         ),
-        (["contrast", "--name", "first", "--limits", "1", "0"], (64, "exchange them")),
-        (["participant"], (64, "--participant-label: name the participant")),
+        (
+            ["contrast", "--name", "first", "--contrasts", "CN-AD", "CN-AD"],
+            (64, "--contrasts has several names"),
+        ),
+        (
+            ["group", "--name", "first", "--measures", "thickness", "curvature"],
+            (64, "--measures has several maps"),
+        ),
+        (
+            ["contrast", "--name", "first", "--limits", "1", "0"],
+            (64, "--limits is (1.0, 0.0); give two numbers"),
+        ),
+        (["contrast", "--name", "first", "--limits", "0", "inf"], (64, "--limits is (0.0, inf)")),
+        (["contrast", "--name", "first", "--dpi", "0"], (64, "--dpi is 0; give 1 to 2400")),
+        (["contrast", "--name", "first", "--dpi", "2401"], (64, "--dpi is 2401; give 1 to 2400")),
+        (["participant"], (64, "--participant-label is missing; name the participant")),
         (["participant", "--participant-label", "99"], (66, "no map of sub-99")),
     ],
 )
@@ -131,14 +146,59 @@ def test_what_is_not_there_is_told_in_one_line(out, tmp_path, capsys, given, out
     assert not (tmp_path / "a.pdf").exists()
 
 
-def test_errors_in_python_name_arguments(out, tmp_path):
-    with pytest.raises(UsageError, match="give the name of one"):
-        hb.figure("group", out)
-    with pytest.raises(ValueError, match=r"^contrasts is 'AD-CN'; choose 'CN-AD'"):
-        hb.figure("contrast", out, name="first", contrasts=["AD-CN"])
-    with pytest.raises(UsageError, match=r"use \.pdf, \.svg or \.png"):
-        hb.figure("group", out, name="first", file=tmp_path / "a.gif")
-    with pytest.raises(ValueError, match="what is 'map'; choose 'participant' or"):
-        hb.figure("map", out)
+@pytest.mark.parametrize(
+    ("argument", "what", "given", "problem"),
+    [
+        ("name", "group", {}, r"is missing; .* has the analyses first, second"),
+        ("contrasts", "contrast", {"contrasts": ["AD-CN"]}, "is 'AD-CN'; choose 'CN-AD'"),
+        ("contrasts", "contrast", {"contrasts": ["CN-AD"] * 2}, "has several names"),
+        ("contrasts", "group", {"contrasts": ["CN-AD"] * 5}, "gives 7 rows, more than the 6 of"),
+        ("measures", "group", {"measures": ["volume"]}, "is 'volume'; choose 'thickness'"),
+        ("measures", "group", {"measures": ["thickness", "curvature"]}, "has several maps"),
+        ("what", "map", {}, "is 'map'; choose 'participant' or"),
+        ("columns", "group", {"columns": 3}, "is 3; choose 1 or 2"),
+        ("limits", "group", {"limits": (2.0, 1.0)}, r"is \(2\.0, 1\.0\); give two numbers"),
+        ("dpi", "group", {"dpi": 0}, "is 0; give 1 to 2400"),
+        ("file", "group", {"file": "a.gif"}, r"is a\.gif, .*use \.pdf, \.svg or \.png"),
+        ("participant", "participant", {}, "is missing; name the participant"),
+    ],
+)
+def test_errors_in_python_name_the_argument_in_text_and_as_data(
+    out, argument, what, given, problem
+):
+    name = {} if argument in {"name", "participant"} else {"name": "first"}
+    with pytest.raises(ValueError, match=f"^{argument} {problem}") as caught:
+        hb.figure(what, out, **name, **given)
+    assert isinstance(caught.value, UsageError)
+    copy = pickle.loads(pickle.dumps(caught.value))  # noqa: S301 (made on this line)
+    assert (copy.argument, str(copy)) == (argument, str(caught.value))
+
+
+def test_a_participant_with_several_sessions_needs_one(measured, tmp_path, capsys):
+    copies = tmp_path / "out"
+    for session in ("1", "2"):
+        for path in sorted(measured.glob("sub-01/anat/*")):
+            target = copies / "sub-01" / f"ses-{session}" / "anat"
+            target.mkdir(parents=True, exist_ok=True)
+            name = path.name.replace("sub-01", f"sub-01_ses-{session}")
+            (target / name).write_bytes(path.read_bytes())
+    (copies / "desc-settings.json").write_bytes((measured / "desc-settings.json").read_bytes())
+    with pytest.raises(ValueError, match=r"^session is missing; sub-01 has the sessions 1, 2$"):
+        hb.figure("participant", copies, participant="01")
+    hb.figure("participant", copies, participant="01", session="ses-2")
+    call = ["figure", "participant", str(copies), "--participant-label", "01"]
+    assert main([*call, "-o", str(tmp_path / "a.pdf")]) == 64
+    told = capsys.readouterr().err
+    assert told == "hipsta-bids: --session-label is missing; sub-01 has the sessions 1, 2\n"
+
+
+def test_values_that_look_like_arguments_are_not_renamed(out, tmp_path, capsys):
+    word = "participant: measures is name"
+    call = ["figure", "contrast", str(out), "--name", "first", "--contrasts", word]
+    assert main([*call, "-o", str(tmp_path / "a.pdf")]) == 64
+    assert f"--contrasts is '{word}'; choose 'CN-AD'" in capsys.readouterr().err
+
+
+def test_a_folder_without_an_analysis_has_no_figure(tmp_path):
     with pytest.raises(NothingToDoError, match="no analysis; run the group level first"):
         hb.figure("group", tmp_path)

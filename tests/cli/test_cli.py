@@ -136,7 +136,7 @@ def test_defaults(seen, tmp_path):
     command = f"hipsta-bids in {tmp_path} participant"
     assert [row["status"] for row in seen["options"].inputs] == ["used", "not used"]
     assert replace(seen["options"], inputs=()) == RunOptions(
-        n_procs=n_procs, reports=True, anatomy=Path("in"), command=command
+        n_procs=n_procs, reports=True, bids_dir=Path("in"), command=command
     )
     assert seen["out"] == tmp_path
 
@@ -174,6 +174,8 @@ def test_everything_reaches_its_place(seen, tmp_path):
     )
     assert replace(seen["options"], inputs=()) == RunOptions(
         is_whole=False,
+        bids_dir=Path("in"),
+        anatomy=False,
         pybids=True,
         n_procs=3,
         mem_gb=4.0,
@@ -274,6 +276,26 @@ def test_options_without_meaning_are_remembered_with_the_reason():
         ("settings x", "argument level: invalid choice: 'x'"),
         ("demo", "the following arguments are required: DIR"),
         ("demo-data a b", "unrecognized arguments: b"),
+        (
+            "group --seg A B in out",
+            "group: the folders precede the level; write hipsta-bids BIDS_DIR OUT_DIR group --seg",
+        ),
+        ("participant in out --hemi=L", "BIDS_DIR OUT_DIR participant --hemi\n"),
+        ("collect in out", "write hipsta-bids BIDS_DIR OUT_DIR collect"),
+        (
+            "--seg A B in out group",
+            "--seg: its values are A B in out group; write --seg after bids_dir, output_dir, anal",
+        ),
+        ("in --seg A out group", "values are A out group; write --seg after output_dir, anal"),
+        (
+            "--hemi L --participant-label 1 2 3 in out participant",
+            "--participant-label: its values are ... 2 3 in out participant; write",
+        ),
+        ("in out --participant_label 01 participant", "--participant-label after analysis_level"),
+        ("--export-summary in out group", "--export-summary: its values are in; write"),
+        ("export --participant-label 01 out dir", "write --participant-label after OUT_DIR, DIR"),
+        ("figure --measures thickness group out -o a.pdf", "write --measures after what, OUT_DIR"),
+        ("figure group out --measures thickness", "are required: -o/--output"),
     ],
 )
 @pytest.mark.usefixtures("seen")
@@ -296,6 +318,18 @@ def test_output_into_the_segmentations_is_refused(tmp_path, capsys):
 def test_datasets_named_like_commands_are_datasets(seen, tmp_path):
     assert main.main(["demo", str(tmp_path), "participant"]) == 0
     assert seen["request"].bids_dir == Path("demo")
+
+
+def test_datasets_named_like_levels_are_datasets(seen, tmp_path):
+    assert main.main(["group", str(tmp_path), "participant"]) == 0
+    assert seen["request"].bids_dir == Path("group")
+
+
+def test_options_with_several_values_may_precede_other_options(seen, tmp_path):
+    assert main.main(["--hemi", "L", "--", "in", str(tmp_path), "participant"]) == 0
+    assert seen["request"].hemis == ("L",)
+    assert main.main(["--hemi", "R", "--force", "in", str(tmp_path), "participant"]) == 0
+    assert seen["request"].hemis == ("R",)
 
 
 def test_dry_run_prints_and_writes_nothing(seen, tmp_path, capsys):

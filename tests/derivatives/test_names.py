@@ -107,6 +107,23 @@ def test_every_line_of_the_ignore_file_hides_something_and_says_why():
         assert pattern.rstrip("*").count("*") <= 1, "the validator does not match it"
         assert not pattern.endswith("/"), "the validator would not pass over the folder itself"
     lines = ignore_file().splitlines()
-    assert [line for line in lines if not line.startswith("#")] == list(IGNORED)
-    for pattern, why in IGNORED.items():
-        assert lines[lines.index(pattern) - 1] == f"# {why}"
+    assert [line for line in lines if line and not line.startswith("#")] == list(IGNORED)
+    blocks = [block.splitlines() for block in ignore_file().split("\n\n")[1:]]
+    for (pattern, why), (reason, *hidden, last) in zip(IGNORED.items(), blocks, strict=True):
+        assert (reason, last) == (f"# {why}", pattern)
+        (listed,) = hidden or [""]
+        for name in listed.removeprefix("# Hides ").split():
+            assert fnmatch(name, pattern), name
+            assert any(full.endswith(name) for full in names), name
+
+
+def test_the_ignore_file_lists_what_a_pattern_stands_for():
+    comments = {line for line in ignore_file().splitlines() if line.startswith("# Hides ")}
+    sidecars = "_curv.json _exterior.json _interior.json _midthickness.json _thickness.json"
+    assert f"# Hides {sidecars}" in comments
+    assert len(comments) == len(IGNORED) - 1  # a region is in the middle of a name
+    listed = set(" ".join(comments).split())
+    endings = {f"_{row.suffix}{row.extension}" for row in (*OUTPUTS, *EXTRA_OUTPUTS)}
+    named = {f"_{row.suffix}{row.extension}" for row in OUTPUTS if row.in_standard}
+    assert endings - named <= listed
+    assert not named & listed

@@ -92,13 +92,14 @@ def test_output_of_both_levels_is_valid(phantom, measured, issues):
 def test_eight_patterns_hide_what_has_no_name_in_bids(measured, issues):
     """Labels of subfields are checked, and what the dataset is."""
     lines = (measured / ".bidsignore").read_text(encoding="utf-8").splitlines()
-    assert sum(not line.startswith("#") for line in lines) <= 8
+    patterns = [line for line in lines if line and not line.startswith("#")]
+    assert len(patterns) <= 8
     assert issues(measured) == []
     count = len(list_results(measured))
     checked = [".bidsignore", "dataset_description.json", "README.md", "dseg.json"]
     assert issues.checked == len(checked) + 2 * count  # labels on the surface, and a sidecar
     # Without a pattern each would be an error: none hides nothing.
-    for line in [one for one in lines if not one.startswith("#")]:
+    for line in patterns:
         if line in {"/[gp]ro[uv]*", "*_label-*"}:
             continue  # not of this run
         (measured / ".bidsignore").write_text("\n".join(one for one in lines if one != line))

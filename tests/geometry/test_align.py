@@ -1,11 +1,14 @@
 """Rigid alignment of the labels of several visits: known motions are found again."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from nibabel.affines import apply_affine
 from scipy.spatial.transform import Rotation
 
 from hipsta_bids.errors import GeometryError
+from hipsta_bids.geometry import align as alignment
 from hipsta_bids.geometry.align import align
 from hipsta_bids.geometry.digital import voxel_points
 from hipsta_bids.phantom import Phantom, PhantomSpec
@@ -107,6 +110,22 @@ def test_moved_visits_on_one_grid_are_aligned():
     moved = POSES[1].copy()
     moved[:3, 3] += first.affine[:3, 3] - second.affine[:3, 3]
     assert spread(align(grids, "L"), [POSES[0], moved], first) < 0.1
+
+
+def test_alignment_of_one_grid_fades_in_without_a_step(visits, monkeypatch):
+    volume = visits[0]
+    shifted = np.roll(volume.tissue, 1, axis=1), np.roll(volume.part, 1, axis=1)
+    pair = [volume, replace(volume, tissue=shifted[0], part=shifted[1])]
+    apart = []
+    distances = np.arange(0.0, 0.8, 0.02)
+    for distance in distances:
+        monkeypatch.setattr(alignment, "_spread", lambda *_, to=distance: to)
+        first, second = align(pair, "L")
+        apart.append(np.linalg.norm(first[:3, 3] - second[:3, 3]))
+    assert apart[0] == 0
+    assert apart[-1] == pytest.approx(0.4, abs=0.05)  # the voxel
+    assert np.interp(0.1, distances, apart) < 0.01
+    assert 0 <= np.diff(apart).min() <= np.diff(apart).max() < 0.05
 
 
 def test_labels_without_a_hippocampus_are_refused(visits):

@@ -1,5 +1,6 @@
 """``participant --longitudinal`` from files to files: outputs, records, what is measured again."""
 
+import html
 import json
 import shutil
 
@@ -146,6 +147,21 @@ def test_pages_show_all_visits_on_the_same_columns(out):
         # Of maps in single precision, and of a table with four decimals.
         near = [f"left, ses-{session} mean {change + step:.3f}" for step in (-1e-4, 1e-4)]
         assert any(text in page for text in (words, *near))
+
+
+@pytest.mark.parametrize("option", [(), ("--no-anatomy",)])
+def test_pages_show_dates_of_sessions_with_and_without_anatomy(out, tmp_path, option):
+    table = tmp_path / "in/sub-01/sub-01_sessions.tsv"
+    table.parent.mkdir(parents=True)
+    table.write_text(
+        "session_id\tacq_time\nses-1\t2020-01-05T10:00:00\nses-2\t2021-02-01\nses-3\tn/a\n"
+    )
+    shutil.copytree(out, tmp_path / "out")
+    call = [tmp_path / "in", tmp_path / "out", "participant", "--reports-only", *option]
+    assert main.main(list(map(str, call))) == ExitCode.OK
+    page = (tmp_path / "out/sub-01_ses-2.html").read_text()
+    visits = json.loads(html.unescape(page.split('data-visits="')[1].split('"')[0]))
+    assert visits == ["ses-1, 2020-01-05", "ses-2, 2021-02-01", "ses-3"]
 
 
 def test_methods_describe_the_common_sheet(out):

@@ -10,6 +10,9 @@ from nibabel.affines import apply_affine
 from hipsta_bids.cli.main import main
 from hipsta_bids.derivatives.hemisphere import list_results
 from hipsta_bids.errors import InputError
+from hipsta_bids.inputs.maps import attach, map_requests
+from hipsta_bids.inputs.scan import InputRequest
+from hipsta_bids.inputs.search import find_inputs
 from hipsta_bids.io.transforms import read_transform
 from hipsta_bids.phantom import Hemisphere, PhantomSpec, write_dataset
 
@@ -149,6 +152,26 @@ def test_points_go_from_the_labels_to_the_image(study):
         np.testing.assert_allclose(to_image(points), apply_affine(MOTION, points), atol=1e-4)
     with pytest.raises(InputError, match="needs --map-reference"):
         read_transform(root / "fsl.mat", images[0])
+
+
+def test_a_pattern_of_a_transform_becomes_a_path_or_a_reason(study):
+    root, bids = study
+    items = find_inputs(InputRequest(bids_dir=bids)).items
+    patterns = [(name, f"{root}/there.nii.gz") for name in ("found", "lacks", "plain")]
+    transforms = [("found", f"{root}/i*.txt"), ("lacks", f"{root}/sub-{{subject}}.lta")]
+    requests = map_requests(patterns, (), (), transforms, [("found", f"{root}/ref*.nii.gz")])
+    assert [source.transform_pattern for source in requests] == [*dict(transforms).values(), None]
+    assert not any(source.transform or source.reference for source in requests)
+    ((item,), notes) = attach(items, requests, None, bids)
+    found, lacks, plain = item.maps
+    assert (found.transform, found.reference) == (root / "itk.txt", root / "reference.nii.gz")
+    assert (found.path, found.missing) == (root / "there.nii.gz", None)
+    assert (lacks.path, lacks.transform) == (None, None)
+    assert lacks.missing == f"no file {root}/sub-01.lta"
+    assert (plain.path, plain.transform) == (root / "there.nii.gz", None)
+    assert notes[1] == (
+        f"map lacks: 0 of 1 hemispheres have a file; not sub-01 hemi-L ({lacks.missing})"
+    )
 
 
 def test_transforms_of_unknown_maps_are_refused(study, capsys):

@@ -229,8 +229,8 @@ def test_reports_only_of_nothing_says_so(tmp_path, capsys):
 
 
 def test_a_page_that_cannot_be_made_is_a_warning(copy, monkeypatch):
-    monkeypatch.setattr("hipsta_bids.reports.participant.participant_page", lambda *_: 1 / 0)
-    problem = reporting.make_page((copy, ("01", None), None))
+    monkeypatch.setattr("hipsta_bids.reports.participant.participant_page", lambda *_, **__: 1 / 0)
+    problem = reporting.make_page((copy, ("01", None), None, True))
     assert str(problem) == "sub-01.html: not made (ZeroDivisionError: division by zero)"
 
 

@@ -1,6 +1,5 @@
 """Which hemispheres a person leaves out: tables, ratings, and conditions on quality metrics."""
 
-import difflib
 import operator
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -9,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from hipsta_bids.derivatives.names import HemisphereName
-from hipsta_bids.errors import InputError, UsageError
+from hipsta_bids.errors import InputError, UsageError, did_you_mean
 from hipsta_bids.group.design.formula import listed
 from hipsta_bids.io import files
 from hipsta_bids.reports.verdict import RATINGS
@@ -178,9 +177,8 @@ def fulfilled(conditions: Sequence[Condition], metrics: Mapping[str, Any]) -> st
     """Return the first condition that quality metrics fulfill; missing ones fulfill none."""
     for name, sign, limit in conditions:
         if name not in metrics:
-            near = difflib.get_close_matches(name, metrics, n=1)
-            hint = f"did you mean {near[0]}?" if near else "see the desc-qc_metrics.json files"
-            raise UsageError(f"--exclude-qc: {name!r} is no quality metric; {hint}")
+            hint = did_you_mean([name], metrics) or "; see the desc-qc_metrics.json files"
+            raise UsageError(f"--exclude-qc: {name!r} is no quality metric{hint}")
         value = metrics[name]
         if value is None:
             continue

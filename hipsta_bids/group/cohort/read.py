@@ -1,6 +1,5 @@
 """Reads the participant level's tables of many hemispheres into arrays, for chosen measures."""
 
-import difflib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,11 +9,12 @@ import numpy as np
 import pandas as pd
 
 from hipsta_bids.derivatives import hemisphere
-from hipsta_bids.errors import InputError
+from hipsta_bids.errors import InputError, did_you_mean
 from hipsta_bids.geometry.catalog import MAPS, why_impossible
 from hipsta_bids.geometry.sheet import sheet_levels
 from hipsta_bids.group.cohort.collect import Exclusion, SheetRecord
 from hipsta_bids.group.cohort.data import Cohort, Measures
+from hipsta_bids.group.design.formula import listed
 from hipsta_bids.group.stats.arrays import MOST_KEPT, Float, SideMaps, blocks
 from hipsta_bids.protocols import EXPERIMENTAL
 from hipsta_bids.settings import SheetSettings
@@ -58,8 +58,10 @@ def choose_measures(
             numbers.append(name)
         else:
             names = list(dict.fromkeys(available))  # maps and summary measures share some
-            ending = " ..." if len(names) > _MOST_NAMES else ""
-            raise _unknown(name, names, f"there are {', '.join(names[:_MOST_NAMES])}{ending}")
+            hint = f"there are {listed(names, _MOST_NAMES)}"
+            if records and len(names) > _MOST_NAMES:
+                hint += f"; {records[0].result.path('summary')} has all summary measures"
+            raise _unknown(name, names, hint)
     return Measures(maps=tuple(maps), summaries=tuple(numbers) or None)
 
 
@@ -72,9 +74,8 @@ def check_summaries(measures: Measures, sides: Mapping[str, SideMaps]) -> None:
 
 
 def _unknown(name: str, available: Sequence[str], hint: str) -> InputError:
-    if near := difflib.get_close_matches(name, available, n=1):
-        hint = f"did you mean {near[0]}?"
-    return InputError(f"no measure is called {name!r}; {hint}")
+    near = did_you_mean([name], available) or f"; {hint}"
+    return InputError(f"no measure is called {name!r}{near}")
 
 
 def _sampled(records: Sequence[SheetRecord]) -> list[str]:

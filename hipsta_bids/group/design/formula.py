@@ -1,6 +1,5 @@
 """What is fitted and tested, by BIDS Stats Models 1.0.0 or a formula, and the variables of it."""
 
-import difflib
 import re
 import unicodedata
 from collections.abc import Iterable, Mapping, Sequence
@@ -178,9 +177,8 @@ def check_names(names: Iterable[str], columns: pd.Index) -> None:
     available = [str(column) for column in columns]
     for name in names:
         if name not in available:
-            near = difflib.get_close_matches(name, available, n=1)
-            hint = f"did you mean {near[0]}?" if near else f"the table has {listed(available)}"
-            raise ModelError(f"model: the table has no column {name!r}; {hint}")
+            hint = did_you_mean([name], available) or f"; the table has {listed(available)}"
+            raise ModelError(f"model: the table has no column {name!r}{hint}")
 
 
 def with_factors(

@@ -6,7 +6,6 @@ has all levels of factors and the means of numbers, or both values of a number t
 that a contrast does not name have equal weights.
 """
 
-import difflib
 import itertools
 import math
 import re
@@ -17,7 +16,7 @@ import pandas as pd
 from formulaic import ModelMatrix
 from scipy.linalg import null_space
 
-from hipsta_bids.errors import ModelError
+from hipsta_bids.errors import ModelError, did_you_mean
 from hipsta_bids.group.design.contrasts import Contrast, ContrastSpec, split_name
 from hipsta_bids.group.design.formula import level_name, listed
 from hipsta_bids.group.design.grammar import CONTEXT, closed_formula, term_text
@@ -121,9 +120,8 @@ class Terms:
             return name
         levels = [f"{f}[{level}]" for f, levels in self.levels.items() for level in levels]
         names = [*self.names, *levels, *map(str, self.table.columns)]
-        near = difflib.get_close_matches(name, names, n=1)
-        hint = f"did you mean {near[0]}?" if near else f"known are {listed(names)}"
-        raise ModelError(f"contrast {contrast!r}: nothing is called {name!r}; {hint}")
+        hint = did_you_mean([name], names) or f"; known are {listed(names)}"
+        raise ModelError(f"contrast {contrast!r}: nothing is called {name!r}{hint}")
 
     def _split(self, name: str) -> tuple[str | None, str]:
         """Return factor and level of ``factor[level]`` or ``factor.level``."""

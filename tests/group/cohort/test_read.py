@@ -119,6 +119,19 @@ def test_unknown_measures_list_each_known_one_once(dataset, capsys, monkeypatch)
     assert len(names) == len(set(names))
 
 
+def test_unknown_measures_are_told_where_many_are_listed(dataset, capsys, monkeypatch):
+    summary = {f"area_CA{number}": 1.0 for number in range(20)}
+    monkeypatch.setattr("hipsta_bids.derivatives.hemisphere.read_summary", lambda _: summary)
+    assert run(dataset, [], "--measures", "xyz")[0] == 65
+    first, more, place = capsys.readouterr().err.strip().split("; ")
+    assert "no measure is called 'xyz'" in first
+    table = place_of(dataset[1], "01", "L").path("summary")
+    assert place == f"{table} has all summary measures"
+    assert more.endswith(f" and {len(SHEET_MAPS) + 1 + len(summary) - 12} more")
+    assert run(dataset, [], "--measures", "area_C19")[0] == 65
+    assert capsys.readouterr().err.endswith("'area_C19'; did you mean area_CA19?\n")
+
+
 @pytest.mark.parametrize(
     ("options", "code", "words"),
     [
@@ -138,7 +151,7 @@ def test_unknown_measures_are_refused_in_one_line(dataset, capsys, options, code
 
 
 def test_messages_list_a_dozen_measures():
-    for count, more in ((12, ""), (13, r" \.\.\.")):
+    for count, more in ((12, ""), (13, " and 1 more")):
         others = [f"m{i}" for i in range(count)]
         with pytest.raises(InputError, match=rf"there are m0, .*, m11{more}$"):
             choose_measures(["xyz"], (), others)

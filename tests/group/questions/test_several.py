@@ -1,5 +1,7 @@
 """Protocols, datasets and programs side by side: one table, one figure, and their agreement."""
 
+import shutil
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -207,6 +209,30 @@ def test_maps_of_one_analysis_are_compared_by_name(compared, tmp_path):
     assert not (tmp_path / "maps" / "effects.tsv").exists()
     assert (tmp_path / "maps" / "figures" / "thickness_maps.pdf").stat().st_size > 1000
     assert "own, map thickness" in (tmp_path / "maps.html").read_text()
+
+
+def test_pages_of_comparisons_are_made_again_from_their_files(compared, tmp_path, capsys):
+    data, out, _ = compared
+    copy = tmp_path / "out"
+    shutil.copytree(out, copy)
+    maps = [f"{seg}={copy}/group/{MODEL}_seg-{seg}:thickness" for seg in ("fs", "other")]
+    assert main(["compare", *maps, str(copy / "group" / "two")]) == 0
+    names = [MODEL, "two", *(f"{MODEL}_seg-{seg}" for seg in PROTOCOLS)]
+    pages = {name: copy / "group" / f"{name}.html" for name in names}
+    before = {name: path.read_text() for name, path in pages.items()}
+    for path in pages.values():
+        path.unlink()
+    capsys.readouterr()
+    command = [str(data), str(copy), "group", "--reports-only"]
+    assert main([*command, "--name", "two"]) == 0
+    assert capsys.readouterr().out == f"report: {pages['two']}\n"
+    assert "_seg-fs.html" not in pages["two"].read_text()  # a page that does not exist yet
+    assert main(command) == 0
+    assert {name: path.read_text() for name, path in pages.items()} == before
+    (copy / "group" / "two" / "comparison.json").write_text("{")
+    assert main([*command, "--name", "two"]) == 70
+    assert "two.html: not made (" in capsys.readouterr().err
+    assert not pages["two"].exists()
 
 
 def test_refusals_name_the_problem(compared, tmp_path, capsys):
