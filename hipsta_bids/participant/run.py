@@ -12,9 +12,9 @@ from pathlib import Path
 from hipsta_bids import __version__
 from hipsta_bids.derivatives import dataset, hemisphere
 from hipsta_bids.derivatives.copies import describe_copies, mark_copies
-from hipsta_bids.derivatives.hemisphere import ResultPlace, read_record
 from hipsta_bids.derivatives.measures import write_measures
 from hipsta_bids.derivatives.names import DATASET_FILES, HemisphereName, write_shared
+from hipsta_bids.derivatives.results import ResultPlace, read_record
 from hipsta_bids.errors import ExitCode, HipstaError, InputError, OutputError, ProtocolError
 from hipsta_bids.inputs.scan import HemisphereInput
 from hipsta_bids.io import files
