@@ -1,7 +1,7 @@
 """Keeps ``status.tsv`` right at any moment of a run: one row per hemisphere, from its outcome."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from statistics import median
 
@@ -25,21 +25,15 @@ class StatusTable:
 
     def __init__(self, root: Path, shard: str | None = None) -> None:
         self._root, self._shard = root, shard
-        shard_rows = {
-            dataset.row_key(row): row
-            for row in dataset.read_table(root / dataset.table_path(shard))
-        }
+        shard_rows = _by_key(dataset.read_table(root / dataset.table_path(shard)))
         # The table of the whole dataset takes up those of its parts.
-        rows = shard_rows.values() if shard else dataset.read_status(root)
-        self._known = {dataset.row_key(row): row for row in rows}
+        self._known = dict(shard_rows) if shard else _by_key(dataset.read_status(root))
         self._pending = {key: row for key, row in self._known.items() if row != shard_rows.get(key)}
         self._next_write = 0.0
 
     def expect(self, jobs: Sequence[Job]) -> None:
         """Make the table right for the case that this process ends at any moment from here on."""
-        self._pending |= {
-            dataset.row_key(row): row for row in map(status_row, map(not_finished, jobs))
-        }
+        self._pending |= _by_key(map(status_row, map(not_finished, jobs)))
         self._known |= self._pending
         self.close()
 
@@ -77,6 +71,11 @@ class StatusTable:
         cost = time.monotonic() - start
         # Tables of many thousand rows may take a twentieth of the time, not more.
         self._next_write = time.monotonic() + (0.0 if cost < _CHEAP_WRITE else 20 * cost)
+
+
+def _by_key(rows: Iterable[dict[str, str]]) -> dict[tuple[str, ...], dict[str, str]]:
+    """Return rows by the hemisphere that they are about."""
+    return {dataset.row_key(row): row for row in rows}
 
 
 def not_finished(job: Job) -> Outcome:
