@@ -30,7 +30,8 @@ from report import print_table, write_report
 from hipsta_bids import progress
 from hipsta_bids.cli import console
 from hipsta_bids.cli.main import main as run_command
-from hipsta_bids.derivatives.hemisphere import ResultPlace, format_column, list_results
+from hipsta_bids.derivatives.hemisphere import format_column
+from hipsta_bids.derivatives.results import ResultPlace, list_results
 from hipsta_bids.io import files
 from validation.group import SimulatedCohort, SimulationPlan, simulate_cohort
 

@@ -17,7 +17,6 @@ from hipsta_bids.cli.commands import (
 )
 from hipsta_bids.cli.group import group_parser
 from hipsta_bids.cli.participant import build_parser
-from hipsta_bids.derivatives.hemisphere import LAYERS, NODES, POSITION, STATE
 from hipsta_bids.derivatives.names import (
     DATASET_FILES,
     EXTRA_OUTPUTS,
@@ -27,6 +26,7 @@ from hipsta_bids.derivatives.names import (
     Output,
     output_name,
 )
+from hipsta_bids.derivatives.results import LAYERS, NODES, POSITION, STATE
 from hipsta_bids.errors import EXIT_MEANINGS
 from hipsta_bids.geometry.catalog import MAPS, PER_SUBFIELD, SECTIONS, SUMMARY, Column
 from hipsta_bids.group.design.settings import GroupSettings

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from hipsta_bids.api.maps import attributes, measure, node_axes
 from hipsta_bids.derivatives.dataset import counts_text
-from hipsta_bids.derivatives.hemisphere import POSITION, STATE, list_results, read_sheet
 from hipsta_bids.derivatives.measures import identify, origin
+from hipsta_bids.derivatives.results import POSITION, STATE, list_results, read_sheet
 from hipsta_bids.errors import MissingFileError, NothingToDoError, in_python
 from hipsta_bids.geometry.catalog import MAPS
 from hipsta_bids.group.cohort.collect import grid_of

@@ -17,9 +17,9 @@ from numpy.typing import ArrayLike, NDArray
 from hipsta_bids import __version__
 from hipsta_bids.derivatives import dataset as folders
 from hipsta_bids.derivatives import hemisphere as outputs
-from hipsta_bids.derivatives.hemisphere import POSITION, STATE
 from hipsta_bids.derivatives.measures import write_measures
 from hipsta_bids.derivatives.names import HemisphereName, output_name, write_shared
+from hipsta_bids.derivatives.results import POSITION, STATE, ResultPlace
 from hipsta_bids.errors import ArgumentError, InputError, in_python
 from hipsta_bids.geometry.catalog import MAPS, SUMMARY
 from hipsta_bids.geometry.sheet import is_left_handed, layer_depth
@@ -201,7 +201,7 @@ class Measurement:
         common = {"version": __version__, "settings_hash": digest, "region": name.region}
         about = {"scheme": name.seg, "scheme_title": self.protocol.title, "input_hash": None}
         record = common | about | {"inputs": [], "edited": [], "notes": ["measured in Python"]}
-        place = outputs.ResultPlace(root=root, name=name)
+        place = ResultPlace(root=root, name=name)
         outputs.write_results(place, self.hemisphere, self.protocol, record, write_meshes=False)
         _, reason, message = outputs.verdict(self.hemisphere)
         row = {"decision": self.decision, "repairs": str(len(self.hemisphere.repairs))}

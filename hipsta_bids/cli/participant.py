@@ -329,8 +329,8 @@ def _rebuild_reports(options: "Namespace") -> ExitCode:
     """Make the pages of the requested visits and of the cohort again from their files."""
     from hipsta_bids.derivatives.names import DATASET_FILES  # noqa: PLC0415  (start-up time)
     from hipsta_bids.io.files import check_writable  # noqa: PLC0415  (start-up time)
+    from hipsta_bids.participant.log import log_file  # noqa: PLC0415  (heavy)
     from hipsta_bids.participant.pages import PagePlan, visits_of, write_reports  # noqa: PLC0415  (heavy)
-    from hipsta_bids.participant.run import log_file  # noqa: PLC0415  (heavy)
 
     root = options.output_dir
     _settle_labels(options)

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from hipsta_bids.derivatives.dataset import agrees, name_of, read_status, update_status
-from hipsta_bids.derivatives.hemisphere import ResultPlace, read_record
 from hipsta_bids.derivatives.names import HemisphereName
+from hipsta_bids.derivatives.results import ResultPlace, read_record
 from hipsta_bids.errors import InputError
 from hipsta_bids.io import files
 

@@ -9,8 +9,10 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from hipsta_bids.derivatives import dataset, hemisphere
+from hipsta_bids.derivatives import dataset
+from hipsta_bids.derivatives.hemisphere import summary_definition
 from hipsta_bids.derivatives.names import DATASET_FILES, HemisphereName
+from hipsta_bids.derivatives.results import ResultPlace, read_record, read_summary_cells
 from hipsta_bids.errors import InputError
 from hipsta_bids.io import files
 
@@ -52,7 +54,7 @@ def write_measures(root: Path) -> None:
         files.write_json(
             root / DATASET_FILES["measures_sidecar"],
             dataset.describe_columns(_COLUMNS)
-            | {name: hemisphere.summary_definition(name) for name in numbers},
+            | {name: summary_definition(name) for name in numbers},
         )
 
 
@@ -67,24 +69,24 @@ def _current_rows(
         row = earlier.get(tuple(identity.values()), {})
         if any(row.get(column) != status.get(column) for column in dataset.RECORDED):
             with suppress(InputError):  # its files are gone, or another run is at them
-                row = identity | read_row(hemisphere.ResultPlace(root=root, name=name))
+                row = identity | read_row(ResultPlace(root=root, name=name))
         if row:
             yield dict(row)
 
 
-def read_row(result: hemisphere.ResultPlace) -> dict[str, str]:
+def read_row(result: ResultPlace) -> dict[str, str]:
     """Read cells of one hemisphere from its quality record and its summary table.
 
     InputError if there is no readable record, or no summary of a hemisphere that was measured.
     """
-    record = hemisphere.read_record(result)
+    record = read_record(result)
     cells = {
         **{column: str(record.get(column) or files.MISSING) for column in dataset.RECORDED},
         "repairs": str(len(record.get("repairs") or ())),
         **origin(record),
     }
     is_measured = result.path("summary").exists()
-    return cells | (hemisphere.read_summary_cells(result) if is_measured else {})
+    return cells | (read_summary_cells(result) if is_measured else {})
 
 
 def _key(row: dataset.Row) -> tuple[str, ...]:

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from hipsta_bids.derivatives import dataset
-from hipsta_bids.derivatives.hemisphere import ResultPlace, list_results, read_record
 from hipsta_bids.derivatives.names import DATASET_FILES, sources
+from hipsta_bids.derivatives.results import ResultPlace, list_results, read_record
 from hipsta_bids.errors import NothingToDoError
 from hipsta_bids.io import files
 

@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from hipsta_bids.derivatives.hemisphere import ResultPlace, write_sources
+from hipsta_bids.derivatives.hemisphere import write_sources
+from hipsta_bids.derivatives.results import ResultPlace
 from hipsta_bids.geometry.sheet import is_left_handed
 from hipsta_bids.io import files, gifti
 from hipsta_bids.io.volumes import mask_bytes

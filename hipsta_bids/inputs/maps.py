@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from hipsta_bids.derivatives import hemisphere
 from hipsta_bids.derivatives.names import EXTRA_OUTPUTS, OUTPUTS
+from hipsta_bids.derivatives.results import SHEET_COLUMNS
 from hipsta_bids.errors import InputError, UsageError
 from hipsta_bids.geometry.catalog import MAPS
 from hipsta_bids.geometry.sampling import Regions
@@ -47,7 +47,7 @@ def read_regions(path: Path, shape: tuple[int, int]) -> Regions:
     rows = files.read_tsv(path)
     columns = tuple(rows[0]) if rows else ()
     lacking = [name for name in COLUMNS if name not in columns]
-    unknown = [name for name in columns if name not in {*COLUMNS, *hemisphere.SHEET_COLUMNS}]
+    unknown = [name for name in columns if name not in {*COLUMNS, *SHEET_COLUMNS}]
     if rows and (lacking or unknown):
         fault = f"lacks {', '.join(lacking)}" if lacking else f"has unknown {', '.join(unknown)}"
         raise InputError(

@@ -14,7 +14,7 @@ import numpy as np
 from nibabel.freesurfer import io as freesurfer
 from numpy.typing import NDArray
 
-from hipsta_bids.derivatives.hemisphere import ResultPlace, list_results, read_sheet
+from hipsta_bids.derivatives.results import ResultPlace, list_results, read_sheet
 from hipsta_bids.errors import NothingToDoError, UsageError
 from hipsta_bids.inputs.maps import check_pattern, fill
 from hipsta_bids.io import files, gifti

@@ -18,7 +18,7 @@ import psutil
 from hipsta_bids import __version__
 from hipsta_bids.derivatives import hemisphere
 from hipsta_bids.derivatives.dataset import source_address
-from hipsta_bids.derivatives.hemisphere import ResultPlace, read_record
+from hipsta_bids.derivatives.results import ResultPlace, read_record
 from hipsta_bids.errors import GeometryError, HipstaError, InputError, OutputError, ProtocolError
 from hipsta_bids.geometry.sampling import Regions
 from hipsta_bids.inputs.scan import HemisphereInput

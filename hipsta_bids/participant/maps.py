@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from hipsta_bids.derivatives import hemisphere
 from hipsta_bids.derivatives.dataset import TABLES, describe_columns, source_address
-from hipsta_bids.derivatives.hemisphere import ResultPlace
+from hipsta_bids.derivatives.hemisphere import format_column
+from hipsta_bids.derivatives.results import NODES, ResultPlace
 from hipsta_bids.errors import InputError
 from hipsta_bids.geometry import sampling
 from hipsta_bids.geometry.catalog import MAPS
@@ -46,7 +46,7 @@ def write_map(
     columns = _with_mean(source, sampled.values)
     values = np.stack(list(columns.values()), axis=-1)
     write_nodes(result.path("map_table", source.name), list(columns), values, digits)
-    definitions = describe_columns(hemisphere.NODES)
+    definitions = describe_columns(NODES)
     if source.name in columns:
         definitions[source.name] = {"Description": "mean of the volumes, in their unit"}
     for number, name in enumerate(names, start=1):
@@ -91,7 +91,7 @@ def _write_regions(
         "region": list(regions.names),
         "n_points": _cells(statistics.n_points),
         "n_valid": _cells(statistics.n_valid),
-        "area": hemisphere.format_column(statistics.area, _REGION_DIGITS),
+        "area": format_column(statistics.area, _REGION_DIGITS),
     }
     parts = (
         ("mean", "mean of {} over valid points", statistics.mean),
@@ -104,7 +104,7 @@ def _write_regions(
             definitions[key] = {"Description": text.format(name)}
             if name in _SHAPE_UNITS:
                 definitions[key]["Units"] = _SHAPE_UNITS[name]
-                columns[key] = hemisphere.format_column(column, _REGION_DIGITS)
+                columns[key] = format_column(column, _REGION_DIGITS)
             else:
                 columns[key] = _cells(column)
     files.write_tsv(result.path("roi"), list(columns), zip(*columns.values(), strict=True))

@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 
-from hipsta_bids.derivatives.hemisphere import list_results
 from hipsta_bids.derivatives.names import DATASET_FILES, participant_report
+from hipsta_bids.derivatives.results import list_results
 from hipsta_bids.errors import HipstaError, OutputError
 from hipsta_bids.io import files
 from hipsta_bids.participant.cluster import Cluster, run_on_cluster

@@ -1,36 +1,20 @@
-"""Runs hemispheres side by side, goes on after a failure, and writes the log and ``status.tsv``."""
+"""Runs hemispheres side by side, goes on after a failure, and writes the output dataset."""
 
 import contextlib
 import logging
 import math
-import time
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime, timedelta
-from os import getpid
+from datetime import timedelta
 from pathlib import Path
-from socket import gethostname
-from statistics import median
 
 from hipsta_bids import __version__
 from hipsta_bids.derivatives import dataset, hemisphere
 from hipsta_bids.derivatives.copies import describe_copies, mark_copies
-from hipsta_bids.derivatives.dataset import (
-    NOT_FINISHED,
-    RECORDED,
-    STAGE_PREFIX,
-    identity,
-    read_status,
-    read_table,
-    row_key,
-    table_path,
-    update_status,
-    write_sidecar,
-)
-from hipsta_bids.derivatives.hemisphere import ResultPlace, read_record
 from hipsta_bids.derivatives.measures import write_measures
 from hipsta_bids.derivatives.names import DATASET_FILES, HemisphereName, write_shared
+from hipsta_bids.derivatives.results import ResultPlace, read_record
 from hipsta_bids.errors import ExitCode, HipstaError, InputError, OutputError, ProtocolError
 from hipsta_bids.inputs.scan import HemisphereInput
 from hipsta_bids.io import files
@@ -45,8 +29,10 @@ from hipsta_bids.participant.job import (
     run_job,
     warm_up,
 )
+from hipsta_bids.participant.log import log_file, log_outcome
 from hipsta_bids.participant.pages import PagePlan, reports_after
 from hipsta_bids.participant.pool import WorkerLost, WorkerPlan, run_jobs
+from hipsta_bids.participant.status import StatusTable, not_finished
 from hipsta_bids.participant.visits import by_side, run_visits, share_sheets
 from hipsta_bids.progress import tell
 from hipsta_bids.settings import Settings
@@ -57,155 +43,8 @@ WORKER_GB = 0.6
 
 STAGE = "hemispheres"
 """Name of the stage that measures them, on the terminal."""
-USUAL_SECONDS = 3.0
-"""Time of a hemisphere on a usual machine, s, where none was measured before."""
 
-_LOG_FORMAT = "%(asctime)s %(levelname)s %(message)s"
-_CHEAP_WRITE = 0.1  # s; quicker writes are never put off
 _LOGGER = logging.getLogger(__name__)
-
-
-class StatusTable:
-    """``status.tsv`` as a view of the quality records, right at any moment of a run.
-
-    It adds hemispheres that a run has not reached, and times and memory, which would make records
-    differ from run to run. A row that agrees with its record is kept for these.
-    """
-
-    def __init__(self, root: Path, shard: str | None = None) -> None:
-        self._root, self._shard = root, shard
-        shard_rows = {row_key(row): row for row in read_table(root / table_path(shard))}
-        # The table of the whole dataset takes up those of its parts.
-        rows = shard_rows.values() if shard else read_status(root)
-        self._known = {row_key(row): row for row in rows}
-        self._pending = {key: row for key, row in self._known.items() if row != shard_rows.get(key)}
-        self._next_write = 0.0
-
-    def expect(self, jobs: Sequence[Job]) -> None:
-        """Make the table right for the case that this process ends at any moment from here on."""
-        self._pending |= {row_key(row): row for row in map(status_row, map(not_finished, jobs))}
-        self._known |= self._pending
-        self.close()
-
-    def add(self, outcome: Outcome) -> None:
-        """Take in one outcome."""
-        row = status_row(outcome)
-        recorded_row = self._known.get(row_key(row), {})
-        if outcome.seconds is None and all(
-            recorded_row.get(cell) == row[cell] for cell in RECORDED
-        ):
-            return
-        self._pending[row_key(row)] = row
-        try:
-            if time.monotonic() >= self._next_write:
-                self.close()
-        except OutputError:
-            if not isinstance(outcome.error, OutputError):
-                raise
-            # The hemisphere's own error says more, and ends the run; the table keeps the row that
-            # calls it not finished.
-            self._pending = {}
-
-    def usual_seconds(self) -> float:
-        """Median time of the hemispheres that were measured before, s."""
-        cells = [row.get("seconds", files.MISSING) for row in self._known.values()]
-        return median([float(cell) for cell in cells if cell != files.MISSING] or [USUAL_SECONDS])
-
-    def close(self) -> None:
-        """Write the rows that are not written yet."""
-        if not self._pending:
-            return
-        start = time.monotonic()
-        update_status(self._root, self._pending.values(), shard=self._shard)
-        self._pending = {}
-        cost = time.monotonic() - start
-        # Tables of many thousand rows may take a twentieth of the time, not more.
-        self._next_write = time.monotonic() + (0.0 if cost < _CHEAP_WRITE else 20 * cost)
-
-
-def not_finished(job: Job) -> Outcome:
-    """Outcome of a hemisphere that no run has finished."""
-    message = "the run ended before this hemisphere; run the same command again"
-    error = HipstaError(message, reason=NOT_FINISHED)
-    return Outcome(
-        job=job, decision=Decision.FAILED, reason=error.reason, message=message, error=error
-    )
-
-
-def _log(outcome: Outcome) -> None:
-    title = outcome.job.title
-    if outcome.skipped:
-        _LOGGER.info("%s: unchanged, skipped (%s)", title, outcome.decision)
-        return
-    for note in outcome.job.item.notes:
-        _LOGGER.info("%s: note: %s", title, note)
-    for edit in outcome.job.item.edits:
-        _LOGGER.info("%s: edited %s: %s", title, edit.kind, edit.path)
-    for stage, seconds in outcome.stages.items():
-        _LOGGER.info("%s: %s %.3f s", title, stage, seconds)
-    reason, message = outcome.reason or "", outcome.message or ""
-    _LOGGER.info("%s: %s %s %s", title, outcome.decision, reason, message)
-    if outcome.trace:
-        _LOGGER.error("%s: %s", title, outcome.trace)
-
-
-def status_row(outcome: Outcome) -> dict[str, str]:
-    """Row of ``status.tsv``."""
-    measured = {
-        "seconds": outcome.seconds,
-        "cpu_seconds": outcome.cpu_seconds,
-        "peak_memory_mb": outcome.peak_memory_mb,
-        **{f"{STAGE_PREFIX}{stage}": spent for stage, spent in outcome.stages.items()},
-    }
-    return {
-        **identity(outcome.job.result.name),
-        "decision": str(outcome.decision),
-        "reason": outcome.reason or files.MISSING,
-        "message": outcome.headline or files.MISSING,
-        "repairs": str(outcome.repairs),
-        "edited": "+".join(outcome.job.item.edited) or files.MISSING,
-        "version": __version__,
-        "settings_hash": outcome.job.settings_hash,
-        "input_hash": outcome.input_hash or files.MISSING,
-        **{
-            name: files.MISSING if value is None else f"{value:.3f}"
-            for name, value in measured.items()
-        },
-    }
-
-
-@contextlib.contextmanager
-def log_file(root: Path, verbosity: int, shard: str | None = None) -> Generator[Path]:
-    """Log this run to a file of its own."""
-    folder = root / DATASET_FILES["logs"]
-    files.make_folder(folder)
-    part = "" if shard is None else f"_shard-{shard}"
-    # Process numbers alone are not unique among the nodes of a cluster.
-    process = f"{gethostname().partition('.')[0]}-{getpid()}"
-    path = folder / f"run-{datetime.now(UTC):%Y%m%dT%H%M%S}-{process}{part}.log"
-    try:
-        handler = _QuietHandler(path, encoding="utf-8", errors="surrogateescape")
-    except OSError as error:
-        raise files.output_error(path, error) from error
-    handler.setFormatter(logging.Formatter(_LOG_FORMAT))
-    logger = logging.getLogger("hipsta_bids")
-    level = logger.level
-    logger.setLevel(logging.DEBUG if verbosity else logging.INFO)
-    logger.addHandler(handler)
-    try:
-        yield path
-    finally:
-        logger.removeHandler(handler)
-        logger.setLevel(level)
-        with contextlib.suppress(OSError):
-            handler.close()
-
-
-class _QuietHandler(logging.FileHandler):
-    """Loses lines rather than the run when the disk is full; that is reported elsewhere."""
-
-    def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802  (logging's name)
-        del record
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -377,7 +216,7 @@ def _run(
             contextlib.closing(outcomes_of(jobs, table, options, log)) as results,
         ):
             for outcome in results:
-                _log(outcome)
+                log_outcome(outcome)
                 table.add(outcome)
                 outcomes.append(outcome)
                 report(outcome)
@@ -413,7 +252,7 @@ def _write_inputs(out_dir: Path, options: RunOptions, outcomes: Sequence[Outcome
             ending = dataset.provenance_of(read_record(outcome.job.result))
             if outcome.decision == Decision.FAILED:
                 ending |= {"status": "failed", "reason": outcome.message or ""}
-            endings[row_key(identity(outcome.job.result.name))[:-1]] = ending
+            endings[dataset.row_key(dataset.identity(outcome.job.result.name))[:-1]] = ending
     rows = []
     for row in options.inputs:
         key = tuple(row.get(name, files.MISSING) for name in dataset.KEY)
@@ -456,7 +295,7 @@ def _prepare(
                 settings, [protocols[k] for k in sorted(protocols)], pybids=options.pybids
             )
             files.write_text(out_dir / DATASET_FILES["citation"], text)
-        write_sidecar(out_dir)
+        dataset.write_sidecar(out_dir)
         write_shared(out_dir)
     memory = options.mem_gb and options.mem_gb / n_workers(options, len(items))
     jobs = [

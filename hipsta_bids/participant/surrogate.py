@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from hipsta_bids.derivatives import dataset
-from hipsta_bids.derivatives.hemisphere import ResultPlace, format_column, read_sheet
+from hipsta_bids.derivatives.hemisphere import format_column
 from hipsta_bids.derivatives.names import HemisphereName
+from hipsta_bids.derivatives.results import ResultPlace, read_sheet
 from hipsta_bids.errors import ExitCode, HipstaError, InputError, OutputError, ProtocolError
 from hipsta_bids.geometry import surrogate
 from hipsta_bids.geometry.body import extract_body

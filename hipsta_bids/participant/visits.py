@@ -10,7 +10,7 @@ import numpy as np
 
 from hipsta_bids import __version__
 from hipsta_bids.derivatives import template
-from hipsta_bids.derivatives.hemisphere import read_record
+from hipsta_bids.derivatives.results import read_record
 from hipsta_bids.errors import HipstaError, InputError, OutputError, UsageError
 from hipsta_bids.inputs.scan import HemisphereInput
 from hipsta_bids.io import files

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from hipsta_bids.derivatives.hemisphere import read_sheet
+from hipsta_bids.derivatives.results import read_sheet
 from hipsta_bids.errors import InputError
 from hipsta_bids.io.files import scratch_folder
 from hipsta_bids.reports.display import (

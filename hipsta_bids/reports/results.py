@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
 from hipsta_bids.derivatives.dataset import linked_path, read_links
-from hipsta_bids.derivatives.hemisphere import (
+from hipsta_bids.derivatives.results import (
     ResultPlace,
     list_results,
     read_record,

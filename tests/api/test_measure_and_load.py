@@ -13,13 +13,9 @@ import hipsta_bids as hb
 from hipsta_bids.api import datasets
 from hipsta_bids.api import maps as api_maps
 from hipsta_bids.derivatives import dataset
-from hipsta_bids.derivatives.hemisphere import (
-    ResultPlace,
-    write_failure,
-    write_results,
-    write_spread,
-)
+from hipsta_bids.derivatives.hemisphere import write_failure, write_results, write_spread
 from hipsta_bids.derivatives.names import HemisphereName
+from hipsta_bids.derivatives.results import ResultPlace
 from hipsta_bids.errors import (
     GeometryError,
     HipstaError,

@@ -10,18 +10,16 @@ from nilearn.surface import load_surf_data, load_surf_mesh
 from stand_ins import NAME, NX, NY, THICKNESS, TISSUES, make_maps, make_scheme
 
 from hipsta_bids.derivatives.hemisphere import (
-    SHEET_COLUMNS,
-    ResultPlace,
     fill_from_nearest,
     format_column,
     headline,
-    read_sheet,
     remove_results,
     verdict,
     write_failure,
     write_results,
 )
 from hipsta_bids.derivatives.names import OUTPUTS, HemisphereName
+from hipsta_bids.derivatives.results import SHEET_COLUMNS, ResultPlace, read_sheet
 from hipsta_bids.errors import GeometryError, InputError
 from hipsta_bids.geometry.catalog import DIERS, MAPS, SECTIONS, SUMMARY
 from hipsta_bids.io.gifti import COORDINATE_NAMES

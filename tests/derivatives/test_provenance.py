@@ -9,7 +9,7 @@ import pytest
 import hipsta_bids as hb
 from hipsta_bids.cli.main import main
 from hipsta_bids.derivatives import dataset
-from hipsta_bids.derivatives.hemisphere import list_results, read_record
+from hipsta_bids.derivatives.results import list_results, read_record
 
 SUFFIXES = {"act": "Activities", "ent": "ProvEntities", "soft": "Software"}
 

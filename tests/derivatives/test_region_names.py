@@ -6,13 +6,14 @@ import pytest
 
 from hipsta_bids.derivatives import dataset
 from hipsta_bids.derivatives.dataset import identity, read_status, update_status
-from hipsta_bids.derivatives.hemisphere import ResultPlace, remove_results
+from hipsta_bids.derivatives.hemisphere import remove_results
 from hipsta_bids.derivatives.names import (
     DATASET_FILES,
     OUTPUTS,
     HemisphereName,
     output_name,
 )
+from hipsta_bids.derivatives.results import ResultPlace
 from hipsta_bids.errors import SettingsError
 from hipsta_bids.io import files
 from hipsta_bids.settings import BodySettings, Settings

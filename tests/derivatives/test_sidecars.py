@@ -8,14 +8,9 @@ from stand_ins import NAME, make_maps, make_scheme
 
 from hipsta_bids.cli.main import main
 from hipsta_bids.derivatives.dataset import linked_path, read_links
-from hipsta_bids.derivatives.hemisphere import (
-    ResultPlace,
-    list_results,
-    remove_results,
-    write_failure,
-    write_results,
-)
+from hipsta_bids.derivatives.hemisphere import remove_results, write_failure, write_results
 from hipsta_bids.derivatives.names import OUTPUTS
+from hipsta_bids.derivatives.results import ResultPlace, list_results
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.catalog import MAPS
 from hipsta_bids.io import files

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from hipsta_bids.cli.main import main
-from hipsta_bids.derivatives.hemisphere import list_results
 from hipsta_bids.derivatives.names import EXTRA_OUTPUTS, OUTPUTS
+from hipsta_bids.derivatives.results import list_results
 from hipsta_bids.io import files
 
 #: In the environment of the tests, else on the path.

@@ -9,8 +9,9 @@ import numpy as np
 import pandas as pd
 
 from hipsta_bids.derivatives import dataset
-from hipsta_bids.derivatives.hemisphere import ResultPlace, format_column
+from hipsta_bids.derivatives.hemisphere import format_column
 from hipsta_bids.derivatives.names import HemisphereName
+from hipsta_bids.derivatives.results import ResultPlace
 from hipsta_bids.io import files
 from hipsta_bids.settings import Settings, SheetSettings
 from validation.group import SimulationPlan, simulate_cohort

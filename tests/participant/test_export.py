@@ -8,7 +8,7 @@ from nibabel.affines import apply_affine
 
 import hipsta_bids as hb
 from hipsta_bids.cli.main import main
-from hipsta_bids.derivatives.hemisphere import list_results, read_sheet
+from hipsta_bids.derivatives.results import list_results, read_sheet
 from hipsta_bids.io.gifti import read_mesh
 
 LEVELS = {"inner": "interior", "mid": "midthickness", "outer": "exterior"}

@@ -11,8 +11,8 @@ from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
 from hipsta_bids.cli import main
-from hipsta_bids.derivatives.hemisphere import ResultPlace, list_results, read_record, read_sheet
 from hipsta_bids.derivatives.names import HemisphereName
+from hipsta_bids.derivatives.results import ResultPlace, list_results, read_record, read_sheet
 from hipsta_bids.errors import ExitCode
 from hipsta_bids.io import files
 from hipsta_bids.phantom import Hemisphere, PhantomSpec, write_dataset

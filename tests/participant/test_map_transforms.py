@@ -8,7 +8,7 @@ import pytest
 from nibabel.affines import apply_affine
 
 from hipsta_bids.cli.main import main
-from hipsta_bids.derivatives.hemisphere import list_results
+from hipsta_bids.derivatives.results import list_results
 from hipsta_bids.errors import InputError
 from hipsta_bids.inputs.maps import attach, map_requests
 from hipsta_bids.inputs.scan import InputRequest

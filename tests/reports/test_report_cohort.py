@@ -5,8 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from hipsta_bids.derivatives.hemisphere import ResultPlace
 from hipsta_bids.derivatives.names import HemisphereName, name_of_record, output_name
+from hipsta_bids.derivatives.results import ResultPlace
 from hipsta_bids.reports.cohort import (
     MEASURES,
     SMALLEST_COMPARED,

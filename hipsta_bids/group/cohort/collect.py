@@ -9,9 +9,10 @@ from typing import Any
 
 import pandas as pd
 
-from hipsta_bids.derivatives import dataset, hemisphere
+from hipsta_bids.derivatives import dataset
 from hipsta_bids.derivatives.dataset import NOT_FINISHED, name_of, provenance_of, read_status
 from hipsta_bids.derivatives.names import DATASET_FILES, HemisphereName
+from hipsta_bids.derivatives.results import ResultPlace, list_results, read_record
 from hipsta_bids.errors import InputError, MissingFileError, NothingToDoError
 from hipsta_bids.group.cohort.covariates import relocate
 from hipsta_bids.group.cohort.exclusions import SHOWN, Choices, Condition, fulfilled
@@ -63,7 +64,7 @@ class GroupRequest:
 class SheetRecord:
     """One complete hemisphere."""
 
-    result: hemisphere.ResultPlace
+    result: ResultPlace
     settings_hash: str
     version: str
     source: str
@@ -143,7 +144,7 @@ def collect_sheets(request: GroupRequest, *, may_lack: bool = False) -> Collecti
     left_out = [exclusion for root in roots for exclusion in _excluded_labels(root, request)]
     quality, digests = [], []
     for result in sorted(places, key=_key):
-        record = hemisphere.read_record(result)
+        record = read_record(result)
         entry = _judge(result, record, request, choices)
         quality.append(_quality(result.name, record, choices))
         digests.append((result.name, _digest(record)))
@@ -196,10 +197,10 @@ def _digest(record: Mapping[str, Any]) -> str | None:
 
 
 def _with_digests(
-    results: Iterable[hemisphere.ResultPlace],
+    results: Iterable[ResultPlace],
 ) -> Iterator[tuple[HemisphereName, str | None]]:
     """Return the names of hemispheres with the hashes of their records, as they are asked for."""
-    return ((result.name, _digest(hemisphere.read_record(result))) for result in results)
+    return ((result.name, _digest(read_record(result))) for result in results)
 
 
 def _several_versions(records: Sequence[SheetRecord]) -> tuple[str, ...]:
@@ -227,12 +228,12 @@ def wanted_by(request: GroupRequest) -> Callable[[str, str | None, str], bool]:
     return is_wanted
 
 
-def _wanted_results(root: Path, request: GroupRequest) -> list[hemisphere.ResultPlace]:
+def _wanted_results(root: Path, request: GroupRequest) -> list[ResultPlace]:
     if not root.is_dir():
         raise MissingFileError(f"{root}: folder not found; run the participant level first")
     return [
         result
-        for result in hemisphere.list_results(root)
+        for result in list_results(root)
         if request.wants(result.name.subject, result.name.session)
     ]
 
@@ -240,7 +241,7 @@ def _wanted_results(root: Path, request: GroupRequest) -> list[hemisphere.Result
 def _excluded_labels(root: Path, request: GroupRequest) -> Iterator[Exclusion]:
     """List the hemispheres of participants whom --exclude-participant-label names."""
     included = replace(request, excluded=()) if request.excluded else request
-    for result in hemisphere.list_results(root) if request.excluded else ():
+    for result in list_results(root) if request.excluded else ():
         name = result.name
         is_same = (name.region, name.seg) == (request.region, request.seg or name.seg)
         if (
@@ -251,9 +252,7 @@ def _excluded_labels(root: Path, request: GroupRequest) -> Iterator[Exclusion]:
             yield Exclusion.of_sheet(name, "listed", "--exclude-participant-label")
 
 
-def _other_regions(
-    results: Sequence[hemisphere.ResultPlace], request: GroupRequest
-) -> tuple[str, ...]:
+def _other_regions(results: Sequence[ResultPlace], request: GroupRequest) -> tuple[str, ...]:
     """Say which results are left out because another region was asked for."""
     counts = Counter(
         result.name.region for result in results if request.seg in {None, result.name.seg}
@@ -266,13 +265,13 @@ def _other_regions(
     )
 
 
-def _key(result: hemisphere.ResultPlace) -> tuple[str, str, str]:
+def _key(result: ResultPlace) -> tuple[str, str, str]:
     return result.name.subject, result.name.session or "", result.name.hemi
 
 
 def _one_protocol(
-    places: Sequence[hemisphere.ResultPlace],
-    results: Sequence[hemisphere.ResultPlace],
+    places: Sequence[ResultPlace],
+    results: Sequence[ResultPlace],
     request: GroupRequest,
 ) -> str:
     counts = Counter(result.name.seg for result in places)
@@ -295,7 +294,7 @@ def _one_protocol(
     return request.seg or next(iter(counts))
 
 
-def _refuse_twice(places: Sequence[hemisphere.ResultPlace]) -> None:
+def _refuse_twice(places: Sequence[ResultPlace]) -> None:
     first: dict[tuple[str, str, str], Path] = {}
     for result in places:
         root = first.setdefault(_key(result), result.root)
@@ -307,7 +306,7 @@ def _refuse_twice(places: Sequence[hemisphere.ResultPlace]) -> None:
 
 
 def _judge(
-    result: hemisphere.ResultPlace,
+    result: ResultPlace,
     record: Mapping[str, Any],
     request: GroupRequest,
     choices: Choices,

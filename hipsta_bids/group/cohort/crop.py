@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from hipsta_bids.derivatives.hemisphere import ResultPlace, read_sheet
+from hipsta_bids.derivatives.results import ResultPlace, read_sheet
 from hipsta_bids.errors import InputError
 from hipsta_bids.geometry.surrogate import compare_nearby
 from hipsta_bids.group.cohort.external import ExternalFiles, sign_notes

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from hipsta_bids.derivatives import hemisphere
+from hipsta_bids.derivatives.results import read_sheet
 from hipsta_bids.errors import InputError, UsageError
 from hipsta_bids.group.cohort.collect import SheetRecord
 from hipsta_bids.group.cohort.exclusions import UserTable
@@ -41,9 +41,7 @@ def mask_sheets(
         visits = measured.table.index[side.rows]
         for sheet, record in enumerate(by_place[visit, hemi] for visit in visits):
             if REPAIRED in masks:
-                columns = hemisphere.read_sheet(
-                    record.result.path("sheet"), [], [REPAIRED], side.shape
-                )
+                columns = read_sheet(record.result.path("sheet"), [], [REPAIRED], side.shape)
                 is_masked[sheet] |= columns[REPAIRED] == "true"
             for table in tables:
                 for row in table.about(record.result.name):

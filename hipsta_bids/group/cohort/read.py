@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from hipsta_bids.derivatives import hemisphere
+from hipsta_bids.derivatives.results import read_sheet, read_summary, read_units
 from hipsta_bids.errors import InputError, did_you_mean
 from hipsta_bids.geometry.catalog import MAPS, why_impossible
 from hipsta_bids.geometry.sheet import sheet_levels
@@ -44,7 +44,7 @@ def choose_measures(
     """Separate maps from summary measures."""
     if not requested:
         return Measures(maps=(*(DEFAULT if records else ()), *further))
-    summaries = tuple(hemisphere.read_summary(records[0].result)) if records else ()
+    summaries = tuple(read_summary(records[0].result)) if records else ()
     available = [*(SHEET_MAPS if records else ()), *further, *_sampled(records), *summaries]
     maps, numbers = [], []
     for name in requested:
@@ -158,7 +158,7 @@ def read_sheets(
         x=x,
         y=y,
         shared=grid.frame != "visit",
-        units=(hemisphere.read_units(records[0].result) if records else {})
+        units=(read_units(records[0].result) if records else {})
         | {n: ARBITRARY for n in names if n not in SHEET_MAPS},
         sources={
             visit_name(r.result.name.subject, r.result.name.session): (r.source, r.result.root)
@@ -218,18 +218,18 @@ def _read_side(
     subfield = np.empty((len(records), *shape), dtype=np.int8)
     codes: dict[str, int] = {}
     for i, record in enumerate(records):
-        columns = hemisphere.read_sheet(record.result.path("sheet"), measured, ["subfield"], shape)
+        columns = read_sheet(record.result.path("sheet"), measured, ["subfield"], shape)
         for name in sampled:
             path = _sampled_table(record, name)
             if path.is_file():
-                columns |= hemisphere.read_sheet(path, [name], shape=shape)
+                columns |= read_sheet(path, [name], shape=shape)
         for name in maps.keys() & columns.keys():
             maps[name][i] = columns[name]
         subfield[i] = _encode(columns["subfield"], codes)
     summary = pd.concat(
         [
             pd.DataFrame(
-                [hemisphere.read_summary(record.result) for record in records[part]],
+                [read_summary(record.result) for record in records[part]],
                 dtype=np.float64,
             )
             for part in blocks(len(records), _ROWS)

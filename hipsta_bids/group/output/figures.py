@@ -16,6 +16,7 @@ import pandas as pd
 
 from hipsta_bids.group.cohort.data import SHEET, Cohort
 from hipsta_bids.group.output import panels, style
+from hipsta_bids.group.output.color_bar import spanned
 from hipsta_bids.group.output.maps import draw_alignment, draw_measure
 from hipsta_bids.group.output.results import Analysis, ScoredMaps
 from hipsta_bids.group.output.shapes import AverageShape
@@ -444,7 +445,7 @@ def norm_rows(
     kind = kind_of(measure)
     for i, (quantity, colors) in enumerate({"mean": kind.colors, "SD": "magma"}.items()):
         values = {hemi: pair[i].ravel() for hemi, pair in centers.items()}
-        scale = panels.spanned(colors, values)
+        scale = spanned(colors, values)
         if kind.centered and quantity == "mean":
             low, high = display.span_of(kind, list(values.values()))
             scale = {"cmap": colors, "vmin": low, "vmax": high}

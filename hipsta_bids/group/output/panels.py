@@ -7,19 +7,18 @@ colors, and how maps lie, is that of the pages (``reports.display``).
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
-from textwrap import wrap
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hipsta_bids.group.output import style
+from hipsta_bids.group.output.color_bar import Scale, draw_bar
 from hipsta_bids.group.output.ground import Ground, beyond, middles_of
 from hipsta_bids.group.output.style import DOTS_PER_INCH, LETTER, MM, SMALL, TITLE
 from hipsta_bids.group.output.views import View, across, draw_mesh, laid_out, look
 from hipsta_bids.group.stats.arrays import Bool, Float
-from hipsta_bids.reports import display
-from hipsta_bids.reports.cells import MINUS, SIDES
+from hipsta_bids.reports.cells import SIDES
 from hipsta_bids.reports.display import X_ENDS, Y_ENDS, parts_of
 from hipsta_bids.reports.group_maps import map_id
 from hipsta_bids.reports.maps import new_figure
@@ -32,7 +31,7 @@ if TYPE_CHECKING:
 
 # Lengths in mm.
 _LEFT, _RIGHT, _TOP, _BOTTOM = 9.0, 20.5, 9.5, 5.0  # margins, with the words in them
-_LINE, _SPACE = 3.2, 0.8  # of type, and between words
+_SPACE = 0.8  # between words
 _HEAD = 6.0  # above a row, for its title
 _GAP, _BETWEEN = 1.5, 5.0  # between columns, and between sides
 _VIEW_WIDTH = 0.62  # of an unfolded map's, for each view of a surface
@@ -45,23 +44,13 @@ _BAR, _BAR_WIDTH = 1.5, 2.6  # distance and width of a color bar
 _LARGEST = 0.94  # of the space of a view, for the surface
 _RULERS = (10.0, 5.0, 2.0, 1.0)  # of surfaces
 
-_FIELD_LINE, _FOUND_LINE = 0.6, 1.3  # borders of subfields and of what survives, points
-_POINT = DOTS_PER_INCH / 72  # pixels
-_LETTER_WIDTH = 0.6  # of type, over its size
-_LABEL_LINES = 2  # of a color bar
+_FIELD_LINE = 0.6  # borders of subfields, points
 _UNKNOWN = 0.92  # brightness where there is no value
 _HALF = 0.5
-_PLAIN = 4  # powers of ten of numbers that are written out
-_SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _HEAD_PIXELS = round(_HEAD * MM)
-_EXTEND = dict.fromkeys(("significance", "heterogeneity", "count"), "neither")  # color bars
-_EXTEND["agreement"] = "min"
 #: Rows of a figure.
 MOST_ROWS = 6
 
-
-Scale = Mapping[str, Any]
-"""Color map and the values at its ends, as matplotlib's arguments."""
 Views = dict[tuple[Any, ...], tuple[View, Bool]]
 """Views with borders of subfields, by direction, size, and what they are of."""
 
@@ -88,13 +77,6 @@ class Row:
     """Positions and texts on the color bar, where it is not to choose them."""
     grounds: Mapping[str, Ground] = field(default_factory=dict)
     """By side, where unfolded maps lie on others than the maps of other rows."""
-
-
-def spanned(colors: str, values: Mapping[str, Float]) -> Scale:
-    """Colors from the 1st to the 99th percentile."""
-    finite = display.known(list(values.values()))
-    low, high = np.percentile(finite, (1, 99)) if len(finite) else (0.0, 1.0)
-    return {"cmap": colors, "vmin": float(low), "vmax": float(high if high > low else low + 1)}
 
 
 def draw_pages(
@@ -154,7 +136,7 @@ def draw_view(
     scale: Scale,
     survive: Bool | None,
     *,
-    point: float = _POINT,
+    point: float = style.POINT,
 ) -> NDArray[np.uint8]:
     """Draw a map (points,) in the colors of a scale, with a line round what survives.
 
@@ -168,7 +150,7 @@ def draw_view(
     colors[~np.isfinite(pixels)] = _UNKNOWN
     if survive is not None:
         inside = view.region(survive.ravel().astype(np.int64), 1)
-        borders = borders | view.border(inside, _FOUND_LINE * point)
+        borders = borders | view.border(inside, style.FOUND_LINE * point)
     return view.picture(colors, borders)
 
 
@@ -271,7 +253,7 @@ def _draw_rows(
     for number, row in enumerate(rows):
         top = round(_TOP * MM) + _HEAD_PIXELS + number * (height + _HEAD_PIXELS)
         _draw_row(
-            figure, columns, row, (top, height, "abcdefghijklmnopqrstuvwxyz"[number % 26]), dpi
+            figure, columns, row, (top, height, style.LETTERS[number % len(style.LETTERS)]), dpi
         )
     _write_feet(figure, columns, top + height, scale)
     return figure
@@ -291,16 +273,18 @@ def _write_heads(figure: "Figure", columns: Sequence[_Column]) -> None:
 def _feet_height(sides: Mapping[str, Ground], unit: float) -> float:
     """Return the mm below the last row: names of subfields, ends, and the ruler."""
     lines = [
-        _longest(ground) if _upright(ground, unit) else _LINE
+        _longest(ground) if _upright(ground, unit) else style.LINE
         for ground in sides.values()
         if ground.mesh is None and ground.names
     ]
-    return _BOTTOM + max(lines, default=0.0 if all(s.unfolded for s in sides.values()) else _LINE)
+    return _BOTTOM + max(
+        lines, default=0.0 if all(s.unfolded for s in sides.values()) else style.LINE
+    )
 
 
 def _longest(ground: Ground) -> float:
     """Return the mm that the longest name of a subfield takes."""
-    return max(map(len, ground.names)) * _LETTER_WIDTH * 1.2 * SMALL * 25.4 / 72 + _SPACE
+    return _length(max(ground.names, key=len), 1.2) + _SPACE
 
 
 def _upright(ground: Ground, width: float) -> bool:
@@ -315,9 +299,9 @@ def _upright(ground: Ground, width: float) -> bool:
     return bool(names) and (min(gaps, default=1.0) < 0 or max(sizes.values()) > width / 2)
 
 
-def _length(text: str) -> float:
-    """Return the mm of a short text."""
-    return len(text) * _LETTER_WIDTH * 1.15 * SMALL * 25.4 / 72
+def _length(text: str, margin: float = 1.15) -> float:
+    """Return the mm of a short text, with a margin for wide letters."""
+    return len(text) * style.LETTER_WIDTH * margin * SMALL * 25.4 / 72
 
 
 def _apart(places: Sequence[float], gap: float, width: float) -> list[float]:
@@ -358,7 +342,7 @@ def _write_feet(figure: "Figure", columns: Sequence[_Column], bottom: int, scale
         length = (lengths or [_RULERS[-1]])[0]
         width, height = _size(figure)
         line_ends = [(left + wide - n * scale) / width for n in (length, 0)]
-        y = bottom + (2.4 + max(feet, _LINE)) * MM
+        y = bottom + (2.4 + max(feet, style.LINE)) * MM
         figure.add_artist(Line2D(line_ends, [1 - y / height] * 2, color="black", linewidth=1.2))
         _text(figure, line_ends[0] * width - MM, y, f"{length:g} mm", ha="right")
 
@@ -370,7 +354,7 @@ def _write_subfields(figure: "Figure", column: _Column, bottom: int) -> None:
     upright = _upright(column.ground, width / MM)
     middles = [place * width for place in places.values()]
     if upright:
-        middles = _apart(middles, 0.9 * _LINE * MM, width)
+        middles = _apart(middles, 0.9 * style.LINE * MM, width)
     for name, x in zip(places, middles, strict=True):
         y = bottom + (0.5 if upright else 0.9) * MM
         _text(figure, left + x, y, name, va="top", rotation=90 * upright)
@@ -420,7 +404,14 @@ def _draw_row(
         if survive is not None:
             _enclose(axes, ground, survive)
     edge = sum(columns[-1].box) + _BAR * MM
-    _draw_bar(_axes(figure, edge, top, _BAR_WIDTH * MM, height), row)
+    draw_bar(
+        _axes(figure, edge, top, _BAR_WIDTH * MM, height),
+        row.scale,
+        row.label,
+        kind=row.kind,
+        level=row.level,
+        ticks=row.ticks,
+    )
 
 
 def _write_title(figure: "Figure", top: int, words: str) -> None:
@@ -457,7 +448,7 @@ def _enclose(axes: "Axes", ground: Ground, survive: Bool) -> None:
     """Draw a line round the points that survive."""
     if not survive.any():
         return
-    line: Any = {"levels": [_HALF], "colors": "black", "linewidths": _FOUND_LINE}
+    line: Any = {"levels": [_HALF], "colors": "black", "linewidths": style.FOUND_LINE}
     if ground.mesh is not None:
         from matplotlib.tri import Triangulation  # noqa: PLC0415  (slow to load)
 
@@ -468,86 +459,3 @@ def _enclose(axes: "Axes", ground: Ground, survive: Bool) -> None:
     # Closed where it meets the edges of the sheet.
     closed = np.pad(survive.reshape(ground.subfield.shape), 1).astype(np.float64)
     axes.contour(beyond(ground.x), beyond(ground.y), closed.T, **line)
-
-
-def _draw_bar(axes: "Axes", row: Row) -> None:
-    """Draw the color bar of a row; that of significance is marked where points survive."""
-    from matplotlib.cm import ScalarMappable  # noqa: PLC0415  (slow to load)
-    from matplotlib.colors import Normalize  # noqa: PLC0415
-    from matplotlib.ticker import MaxNLocator  # noqa: PLC0415
-
-    low, high = row.scale["vmin"], row.scale["vmax"]
-    signs = (-1, 1) if low else (1,)
-    colors = ScalarMappable(Normalize(low, high), row.scale["cmap"])
-    extend = _EXTEND.get(row.kind, "both" if low else "max")
-    bar = axes.figure.colorbar(colors, cax=axes, extend=extend, extendfrac=0.06)
-    if bar.solids is not None:  # an image instead, which has no seams and takes no page in memory
-        bar.solids.remove()
-        steps = np.linspace(low, high, 256)[:, None]
-        box: Any = (0.0, 1.0, low, high)
-        axes.imshow(steps, **row.scale, extent=box, origin="lower", aspect="auto")
-    axes.tick_params(labelsize=SMALL, length=2, pad=1.5)
-    ticks, power = dict(row.ticks), 0
-    if row.level is not None:
-        ticks = {sign * at: text for at, text in display.p_ticks(row.level, high) for sign in signs}
-        for sign in signs:
-            axes.axhline(-sign * np.log10(row.level), color="black", linewidth=_FOUND_LINE)
-    elif not ticks:
-        n = max(2, int(axes.bbox.height / (2 * _LINE * MM)))
-        places = MaxNLocator(min(n, 5), steps=[1, 2, 2.5, 5, 10]).tick_values(low, high)
-        power = 3 * int(np.floor(np.log10(max(abs(low), abs(high), 1e-300)) / 3))
-        power = 0 if -_PLAIN <= power < _PLAIN else power
-        texts = [f"{at / 10.0**power:.6g}" for at in places]
-        digits = max(len(text.partition(".")[2]) for text in texts)
-        ticks = {at: f"{at / 10.0**power:.{digits}f}" for at in places}
-    ticks = _spaced({at: text for at, text in ticks.items() if low <= at <= high}, axes, row)
-    bar.set_ticks(list(ticks), labels=[_tick_text(text) for text in ticks.values()])
-    _label_bar(axes, _with_power(row.label, power))
-
-
-def _spaced(ticks: Mapping[float, str], axes: "Axes", row: Row) -> dict[float, str]:
-    """Leave out ticks too near to others, last those of the level."""
-    low, high = row.scale["vmin"], row.scale["vmax"]
-    gap = (high - low) * 0.9 * _LINE * MM / axes.bbox.height
-    level = f"{row.level:g}" if row.level is not None else None
-    places = list[float]()
-    for at in sorted(ticks, key=lambda at: (ticks[at] != level, abs(at))):
-        if all(abs(at - other) >= gap for other in places):
-            places.append(at)
-    return {at: ticks[at] for at in sorted(places)}
-
-
-def _tick_text(text: str) -> str:
-    """Write a number on a color bar; powers of ten are short, so that labels have room."""
-    digits, power, exponent = ("1e-04" if text == "0.0001" else text).partition("e")
-    if not power or digits != "1":
-        return text.replace("-", MINUS)
-    return f"10{str(int(exponent)).translate(_SUPERSCRIPTS)}"
-
-
-def _with_power(label: str, power: int) -> str:
-    """Write the power of ten that ticks are in into the unit of a label."""
-    if not power:
-        return label
-    number = "10" + str(power).translate(_SUPERSCRIPTS)
-    start, bracket, unit = label.rpartition("[")
-    return f"{start}[{number} {unit}" if bracket else f"{label} [{number}]"
-
-
-def _label_bar(axes: "Axes", label: str) -> None:
-    """Write the label of a color bar at the right margin, in lines that fit its height."""
-    figure, place = axes.figure, axes.bbox
-    letters = int(place.height / (_LETTER_WIDTH * SMALL * _POINT))
-    lines = [part for line in label.split("\n") for part in wrap(line, max(letters, 4))]
-    if len(lines) > _LABEL_LINES:
-        lines = wrap(" ".join(lines), max(letters, 4))
-    if len(lines) > _LABEL_LINES:
-        lines = [
-            *lines[: _LABEL_LINES - 1],
-            lines[_LABEL_LINES - 1][: letters - 1] + style.ELLIPSIS,
-        ]
-    width, height = figure.bbox.width, figure.bbox.height
-    figure.text(
-        1 - 0.8 * MM / width, (place.y0 + place.height / 2) / height, "\n".join(lines),
-        fontsize=SMALL, rotation=90, ha="right", va="center", multialignment="center",
-    )  # fmt: skip

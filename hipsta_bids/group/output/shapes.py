@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hipsta_bids.derivatives.hemisphere import ResultPlace, fill_from_nearest
+from hipsta_bids.derivatives.hemisphere import fill_from_nearest
+from hipsta_bids.derivatives.results import ResultPlace
 from hipsta_bids.errors import InputError
 from hipsta_bids.geometry.sheet import is_left_handed
 from hipsta_bids.group.cohort.collect import SheetRecord

@@ -19,9 +19,12 @@ if TYPE_CHECKING:
 #: Widths of figures in mm, of one column of a journal's page and of two.
 ONE_COLUMN, TWO_COLUMNS = 85.0, 180.0
 DOTS_PER_INCH = 300
-MM = DOTS_PER_INCH / 25.4  # pixels
+MM, POINT = DOTS_PER_INCH / 25.4, DOTS_PER_INCH / 72  # pixels
 #: Sizes of type in points: of letters of panels, of titles, and of all else.
 LETTER, TITLE, SMALL = 9.0, 8.0, 7.0
+LINE = 3.2  # mm, of small type
+LETTER_WIDTH = 0.6  # over the size of type
+FOUND_LINE = 1.3  # points, round what survives
 ELLIPSIS = "\N{HORIZONTAL ELLIPSIS}"
 
 _STYLE: Any = {
@@ -68,7 +71,7 @@ _METADATA: Mapping[str, Any] = {
 #: Formats of figures, by their extensions.
 KINDS = tuple(_METADATA)
 _INCH = 25.4  # mm
-_LETTERS = "abcdefghijklmnopqrstuvwxyz"
+LETTERS = "abcdefghijklmnopqrstuvwxyz"
 
 Drawing = Callable[[], "list[Figure]"]
 
@@ -111,7 +114,7 @@ def new_panels(
 def explain(figure: "Figure", axis: "Axes", title: str | None = None) -> None:
     """Put the legend of a panel below all, where it covers no curve."""
     handles = dict(zip(*axis.get_legend_handles_labels()[::-1], strict=True))
-    letters = figure.get_figwidth() * 72 / (0.6 * SMALL)
+    letters = figure.get_figwidth() * 72 / (LETTER_WIDTH * SMALL)
     longest = max(map(len, handles)) + 8  # with the line and what is between
     columns = max(1, min(len(handles), int(letters / longest)))
     legend = figure.legend(handles.values(), handles, loc="outside lower center", ncols=columns)
@@ -120,7 +123,7 @@ def explain(figure: "Figure", axis: "Axes", title: str | None = None) -> None:
 
 def letter_panels(axes: "Sequence[Axes]") -> None:
     """Put letters on panels, beside their titles."""
-    for axis, letter in zip(axes, cycle(_LETTERS), strict=False):
+    for axis, letter in zip(axes, cycle(LETTERS), strict=False):
         axis.set_title(letter, loc="left", fontsize=LETTER, weight="bold")
 
 

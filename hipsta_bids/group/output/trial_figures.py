@@ -5,7 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from hipsta_bids.group.output.panels import Row, spanned
+from hipsta_bids.group.output.color_bar import spanned
+from hipsta_bids.group.output.panels import Row
 from hipsta_bids.group.stats.arrays import Float
 from hipsta_bids.group.stats.trials import MOST_PARTICIPANTS
 from hipsta_bids.reports.cells import with_brackets

@@ -10,7 +10,7 @@ from scipy.spatial import Delaunay
 from small_cohorts import NODES, PLAN, methods_of, place_of, table, write_dataset
 
 from hipsta_bids.cli.main import main
-from hipsta_bids.derivatives.hemisphere import read_sheet
+from hipsta_bids.derivatives.results import read_sheet
 from hipsta_bids.group.cohort.crop import crop_maps
 from hipsta_bids.group.cohort.external import find_maps, map_patterns
 

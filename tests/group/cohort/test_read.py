@@ -112,7 +112,7 @@ def test_model_of_a_summary_measure_has_no_maps(dataset, quick):
 
 def test_unknown_measures_list_each_known_one_once(dataset, capsys, monkeypatch):
     summary = {"extent_x": 20.0, "extent_y": 9.0, "volume": 500.0, "area_mid": 100.0}
-    monkeypatch.setattr("hipsta_bids.derivatives.hemisphere.read_summary", lambda _: summary)
+    monkeypatch.setattr("hipsta_bids.group.cohort.read.read_summary", lambda _: summary)
     assert run(dataset, [], "--measures", "xyz")[0] == 65
     names = capsys.readouterr().err.strip().partition("; there are ")[2].split(", ")
     assert set(names) == {*SHEET_MAPS, "T2", *summary}
@@ -121,7 +121,7 @@ def test_unknown_measures_list_each_known_one_once(dataset, capsys, monkeypatch)
 
 def test_unknown_measures_are_told_where_many_are_listed(dataset, capsys, monkeypatch):
     summary = {f"area_CA{number}": 1.0 for number in range(20)}
-    monkeypatch.setattr("hipsta_bids.derivatives.hemisphere.read_summary", lambda _: summary)
+    monkeypatch.setattr("hipsta_bids.group.cohort.read.read_summary", lambda _: summary)
     assert run(dataset, [], "--measures", "xyz")[0] == 65
     first, more, place = capsys.readouterr().err.strip().split("; ")
     assert "no measure is called 'xyz'" in first

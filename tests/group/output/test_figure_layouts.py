@@ -10,11 +10,12 @@ import pytest
 from matplotlib.lines import Line2D
 from matplotlib.text import Text
 
-from hipsta_bids.group.output import panels
+from hipsta_bids.group.output import color_bar
+from hipsta_bids.group.output.color_bar import spanned
 from hipsta_bids.group.output.figures import draw_registration, draw_roc
 from hipsta_bids.group.output.ground import Ground
 from hipsta_bids.group.output.maps import ContrastMap, contrasts
-from hipsta_bids.group.output.panels import Row, draw_pages, spanned
+from hipsta_bids.group.output.panels import Row, draw_pages
 from hipsta_bids.group.output.style import ONE_COLUMN, TWO_COLUMNS, style
 from hipsta_bids.io.gifti import sheet_triangles
 from hipsta_bids.reports.cells import MINUS
@@ -231,7 +232,7 @@ def test_titles_of_two_lines_are_whole():
      ("-2.5", f"{MINUS}2.5"), ("10,000", "10,000")],
 )  # fmt: skip
 def test_ticks_are_short(number, tick):
-    assert panels._tick_text(number) == tick
+    assert color_bar._tick_text(number) == tick
 
 
 def test_small_p_are_powers_of_ten_on_the_color_bar():

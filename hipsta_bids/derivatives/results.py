@@ -1,0 +1,203 @@
+"""The results of hemispheres in an output dataset: where they are, which there are, what they hold.
+
+``hemisphere`` writes them. A hemisphere has results if it has a quality record.
+"""
+
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hipsta_bids.derivatives.dataset import TABLES
+from hipsta_bids.derivatives.names import (
+    EXTRA_OUTPUTS,
+    OUTPUTS,
+    HemisphereName,
+    name_of_record,
+    output_name,
+    output_path,
+    output_pattern,
+)
+from hipsta_bids.errors import InputError
+from hipsta_bids.geometry.catalog import MAPS
+from hipsta_bids.io import files
+from hipsta_bids.opening import open_regular
+
+#: Columns of the tables that are no measures: definition and unit.
+NODES, POSITION, STATE = (TABLES[name] for name in ("nodes", "position", "state"))
+LAYERS = NODES | TABLES["layers"]
+
+#: Columns of the sheet table, in order.
+SHEET_COLUMNS = (*NODES, *POSITION, *(row.name for row in MAPS), *STATE)
+
+_REDO = "run the participant level again with --force"
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ResultPlace:
+    """Where the results of one hemisphere are."""
+
+    root: Path
+    """The output dataset."""
+    name: HemisphereName
+
+    def path(self, key: str, desc: str | None = None) -> Path:
+        """Path of one output, by its key in the output table and, for maps, the user's name."""
+        return self.root / output_path(self.name, key, desc)
+
+    def paths(self, *, optional: bool) -> list[Path]:
+        """Paths of all outputs, with the optional ones or without."""
+        return [self.path(row.key) for row in OUTPUTS if optional or not row.optional]
+
+    def extra_paths(self) -> list[Path]:
+        """Existing files of an option or another command."""
+        folder = self.root / self.name.folder
+        names = [output_name(self.name, row.key) for row in EXTRA_OUTPUTS]
+        return [path for name in names for path in sorted(folder.glob(name))]
+
+
+def list_results(
+    root: Path, subject: str | None = None, session: str | None = None
+) -> list[ResultPlace]:
+    """List the hemispheres of a dataset, or of one visit, that have a quality record."""
+    folders = ["sub-*/anat", "sub-*/ses-*/anat"]
+    if subject is not None:
+        folders = [f"sub-{subject}/{f'ses-{session}/' if session else ''}anat"]
+    results = [
+        ResultPlace(root=root, name=name)
+        for folder in folders
+        for path in root.glob(f"{folder}/{output_pattern('qc')}")
+        if (name := name_of_record(path.name)) is not None
+    ]
+    return sorted(results, key=_order)
+
+
+def _order(result: ResultPlace) -> tuple[str, ...]:
+    name = result.name
+    return name.subject, name.session or "", name.seg, name.region, name.hemi
+
+
+def read_record(result: ResultPlace) -> dict[str, Any]:
+    """Read the quality record."""
+    record = files.read_json(result.path("qc"))
+    for name in ("inputs", "edited"):
+        entries = record.get(name) or []
+        if not isinstance(entries, list) or not all(isinstance(one, dict) for one in entries):
+            raise InputError(f"{result.path('qc')}: bad {name}; {_REDO}", reason="bad-json")
+    return record
+
+
+def read_summary(result: ResultPlace) -> dict[str, float]:
+    """Read the row of summary measures, NaN where missing."""
+    cells = read_summary_cells(result)
+    try:
+        return {name: np.nan if v == files.MISSING else float(v) for name, v in cells.items()}
+    except ValueError as error:
+        raise _bad_summary(result) from error
+
+
+def read_summary_cells(result: ResultPlace) -> dict[str, str]:
+    """Read the row of summary measures as text."""
+    rows = files.read_tsv(result.path("summary"))
+    if len(rows) != 1:
+        raise _bad_summary(result)
+    return rows[0]
+
+
+def _bad_summary(result: ResultPlace) -> InputError:
+    path = result.path("summary")
+    return InputError(f"{path}: not one row of numbers; {_REDO}", reason="bad-table")
+
+
+def read_sheet(
+    path: Path,
+    numbers: Sequence[str] | None = None,
+    words: Sequence[str] = (),
+    shape: tuple[int, int] | None = None,
+) -> dict[str, NDArray[Any]]:
+    """Read columns of a table with one row per sheet point, as (Nx, Ny) arrays.
+
+    Missing numbers are NaN, missing words empty. Without ``numbers`` all columns that hold numbers
+    are read; without ``shape`` the last row has the number of nodes.
+    """
+    try:
+        open_regular(path).close()
+        if numbers is None:
+            with path.open(encoding="utf-8") as file:
+                columns = file.readline().rstrip("\n").split("\t")
+            numbers = [name for name in columns if name not in {*NODES, *STATE}]
+        read = _columns_by_arrow if find_spec("pyarrow") else _columns_by_pandas
+        x, y, *values = read(path, numbers, words)
+        nx, ny = shape or (int(x[-1]), int(y[-1]))
+    except (OSError, ValueError, KeyError, IndexError) as error:  # pyarrow's are among these
+        first = str(error).partition("\n")[0]
+        raise InputError(
+            f"{path}: not readable as a sheet ({first}); {_REDO}", reason="unreadable-table"
+        ) from error
+    expected = np.divmod(np.arange(len(x)), max(ny, 1))
+    if len(x) != nx * ny or (x != expected[0] + 1).any() or (y != expected[1] + 1).any():
+        suffix = " of the settings" if shape else ""
+        raise InputError(f"{path}: not a sheet of {nx} x {ny} nodes{suffix}; {_REDO}")
+    names = (*numbers, *words)
+    return {name: column.reshape(nx, ny) for name, column in zip(names, values, strict=True)}
+
+
+def _columns_by_arrow(
+    path: Path, numbers: Sequence[str], words: Sequence[str]
+) -> list[NDArray[Any]]:
+    """Read node numbers, numbers and words of a table with pyarrow, an optional extra."""
+    import pyarrow as pa  # noqa: PLC0415  (slow to load)
+    from pyarrow import csv  # noqa: PLC0415  (likewise)
+
+    types = dict.fromkeys(numbers, pa.float64()) | dict.fromkeys(words, pa.string())
+    table = csv.read_csv(
+        path,
+        read_options=csv.ReadOptions(use_threads=False),
+        parse_options=csv.ParseOptions(delimiter="\t"),
+        convert_options=csv.ConvertOptions(
+            include_columns=[*NODES, *numbers, *words],
+            column_types=types,
+            null_values=[files.MISSING],
+            strings_can_be_null=True,
+        ),
+    )
+    columns = [table.column(name) for name in (*NODES, *numbers)]
+    columns += [table.column(name).fill_null("") for name in words]
+    return [column.to_numpy() for column in columns]
+
+
+def _columns_by_pandas(
+    path: Path, numbers: Sequence[str], words: Sequence[str]
+) -> list[NDArray[Any]]:
+    """Read the same with pandas, which takes longer."""
+    import pandas as pd  # noqa: PLC0415  (slow to load)
+
+    content = path.read_bytes()
+    header, *lines = content.splitlines()
+    if any(line.count(b"\t") != header.count(b"\t") for line in lines):
+        raise ValueError("rows differ in their number of columns")
+    table = pd.read_csv(
+        io.BytesIO(content),
+        sep="\t",
+        usecols=[*NODES, *numbers, *words],
+        dtype=dict.fromkeys(numbers, float) | dict.fromkeys(words, object),
+        na_values=[files.MISSING],
+        keep_default_na=False,
+    )
+    columns = [table[name] for name in (*NODES, *numbers)]
+    return [column.to_numpy() for column in (*columns, *(table[name].fillna("") for name in words))]
+
+
+def read_units(result: ResultPlace) -> dict[str, str]:
+    """Read the units of maps and summary measures."""
+    return {
+        name: str(entry["Units"])
+        for key in ("sheet_sidecar", "summary_sidecar")
+        for name, entry in files.read_json(result.path(key)).items()
+        if isinstance(entry, Mapping) and "Units" in entry
+    }
