@@ -108,7 +108,7 @@ def study(tmp_path_factory):
 @whole
 def test_every_file_and_column_of_the_page_is_there(study):
     rows = re.findall(r"^\| .*? \| (`.*?) \| (.*?) \|$", PAGE, re.MULTILINE)
-    assert len(rows) == 6
+    assert len(rows) == 7
     columns = ""
     for out in ("out", "out-ashs"):
         folder = study / out / "group" / "published"
