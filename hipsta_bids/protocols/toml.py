@@ -8,7 +8,7 @@ import textwrap
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Annotated, Any, Self, TypeVar, get_args
+from typing import Annotated, Any, Self, TypeVar, cast, get_args, get_origin
 
 from pydantic import (
     AfterValidator,
@@ -124,12 +124,13 @@ def _name(position: Iterable[str | int]) -> str:
     return name.rstrip(".: ")
 
 
-def _table_at(kind: type[BaseModel], position: Iterable[str | int]) -> type[BaseModel]:
+def _table_at(kind: Any, position: Iterable[str | int]) -> type[BaseModel]:  # noqa: ANN401  (of fields)
     for key in position:
-        if isinstance(key, str):
-            annotation = kind.model_fields[key].annotation
-            kind = (get_args(annotation) or (annotation,))[0]
-    return kind
+        if parts := get_args(kind):  # of a list, or of a mapping from keys to values
+            kind = parts[1 if get_origin(kind) is dict else 0]
+        else:
+            kind = kind.model_fields[key].annotation
+    return cast("type[BaseModel]", kind)
 
 
 def read_settings(path: Path | None, kind: type[Table]) -> Table:

@@ -15,7 +15,13 @@ from small_cohorts import NODES, place_of, read_participants, table, write_parti
 
 from hipsta_bids.cli.main import main
 from hipsta_bids.group.design.settings import RegistrationSettings
-from hipsta_bids.group.output.saved import NormArrays, _digest, load_norms, templates_from_json
+from hipsta_bids.group.output.saved import (
+    NormArrays,
+    NormsFile,
+    _digest,
+    load_norms,
+    templates_from_json,
+)
 from hipsta_bids.group.output.tables import COLUMNS
 from hipsta_bids.group.questions import norming
 from hipsta_bids.group.stats.registration import mean_profiles, register_to
@@ -361,3 +367,15 @@ def test_counts_beyond_floats_are_refused():
     assert NormArrays.model_validate({**values, "n": [[7]]}).n == [[7]]
     with pytest.raises(ValidationError, match="less than or equal to 1000000000"):
         NormArrays.model_validate({**values, "n": [[10**400]]})
+
+
+@pytest.mark.parametrize(
+    ("key", "message"),
+    [
+        ("scales", r"norms\.L\.volume\.scales \(did you mean 'scale'\?\)"),
+        ("x", r"volume\.x; known here: mean, spread, shape, shift, scale, n"),
+    ],
+)
+def test_an_unknown_key_in_norms_of_a_measure_is_named(key, message):
+    with pytest.raises(ValueError, match=message):
+        files.checked_foreign({"norms": {"L": {"volume": {key: [[1.0]]}}}}, NormsFile)
