@@ -19,11 +19,13 @@ from hipsta_bids.group.stats.combat import ARRAYS, SiteEffects
 from hipsta_bids.group.stats.norms import LEVELS, NORM_ARRAYS, Norms, People
 from hipsta_bids.group.stats.warps import DEGREE, Template
 from hipsta_bids.io import files
-from hipsta_bids.protocols.toml import Fraction, TomlTable
+from hipsta_bids.protocols.toml import Fraction, OpenFraction, TomlTable
 
 #: Fields of a template that are arrays.
 _TEMPLATE_ARRAYS = ("knots", "mean", "components", "center")
 _FLAT = frozenset({"mean", "sd", "ratio"})
+#: Least distance of the knots of a template, and from 0 and 1.
+_CLOSEST = 1e-6
 
 
 class SavedEffects(TomlTable):
@@ -266,7 +268,15 @@ def _rising(values: list[float]) -> list[float]:
     return values
 
 
+def _separate(values: list[float]) -> list[float]:
+    # Splines of knots that meet cannot be differentiated.
+    if (np.diff([0.0, *values, 1.0]) < _CLOSEST).any():
+        raise ValueError("different numbers that rise")
+    return values
+
+
 _Rising = Annotated[list[Fraction], Field(max_length=1000), AfterValidator(_rising)]
+_Knots = Annotated[list[OpenFraction], Field(max_length=1000), AfterValidator(_separate)]
 
 
 def templates_to_json(templates: Mapping[str, Template]) -> dict[str, Any]:
@@ -294,7 +304,7 @@ def templates_to_json(templates: Mapping[str, Template]) -> dict[str, Any]:
 class _SavedTemplate(TomlTable):
     """A template in a file, which may be other people's and hold anything."""
 
-    knots: _Rising
+    knots: _Knots
     mean: list[files.Number]
     components: list[list[files.Number]]
     noise: Annotated[files.Number, Field(gt=0)]
