@@ -220,17 +220,20 @@ def _run(options: "Namespace", arguments: Sequence[str]) -> ExitCode:
     from hipsta_bids.io.volumes import limit_memory  # noqa: PLC0415  (heavy)
 
     limit_memory(options.mem)
-    keys = ("sampling", "interpolation", "transform", "reference")
-    requests = map_requests(options.map, *(getattr(options, f"map_{key}") for key in keys))
+    requests = map_requests(
+        *(options.map, options.map_sampling, options.map_interpolation),
+        *(options.map_transform, options.map_reference),
+    )
     with console.searching(has_bar=not (options.quiet or options.dry_run)):
-        findings = _find(request, options.shard, say=console.echo if options.dry_run else None)
+        part = options.shard and options.shard.take(search.list_subjects(request))
+        findings = _find(request, part, say=console.echo if options.dry_run else None)
     if findings is None:
         console.echo(f"part {options.shard.name} of the dataset has nothing to process")
         return ExitCode.OK
     items, end_notes = attach_ends(findings.items, options.ends)
     items, map_notes = attach(items, requests, options.roi, options.bids_dir)
     notes = (
-        *search.dataset_notes(request, items),
+        *search.dataset_notes(request, items, part),
         *findings.notes,
         *end_notes,
         *map_notes,
@@ -300,15 +303,15 @@ def _settings(options: "Namespace") -> "Settings":
 
 
 def _find(
-    request: "InputRequest", shard: Shard | None, say: Callable[[str], None] | None
+    request: "InputRequest", part: Sequence[str] | None, say: Callable[[str], None] | None
 ) -> "Findings | None":
     """Find inputs, of one part of the subjects if asked for; ``None`` if that has none.
 
     Where there are none at all, ``say`` gets a line for each entry that was not used.
     """
-    from hipsta_bids.inputs.search import find_inputs, list_subjects  # noqa: PLC0415  (heavy)
+    from hipsta_bids.inputs.search import find_inputs  # noqa: PLC0415  (heavy)
 
-    if shard is None:
+    if part is None:
         try:
             return find_inputs(request)
         except NothingToDoError as error:
@@ -316,11 +319,10 @@ def _find(
                 for line in getattr(error, "__notes__", ()):
                     say(line)
             raise
-    subjects = shard.take(list_subjects(request))
-    if not subjects:
+    if not part:
         return None
     try:
-        return find_inputs(replace(request, participant_labels=subjects))
+        return find_inputs(replace(request, participant_labels=tuple(part)))
     except NothingToDoError:
         return None  # others may have something, and collecting says if none has
 

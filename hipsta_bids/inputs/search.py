@@ -210,8 +210,10 @@ def list_subjects(request: InputRequest) -> tuple[str, ...]:
     )
 
 
-def dataset_notes(request: InputRequest, items: Iterable[HemisphereInput]) -> tuple[str, ...]:
-    """List what a user should know about the dataset as a whole."""
+def dataset_notes(
+    request: InputRequest, items: Iterable[HemisphereInput], part: Sequence[str] | None = None
+) -> tuple[str, ...]:
+    """List what a user should know about the dataset, or about a part of its subjects."""
     notes = []
     if read_description(request.bids_dir) is None:
         notes.append(
@@ -219,6 +221,7 @@ def dataset_notes(request: InputRequest, items: Iterable[HemisphereInput]) -> tu
         )
     selection = make_selection(request)
     expected = selection.subjects or scan.list_participants(request)
+    expected &= expected if part is None else set(part)
     without = sorted(expected - selection.excluded - {item.subject for item in items})
     if without:
         hint = did_you_mean(selection.subjects.intersection(without), {i.subject for i in items})

@@ -233,3 +233,21 @@ def test_content_that_was_not_fetched(tmp_path, capsys):
     assert f"[not-fetched] {path}: its content was not fetched; run `datalad get {path}`" in said
     (row,) = (r for r in files.read_tsv(tmp_path / "out" / "inputs.tsv") if r["hemi"] == "R")
     assert (row["status"], row["tool"]) == ("failed", "freesurfer")
+
+
+def test_a_part_notes_its_own_participants_without_labels(tmp_path, capsys):
+    bids = tmp_path / "bids"
+    for subject in ("sub-01", "sub-02", "sub-03", "sub-04"):
+        (bids / subject / "anat").mkdir(parents=True)
+    for subject in ("sub-01", "sub-02", "sub-03"):
+        (bids / "derivatives" / "fs" / subject / "mri").mkdir(parents=True)
+    for subject in ("sub-01", "sub-02"):
+        (bids / f"derivatives/fs/{subject}/mri/lh.hippoAmygLabels-T1.v22.mgz").touch()
+    notes = []
+    for part in ([], ["--shard", "1/2"], ["--shard", "2/2"]):
+        arguments = [str(bids), str(tmp_path / "out"), "participant", "--dry-run", *part]
+        assert main.main(arguments) == ExitCode.OK
+        lines = capsys.readouterr().out.splitlines()
+        notes.append([line for line in lines if "no segmentation" in line])
+    numbers = ("2 participants (03, 04)", "1 participant (03)", "1 participant (04)")
+    assert notes == [[f"note: no segmentation found for {text}"] for text in numbers]
