@@ -357,7 +357,9 @@ def entities(name: str) -> dict[str, str]:
     return {**pairs, "suffix": suffix, "extension": dot + extension}
 
 
-Number = Annotated[float, Field(allow_inf_nan=False)]
+#: Largest number of a file of another site; products and powers of such numbers stay finite.
+LARGEST = 1e40
+Number = Annotated[float, Field(allow_inf_nan=False, ge=-LARGEST, le=LARGEST)]
 FileNumbers = list[Number | None]
 """FileNumbers in JSON; null where one is missing."""
 Nested = dict[str, dict[str, dict[str, list[Any]]]]

@@ -97,6 +97,9 @@ class ModelSummary(TomlTable):
             "standard deviations or errors that are not positive": any(
                 value is not None and value <= 0 for value in sizes
             ),
+            "standard deviations or errors too close to zero": any(
+                value is not None and value < 1 / files.LARGEST for value in sizes
+            ),
         }
         return next((text for text, is_wrong in problems.items() if is_wrong), None)
 

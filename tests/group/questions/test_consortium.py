@@ -340,6 +340,10 @@ def spoiled(change):
         (spoiled(lambda m: m["sd"].append(1.0)), "numbers of points that are not 147"),
         (spoiled(lambda m: m["sd"].__setitem__(0, "1")), "has to be a number"),
         (spoiled(lambda m: m["se"]["CN-AD"].__setitem__(0, 0.0)), "that are not positive"),
+        # Their squares, and the weights by them, are beyond the range of floats.
+        (spoiled(lambda m: m["se"]["CN-AD"].__setitem__(0, 1e308)), "has to be at most 1e+40"),
+        (spoiled(lambda m: m["se"]["CN-AD"].__setitem__(0, 1e-170)), "errors too close to zero"),
+        (spoiled(lambda m: m["estimate"]["CN-AD"].__setitem__(0, -1e200)), "at least -1e+40"),
         (spoiled(lambda m: m["contrasts"].clear()), "contrasts"),
         (spoiled(lambda m: m["measures"].__setitem__(0, "../x")), "measures"),
         (spoiled(lambda m: m.__setitem__("df", 400)), "other degrees of freedom"),
