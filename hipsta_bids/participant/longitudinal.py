@@ -17,8 +17,9 @@ from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry import catalog, checks, columns
 from hipsta_bids.geometry.align import align
 from hipsta_bids.geometry.average import average_labels
-from hipsta_bids.geometry.body import Body, check_side, extract_body
-from hipsta_bids.geometry.ends import EndPlanes
+from hipsta_bids.geometry.body import Body, check_side, extract_body, relabel_by_mask
+from hipsta_bids.geometry.digital import voxel_points
+from hipsta_bids.geometry.ends import EndPlanes, hippocampal_voxels
 from hipsta_bids.geometry.grid import Field, resample_body
 from hipsta_bids.geometry.label_checks import check_label_image
 from hipsta_bids.geometry.measures import bending_angle, subfield_volumes
@@ -47,6 +48,7 @@ FLAG_OVERLAP = 0.8
 #: Walls at least this far from the mean's are the place of a visit that does not fit, mm.
 FAR = 0.5
 
+_PAIR = 2  # visits of which none can be told to be the wrong one
 _ENDS: tuple[End, ...] = ("posterior", "anterior")
 
 
@@ -163,14 +165,85 @@ def _mean_ends(volumes: Sequence[LabelVolume], motions: Sequence[Float]) -> tupl
     return tuple(means)
 
 
-def measure_visit(
-    frame: Frame, number: int, volume: LabelVolume, hemi: str, clock: Clock
-) -> HemisphereMaps:
-    """Measure a visit along the columns of the common sheet; ``number`` is its place in the frame.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Laid:
+    """A visit on the common sheet, before it is measured."""
 
-    GeometryError if it cannot be measured, or does not resemble the mean at all.
+    image: list[Finding]
+    """What the checks of the label image found."""
+    body: Body
+    side: float
+    """How far the medial subfields lie medially of CA1, mm."""
+    solid: SolidField
+    visit: _Visit
+    walls: columns.Walls
+
+
+def check_alone(volume: LabelVolume, hemi: str, settings: Settings) -> None:
+    """Check labels that are to enter a mean.
+
+    GeometryError if these labels cannot be measured, whatever the further visits are like.
     """
-    motion, common, settings = frame.motions[number], frame.evidence, frame.evidence.settings
+    check_label_image(volume, hemi, settings.checks)
+    check_side(extract_body(volume, settings.body), hemi)
+
+
+def find_common(
+    volumes: Sequence[LabelVolume], hemi: str, settings: Settings, clock: Clock, *, shared: bool
+) -> tuple[Frame, dict[int, Laid | GeometryError]]:
+    """Make the common sheet of the visits that resemble each other, and lay them on it.
+
+    Of three visits or more, a refused visit is omitted, of several the one that resembles the
+    rest least, until none is refused. Returns the result of each visit on the sheet, by its number.
+    """
+    numbers = list(range(len(volumes)))
+    relabeled = [relabel_by_mask(volume, settings.body) for volume in volumes]
+    while True:
+        part = [relabeled[n] for n in numbers]
+        laid: dict[int, Laid | GeometryError] = {}
+        try:
+            frame = make_frame(part, hemi, settings, clock, shared=shared)
+        except GeometryError:
+            if len(numbers) <= _PAIR:
+                raise
+        else:
+            for place, n in enumerate(numbers):
+                try:
+                    laid[n] = lay_visit(frame, place, volumes[n], hemi, clock)
+                except GeometryError as error:
+                    laid[n] = error
+            fit = not any(isinstance(result, GeometryError) for result in laid.values())
+            if fit or len(numbers) <= _PAIR:
+                return frame, laid
+        refused = [n for n in numbers if not isinstance(laid.get(n), Laid)]
+        with clock("alignment"):
+            overlap = _resemblance(part, align(part, hemi, shared=shared))
+        numbers.remove(min(refused, key=lambda n: overlap[numbers.index(n)]))
+
+
+def _resemblance(volumes: Sequence[LabelVolume], motions: Sequence[Float]) -> list[float]:
+    """Compute the mean overlap of the labels of each visit with the labels of all visits."""
+    masks = [hippocampal_voxels(volume) for volume in volumes]
+    places = [
+        apply_affine(np.linalg.inv(motion), voxel_points(mask, volume.affine))
+        for mask, volume, motion in zip(masks, volumes, motions, strict=True)
+    ]
+    shares = np.ones((len(volumes), len(volumes)))
+    for number, (mask, volume, motion) in enumerate(zip(masks, volumes, motions, strict=True)):
+        to_voxels = np.linalg.inv(volume.affine) @ motion
+        for n, points in enumerate(places):
+            index = np.rint(apply_affine(to_voxels, points)).astype(np.intp)
+            within = ((index >= 0) & (index < mask.shape)).all(axis=1)
+            shares[number, n] = mask[tuple(index[within].T)].sum() / len(points)
+    return [float(share) for share in np.minimum(shares, shares.T).mean(axis=1)]
+
+
+def lay_visit(frame: Frame, number: int, volume: LabelVolume, hemi: str, clock: Clock) -> Laid:
+    """Lay the common sheet on a visit; ``number`` is its place in the frame.
+
+    GeometryError if its labels cannot be measured, or do not resemble the mean at all.
+    """
+    motion, settings = frame.motions[number], frame.evidence.settings
     with clock("body"):
         image = check_label_image(volume, hemi, settings.checks)
         body = extract_body(replace(volume, given_ends=frame.ends(motion)), settings.body)
@@ -179,8 +252,25 @@ def measure_visit(
         field = resample_body(body, hemi, settings.grid, settings.slices)
         solid = measure.make_solid(field, body, settings)
     with clock("sheet"):
-        measured, walls = _carry(frame, motion, solid.field)
-        sheet = measured.sheet
+        visit, walls = _carry(frame, motion, solid.field)
+    return Laid(image=image, body=body, side=side, solid=solid, visit=visit, walls=walls)
+
+
+def measure_visit(
+    frame: Frame, number: int, volume: LabelVolume, hemi: str, clock: Clock
+) -> HemisphereMaps:
+    """Lay the common sheet on a visit and measure it; for errors see :func:`lay_visit`."""
+    laid = lay_visit(frame, number, volume, hemi, clock)
+    return measure_laid(frame, frame.motions[number], volume, laid, clock)
+
+
+def measure_laid(
+    frame: Frame, motion: Float, volume: LabelVolume, laid: Laid, clock: Clock
+) -> HemisphereMaps:
+    """Measure a visit on the common sheet."""
+    common, settings = frame.evidence, frame.evidence.settings
+    body, solid, measured, walls = laid.body, laid.solid, laid.visit, laid.walls
+    sheet = measured.sheet
     with clock("measures"):
         maps = catalog.measure_maps(measured)
         repaired = repaired_columns(sheet, solid)
@@ -188,7 +278,7 @@ def measure_visit(
         overlap = _overlap(body, frame, motion)
         repairs = [checks.add_consequence(measure.describe_repair(r), sheet) for r in solid.repairs]
         findings = [
-            *image,
+            *laid.image,
             *checks.check_image(body),
             *checks.check_end_labels(volume, body, settings.checks),
             *measure.check_edits(volume, body, settings),
@@ -208,7 +298,8 @@ def measure_visit(
             body_mask=volume.in_file(body.inside),
             summary=catalog.summarize(measured, for_region(volume.protocol, body.region).sheet),
             qc={
-                **measure.body_metrics(body, side, settings),
+                **measure.body_metrics(body, laid.side, settings),
+                **{f"{end}_end_rule": common.body.ends[end].rule for end in _ENDS},
                 "euler_before": solid.euler_before,
                 "euler_after": solid.euler_after,
                 "changed_fraction": solid.changed_fraction,

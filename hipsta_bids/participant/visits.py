@@ -1,22 +1,25 @@
 """All visits of one side of a participant from files to files, on one sheet, as workers run it."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from itertools import groupby
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from hipsta_bids import __version__
 from hipsta_bids.derivatives import template
-from hipsta_bids.derivatives.results import read_record
-from hipsta_bids.errors import HipstaError, InputError, OutputError, UsageError
+from hipsta_bids.derivatives.results import ResultPlace, read_record
+from hipsta_bids.errors import GeometryError, HipstaError, InputError, OutputError, UsageError
 from hipsta_bids.inputs.scan import HemisphereInput
 from hipsta_bids.io import files
 from hipsta_bids.participant import job as one_job
 from hipsta_bids.participant.job import CostClock, Job, Measure, Outcome, fail, finished
 from hipsta_bids.types import HemisphereMaps, LabelVolume
+
+if TYPE_CHECKING:
+    from hipsta_bids.participant.longitudinal import Frame
 
 
 def side(item: HemisphereInput) -> tuple[str, str, str]:
@@ -53,39 +56,50 @@ def run_visits(jobs: tuple[Job, ...]) -> list[Outcome]:
 
 def _measure_visits(jobs: tuple[Job, ...]) -> list[Outcome]:
     """Lay out the mean of the visits, measure each visit on it, and write what they share."""
-    from hipsta_bids.geometry.body import relabel_by_mask  # noqa: PLC0415  (workers only)
-    from hipsta_bids.inputs.labels import read_label_volume  # noqa: PLC0415  (likewise)
+    from hipsta_bids.inputs.labels import read_label_volume  # noqa: PLC0415  (workers only)
     from hipsta_bids.participant import longitudinal  # noqa: PLC0415  (likewise)
-    from hipsta_bids.participant.measure import quality_metrics  # noqa: PLC0415  (likewise)
 
     clock = CostClock()
     place, settings = template.template_place(jobs[0].result), jobs[0].settings
     template.remove_template(place)
+    hemi = jobs[0].item.hemi
     usable, volumes = [], []
     for job in jobs:
         with suppress(HipstaError):  # its own job reports it
             volume = read_label_volume(job.item, settings.body.region)
-            volumes.append(relabel_by_mask(volume, settings.body))
+            longitudinal.check_alone(volume, hemi, settings)
+            volumes.append(volume)
             usable.append(job)
     frame, problem = None, None
+    laid: dict[int, longitudinal.Laid | GeometryError] = {}
     try:
         shared = settings.sheet.frame == "shared" or all(
             job.item.provenance.get("design") == "longitudinal" for job in usable
         )
-        hemi = jobs[0].item.hemi
-        frame = longitudinal.make_frame(volumes, hemi, settings, clock, shared=shared)
+        frame, laid = longitudinal.find_common(volumes, hemi, settings, clock, shared=shared)
     except Exception as error:  # noqa: BLE001  (each visit reports it)
         problem = error
     spent = clock.spent()
-    thick = _thick(usable, volumes)
+    on_sheet = [usable[number] for number in laid]
+    shared_notes = (*_thick(usable, volumes), *_left_out(jobs, usable, on_sheet))
     measured: dict[str | None, HemisphereMaps] = {}
 
     def measure(job: Job) -> Measure:
         def run(volume: Any, hemi: str, _settings: Any, clock: Any) -> HemisphereMaps:  # noqa: ANN401
-            if frame is None or job not in usable:
-                relabel_by_mask(volume, settings.body)  # names what is wrong with a mask
+            if job not in usable or frame is None:
+                longitudinal.check_alone(volume, hemi, settings)  # says what is wrong
                 raise problem or HipstaError("no visit can be read", reason="internal-error")
-            maps = longitudinal.measure_visit(frame, usable.index(job), volume, hemi, clock)
+            if job not in on_sheet:
+                raise GeometryError(
+                    "this visit does not resemble the other visits: check participant, side and "
+                    "labels",
+                    reason="visit-unlike",
+                )
+            result = laid[usable.index(job)]
+            if isinstance(result, GeometryError):
+                raise result
+            motion = frame.motions[on_sheet.index(job)]
+            maps = longitudinal.measure_laid(frame, motion, volume, result, clock)
             measured[job.item.session] = maps
             return maps
 
@@ -94,32 +108,44 @@ def _measure_visits(jobs: tuple[Job, ...]) -> list[Outcome]:
     outcomes = []
     for job in jobs:
         renewal = _renewal(job)
-        notes = (*job.item.notes, *thick, *([renewal] if renewal else []))
+        notes = (*job.item.notes, *shared_notes, *([renewal] if renewal else []))
         noted = replace(job, item=replace(job.item, notes=notes))
         outcome = replace(one_job.measure_job(noted, measure(job)), renewal=renewal)
         outcomes.append(_with_cost(outcome, spent, len(jobs)))
     if frame is not None and measured:
-        thickness = np.stack([maps.thickness for maps in measured.values()])
-        base = one_job.base_record(jobs[0])
-        _, entries = one_job.hash_inputs(usable[0], base)
-        record = {
-            **{key: base[key] for key in ("settings_hash", "scheme", "scheme_title")},
-            "version": __version__,
-            "visits": entries["visits"],
-            "measured": list(measured),
-            "motions": [
-                {"session": job.item.session, "frame_to_visit": motion.round(6)}
-                for job, motion in zip(usable, frame.motions, strict=True)
-            ],
-            "metrics": quality_metrics(frame.evidence),
-        }
-        mask = frame.volume.in_file(frame.evidence.body.inside)
-        template.write_template(place, frame.evidence.sheet, thickness, mask, record)
-        for job in jobs:
-            if job.item.session in measured:
-                change = measured[job.item.session].thickness - thickness.mean(axis=0)
-                template.write_change(job.result, change, record)
+        _write_common(place, frame, on_sheet, measured)
     return outcomes
+
+
+def _write_common(
+    place: ResultPlace,
+    frame: "Frame",
+    jobs: Sequence[Job],
+    measured: Mapping[str | None, HemisphereMaps],
+) -> None:
+    """Write what the visits share, and the change of each one."""
+    from hipsta_bids.participant.measure import quality_metrics  # noqa: PLC0415  (workers only)
+
+    thickness = np.stack([maps.thickness for maps in measured.values()])
+    base = one_job.base_record(jobs[0])
+    _, entries = one_job.hash_inputs(jobs[0], base)
+    record = {
+        **{key: base[key] for key in ("settings_hash", "scheme", "scheme_title")},
+        "version": __version__,
+        "visits": entries["visits"],
+        "measured": list(measured),
+        "motions": [
+            {"session": job.item.session, "frame_to_visit": motion.round(6)}
+            for job, motion in zip(jobs, frame.motions, strict=True)
+        ],
+        "metrics": quality_metrics(frame.evidence),
+    }
+    mask = frame.volume.in_file(frame.evidence.body.inside)
+    template.write_template(place, frame.evidence.sheet, thickness, mask, record)
+    for job in jobs:
+        if job.item.session in measured:
+            change = measured[job.item.session].thickness - thickness.mean(axis=0)
+            template.write_change(job.result, change, record)
 
 
 def _thick(jobs: Sequence[Job], volumes: Sequence[LabelVolume]) -> list[str]:
@@ -133,6 +159,19 @@ def _thick(jobs: Sequence[Job], volumes: Sequence[LabelVolume]) -> list[str]:
     ]
     text = "thick slices: a common sheet does not lower noise of the mean thickness (sessions {})"
     return [text.format(", ".join(sessions))] if sessions else []
+
+
+def _left_out(jobs: Sequence[Job], usable: Sequence[Job], on_sheet: Sequence[Job]) -> list[str]:
+    """Note visits that are no part of the common sheet."""
+    groups = {
+        "cannot be measured": [job for job in jobs if job not in usable],
+        "do not resemble the others": [job for job in usable if job not in on_sheet],
+    }
+    return [
+        f"common sheet without sessions that {why}: {', '.join(str(j.item.session) for j in group)}"
+        for why, group in groups.items()
+        if group and on_sheet
+    ]
 
 
 def _with_cost(outcome: Outcome, spent: dict[str, Any], count: int) -> Outcome:

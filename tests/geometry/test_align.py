@@ -128,6 +128,13 @@ def test_alignment_of_one_grid_fades_in_without_a_step(visits, monkeypatch):
     assert 0 <= np.diff(apart).min() <= np.diff(apart).max() < 0.05
 
 
+def test_visits_that_share_no_space_are_refused(visits):
+    far = replace(visits[0], affine=rigid((0, 0, 0), (0, 30, 0)) @ visits[0].affine)
+    with pytest.raises(GeometryError, match="15 mm from their mean"):
+        align([visits[0], far], "L", shared=True)
+    assert len(align([visits[0], far], "L")) == 2
+
+
 def test_labels_without_a_hippocampus_are_refused(visits):
     volume = visits[0]
     empty = type(volume)(

@@ -224,6 +224,26 @@ def test_an_edited_mask_enters_the_mean(data, out, tmp_path):
     assert "misses the sheet's labels" in rows["ses-2"]["message"]
 
 
+def test_a_visit_of_another_shape_fails_alone(data, tmp_path):
+    wrong = tmp_path / "data"
+    shutil.copytree(data, wrong)
+    (path,) = wrong.glob("derivatives/freesurfer/sub-01_ses-3/mri/*.mgz")
+    spec = PhantomSpec(kind="s-shape", thickness=2.4, width=13.0, length=12.0)
+    stranger = Hemisphere(subject="01_ses-3", hemi="L", spec=spec, pose=pose(2))
+    path.unlink()
+    write_dataset(wrong, [stranger], layouts=(SEG,), voxel_size=(0.5, 0.5, 0.5))
+    out = tmp_path / "out"
+    assert run(wrong, out) == ExitCode.SOME_FAILED
+    rows = {row["session"]: row for row in files.read_tsv(out / "status.tsv")}
+    assert [rows[f"ses-{n}"]["decision"] for n in "123"] == ["use", "use", "failed"]
+    assert rows["ses-3"]["reason"] == "visit-unlike"
+    (note,) = [n for n in read_record(place(out, "1"))["notes"] if "do not resemble" in n]
+    assert note.endswith(": 3")
+    pair = tmp_path / "pair"
+    assert run(data, pair, "--session-label", "1", "2") == ExitCode.OK
+    np.testing.assert_array_equal(thickness(out, "1"), thickness(pair, "1"))
+
+
 @pytest.mark.parametrize("way", ["folders", "option"])
 def test_visits_that_share_a_space_are_not_aligned(data, tmp_path, way):
     shutil.copytree(data, tmp_path / "data")

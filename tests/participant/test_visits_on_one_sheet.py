@@ -8,7 +8,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hipsta_bids.errors import GeometryError
-from hipsta_bids.participant.longitudinal import make_frame, measure_visit
+from hipsta_bids.participant.longitudinal import (
+    check_alone,
+    find_common,
+    make_frame,
+    measure_laid,
+    measure_visit,
+)
 from hipsta_bids.participant.measure import measure_hemisphere
 from hipsta_bids.phantom import Phantom, PhantomSpec
 from hipsta_bids.protocols.load import load_protocol
@@ -104,7 +110,7 @@ def test_subfields_and_ends_are_the_same_at_all_visits(measured):
     for visit in maps[1:]:
         assert np.array_equal(visit.subfield, maps[0].subfield)
     for visit, motion in zip(maps, frame.motions, strict=True):
-        assert visit.qc["posterior_end_rule"] == visit.qc["anterior_end_rule"] == "user"
+        assert visit.qc["posterior_end_rule"] == visit.qc["anterior_end_rule"] == "labels"
         points = visit.sheet.points @ np.linalg.inv(motion)[:3, :3].T + np.linalg.inv(motion)[:3, 3]
         # Walls differ, the columns are the same.
         middle = points[:, :, visit.sheet.middle] - frame.evidence.sheet.points[:, :, 4]
@@ -156,6 +162,35 @@ def test_another_body_among_the_visits_is_not_accepted(thinning):
         assert error.reason == "visit-unlike"  # noqa: PT017 -- either is right
     else:
         assert "visits-differ" in {flag.reason for flag in maps.flags}
+
+
+STRANGER = PhantomSpec(kind="s-shape", thickness=2.4, width=13.0, length=14.0)
+
+
+@pytest.mark.parametrize("place", [0, 2])
+def test_a_visit_that_is_refused_does_not_enter_the_mean(thinning, place):
+    visits = list(thinning[:2])
+    visits.insert(place, draw(STRANGER, POSES[1]))
+    frame, laid = find_common(visits, "L", Settings(), clock, shared=False)
+    assert place not in laid
+    assert len(frame.motions) == len(laid) == 2
+    expected, _ = find_common(thinning[:2], "L", Settings(), clock, shared=False)
+    assert np.array_equal(frame.evidence.sheet.points, expected.evidence.sheet.points)
+
+
+def test_visits_that_fit_are_all_on_the_sheet(thinning):
+    frame, laid = find_common(thinning, "L", Settings(), clock, shared=False)
+    maps = measure_laid(frame, frame.motions[1], thinning[1], laid[1], clock)
+    assert np.array_equal(maps.thickness, measure(thinning)[1][1].thickness)
+
+
+def test_labels_that_cannot_be_measured_are_refused_before_the_mean(thinning):
+    volume = thinning[0]
+    mirrored = np.diag([-1.0, 1, 1, 1]) @ volume.affine
+    with pytest.raises(GeometryError) as caught:
+        check_alone(replace(volume, affine=mirrored), "L", Settings())
+    assert caught.value.reason == "left-right-swapped"
+    check_alone(volume, "L", Settings())
 
 
 def test_planes_placed_by_hand_hold_for_all_visits(thinning):
