@@ -1,7 +1,6 @@
 """Flags of visits on a common sheet: false alarms, and one visit that does not fit."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -13,7 +12,7 @@ from scipy.spatial import KDTree
 
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.inputs.search import HemisphereInput, InputRequest, find_hemispheres
-from hipsta_bids.participant.longitudinal import make_frame, measure_visit
+from hipsta_bids.participant.longitudinal import Laid, find_common, measure_laid
 from hipsta_bids.protocols.protocol import Part, Tissue
 from hipsta_bids.settings import Settings
 from hipsta_bids.types import HemisphereMaps, LabelVolume, Sheet
@@ -28,6 +27,7 @@ from validation.visits import (
     draw,
     measure_person,
     noise_table,
+    untimed,
 )
 
 SHIFTS = (0.4, 0.8, 1.2, 2.0)
@@ -111,15 +111,17 @@ def lose_edge(volume: LabelVolume, sheet: Sheet, *, lateral: bool) -> LabelVolum
 def measure(volumes: Sequence[LabelVolume], hemi: str) -> list[HemisphereMaps | str]:
     """Measure visits on a common sheet; a reason replaces the maps of a visit without."""
     try:
-        frame = make_frame(volumes, hemi, Settings(), lambda _: nullcontext(), shared=False)
+        frame, laid = find_common(volumes, hemi, Settings(), untimed, shared=False)
     except GeometryError as error:
         return [error.reason] * len(volumes)
+    motions = dict(zip(laid, frame.motions, strict=True))
     results: list[HemisphereMaps | str] = []
     for number, volume in enumerate(volumes):
-        try:
-            results.append(measure_visit(frame, number, volume, hemi, lambda _: nullcontext()))
-        except GeometryError as error:
-            results.append(error.reason)
+        visit = laid.get(number)
+        if isinstance(visit, Laid):
+            results.append(measure_laid(frame, motions[number], volume, visit, untimed))
+        else:
+            results.append(visit.reason if visit else "visit-unlike")
     return results
 
 

@@ -241,19 +241,19 @@ def measure_frame(
     volumes: Sequence[LabelVolume], hemi: str, settings: Settings, *, shared: bool = False
 ) -> list[HemisphereMaps]:
     """Measure visits on a common sheet."""
-    frame = make_frame(volumes, hemi, settings, _untimed, shared=shared)
+    frame = make_frame(volumes, hemi, settings, untimed, shared=shared)
     return measure_on(frame, volumes, hemi)
 
 
 def measure_on(frame: Frame, volumes: Sequence[LabelVolume], hemi: str) -> list[HemisphereMaps]:
     """Measure visits on a sheet."""
     return [
-        measure_visit(frame, number, volume, hemi, _untimed)
-        for number, volume in enumerate(volumes)
+        measure_visit(frame, number, volume, hemi, untimed) for number, volume in enumerate(volumes)
     ]
 
 
-def _untimed(_stage: str) -> AbstractContextManager[None]:
+def untimed(_stage: str) -> AbstractContextManager[None]:
+    """Time no stage."""
     return nullcontext()
 
 
@@ -267,12 +267,12 @@ def measure_person(person: Person) -> Result:
         separate = [cases.measure_body(volume, hemi, settings) for volume in volumes]
     middle = time.process_time()
     reset_peak_memory()
-    frame = make_frame(volumes, hemi, settings, _untimed, shared=not person.voxels)
+    frame = make_frame(volumes, hemi, settings, untimed, shared=not person.voxels)
     maps = measure_on(frame, volumes, hemi)
     end, memory = time.process_time(), peak_memory()
     true = None
     if person.true:
-        drawn = make_frame([load(person.sources[0])[0]], hemi, settings, _untimed, shared=True)
+        drawn = make_frame([load(person.sources[0])[0]], hemi, settings, untimed, shared=True)
         posed = replace(drawn, motions=tuple(pose @ drawn.motions[0] for pose in poses))
         true = _stacked(measure_on(posed, volumes, hemi))
     smoothed = _smoothed(separate) if separate else None

@@ -76,10 +76,10 @@ def align(volumes: Sequence[LabelVolume], hemi: str, *, shared: bool = False) ->
     marks = marks[:, np.isfinite(marks).all(axis=(0, 2))]
     common = [_frame(marks.mean(axis=0), hemi)] * len(volumes)
     centers = marks[:, :2].mean(axis=1)
-    apart = float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
-    if shared and apart > _REACH:
+    distance = float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
+    if shared and distance > _REACH:
         raise GeometryError(
-            f"the labels of a visit lie {apart:.0f} mm from their mean: the visits share no space; "
+            f"the labels of a visit lie {distance:.0f} mm from their mean: the visits share no space; "
             "use --longitudinal without shared",
             reason="visit-unlike",
         )
