@@ -272,7 +272,7 @@ def test_a_folder_holds_one_kind_of_maps(data, out, capsys):
     options = ["--settings", data / "coarse.toml", "--no-reports"]
     code = main.main(list(map(str, [data, out, "participant", *options])))
     assert code == ExitCode.USAGE
-    assert "sheet.frame" in capsys.readouterr().err
+    assert "made with --longitudinal; add --longitudinal, or" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("option", [("--region", "extended"), ("--uncertainty", "2")])
