@@ -245,9 +245,7 @@ def _run(options: "Namespace", arguments: Sequence[str]) -> ExitCode:
     counts = f"inputs: {account.count_inputs(inputs)}"
     if options.dry_run:
         console.echo(counts)
-        console.echo_table(account.selection_table(items))
-        console.echo_table(account.ignored_table(findings.ignored))
-        console.echo_table(account.other_entries_table(findings.other_entries))
+        _list_inputs(items, findings, settings)
         _check_labels(items, settings)
         return ExitCode.OK
     check_output_is_no_input(options.output_dir, items)
@@ -270,6 +268,19 @@ def _run(options: "Namespace", arguments: Sequence[str]) -> ExitCode:
             result = run_participants(items, out, settings, run_options, progress.report)
     console.echo_result(result, out, has_pages=run_options.reports)
     return result.exit_code
+
+
+def _list_inputs(
+    items: "Sequence[HemisphereInput]", findings: "Findings", settings: "Settings"
+) -> None:
+    """Print tables of the inputs and of all that is not used, and the visits on common sheets."""
+    from hipsta_bids.inputs import account, search  # noqa: PLC0415  (heavy)
+
+    console.echo_table(account.selection_table(items))
+    console.echo_table(account.ignored_table(findings.ignored))
+    console.echo_table(account.other_entries_table(findings.other_entries))
+    for note in search.sheet_notes(items) if settings.sheet.frame != "visit" else ():
+        console.echo(note)
 
 
 def _check_labels(items: "Sequence[HemisphereInput]", settings: "Settings") -> None:

@@ -42,6 +42,13 @@ _APPTAINER_VARIABLES = ("APPTAINER_CONTAINER", "SINGULARITY_CONTAINER")
 CODE_URL_VARIABLE = "HIPSTA_BIDS_CODE_URL"
 _CODE_LABELS = ("source", "repository")
 
+#: Options by values of ``sheet.frame``.
+_FRAME_OPTIONS = {
+    "visit": "--longitudinal",
+    "person": "--longitudinal",
+    "shared": "--longitudinal shared",
+}
+
 
 def check_own_dataset(root: Path) -> None:
     """Refuse to write into a dataset that another program made."""
@@ -105,6 +112,9 @@ def settle_settings(root: Path, settings: Settings) -> str:
             for key in keys
             if recorded.get(key) != current.get(key)
         ]
+        before_frame, frame = (str(cells.get("sheet.frame")) for cells in (recorded, current))
+        if before_frame in _FRAME_OPTIONS and before_frame != frame:
+            raise SettingsError(f"{root}: {_other_frame(before_frame, frame, changes)}")
         if changes or is_same_version or not recorded:
             raise SettingsError(
                 f"{root}: results with other settings ({'; '.join(changes) or 'hash differs'}); "
@@ -113,6 +123,17 @@ def settle_settings(root: Path, settings: Settings) -> str:
     content = {"hash": digest, "version": __version__, "settings": resolved}
     files.write_json(path, content)
     return digest
+
+
+def _other_frame(before: str, current: str, changes: Sequence[str]) -> str:
+    """Return what to do in a folder made with or without --longitudinal; other changes follow."""
+    option = _FRAME_OPTIONS[before]
+    option += " auto" if (before, current) == ("person", "shared") else ""  # as without a choice
+    advice = f"with {option}; {'add' if current == 'visit' else 'use'} {option}"
+    advice = advice if before != "visit" else f"without {option}; omit it"
+    remainder = "; ".join(text for text in changes if not text.startswith("sheet.frame "))
+    also = f" (other settings: {remainder})" if remainder else ""
+    return f"this folder was made {advice}, or choose another output folder{also}"
 
 
 def upgrade_notes(root: Path) -> list[str]:

@@ -3,6 +3,7 @@
 The quality record is written last and removed first, so that it stands for a complete set.
 """
 
+import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
@@ -31,6 +32,7 @@ _MILLIMETER_DIGITS = 4
 
 #: Most words of a message in a table.
 _HEADLINE = 25
+_WORD = re.compile(r"[^\s()]*\((?:[^()]|\([^()]*\))*\)\S*|\S+")
 
 #: Names of surfaces in Workbench, where there is one that fits.
 _SECONDARY = {"interior": None, "midthickness": "MidThickness", "exterior": None}
@@ -314,8 +316,11 @@ def verdict(maps: HemisphereMaps) -> tuple[Decision, str | None, str | None]:
 
 
 def headline(message: str) -> str:
-    """Shorten a message to 25 words at most, at the end of a clause where one is near."""
-    words = message.split()
+    """Shorten a message to 25 words at most, at the end of a clause where one is near.
+
+    Brackets, such as the subfields at a place, are one word.
+    """
+    words = _WORD.findall(" ".join(message.split()))
     if len(words) <= _HEADLINE:
         return " ".join(words)
     head = words[:_HEADLINE]

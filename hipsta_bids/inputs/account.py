@@ -91,8 +91,7 @@ def input_table(
         main, *parts = item.files
         reasons = [(main, status, str(item.problem or item.explanation))]
         reasons += [(path, status, "head, body and tail of the same labels") for path in parts]
-        # An absolute path replaces the folder.
-        reasons += [(main.parent / name, tree.NOT_USED, why) for name, why in item.passed_over]
+        reasons += [(item.path_of(name), tree.NOT_USED, why) for name, why in item.passed_over]
         of_item = [row(path, item, *reason) for path, *reason in reasons]
         of_item[0] = item.origin | of_item[0]
         rows += [cells | {"seg": item.protocol.name} for cells in of_item]
@@ -145,7 +144,7 @@ def unused_of_visit(
     top = root / visit.folders[0].path.relative_to(root).parts[0]
     entry_of = partial(tree.Ignored, subject=visit.subject, session=visit.session, inside=top)
     used_paths = {path for item in items for path in item.files}
-    used_paths |= {item.files[0].parent / name for item in items for name, _ in item.passed_over}
+    used_paths |= {item.path_of(name) for item in items for name, _ in item.passed_over}
     n_other = sum(len(folder.names) for folder in visit.folders) - len(used_paths)
     has_labels = bool(items)
     for folder in visit.folders:

@@ -46,6 +46,7 @@ __all__ = [
     "find_hemispheres",
     "find_inputs",
     "list_subjects",
+    "sheet_notes",
 ]
 
 _LOOKED_FOR = (
@@ -241,6 +242,27 @@ def dataset_notes(
     return tuple(notes)
 
 
+def sheet_notes(items: Iterable[HemisphereInput]) -> list[str]:
+    """Count sheets of several visits and of a single one, and name participants and sessions."""
+    visits: dict[tuple[str, str, str], list[str]] = {}
+    for item in items:
+        if item.problem is None:
+            side = (item.subject, item.hemi, item.protocol.name)
+            visits.setdefault(side, []).append(f"ses-{item.session}" if item.session else "")
+    notes = []
+    for title, is_common in (("several visits", True), ("a single visit", False)):
+        sides = {side: labels for side, labels in visits.items() if (len(labels) > 1) == is_common}
+        sessions: dict[str, dict[str, None]] = {}
+        for (subject, *_), labels in sides.items():
+            sessions.setdefault(subject, {}).update(dict.fromkeys(labels))
+        names = [
+            " ".join((f"sub-{subject}", *labels)).strip() for subject, labels in sessions.items()
+        ]
+        if names:
+            notes.append(f"sheets of {title}: {len(sides)} of {_count(names, 'participant')}")
+    return notes
+
+
 def _search(source: Source, selection: Selection, option: Protocol | None, results: _Found) -> None:
     """Search one dataset for all kinds of segmentations, and add the edited files beside them."""
     all_folders, strays = source.folders()
@@ -350,12 +372,21 @@ def _nothing(
             f"name the dataset with the segmentations: -d NAME=PATH{unused}"
         )
     if restricted:
-        subjects = {folder.subject for source in sources for folder in source.folders()[0]}
-        named = (label.removeprefix("sub-") for label in request.participant_labels)
-        hint = did_you_mean((label for label in named if label not in subjects), subjects)
+        folders = [folder for source in sources for folder in source.folders()[0]]
+        subjects = {folder.subject for folder in folders}
+        unmatched = {label.removeprefix("sub-") for label in request.participant_labels} - subjects
+        hint, contents = (
+            did_you_mean(sorted(unmatched), subjects),
+            _count(sorted(subjects), "subject"),
+        )
+        if request.session_labels:
+            sessions = {visit.session for visit in tree.list_visits(folders) if visit.session}
+            absent = {label.removeprefix("ses-") for label in request.session_labels} - sessions
+            hint = hint or did_you_mean(sorted(absent), sessions)
+            contents += f" and {_count(sorted(sessions), 'session')}"
         return NothingToDoError(
             f"no hippocampal segmentation matches {' '.join(restricted)} in {searched} (which hold"
-            f" {_count(sorted(subjects), 'subject')}; looked for {_LOOKED_FOR}){hint}{unused}"
+            f" {contents}; looked for {_LOOKED_FOR}){hint}{unused}"
         )
     return NothingToDoError(
         f"no hippocampal segmentation in {searched} (looked for {_LOOKED_FOR}); "

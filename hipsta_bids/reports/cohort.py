@@ -23,10 +23,12 @@ from hipsta_bids.derivatives.names import (
 from hipsta_bids.errors import InputError
 from hipsta_bids.geometry.catalog import SUMMARY
 from hipsta_bids.io import files
+from hipsta_bids.protocols.toml import flatten, resolve
 from hipsta_bids.reports.maps import make_sprites, read_maps
 from hipsta_bids.reports.page import number, render
 from hipsta_bids.reports.results import SURFACES, Hemisphere, Views, find_results, input_path
 from hipsta_bids.reports.verdict import RATINGS, Verdict, verdict_of
+from hipsta_bids.settings import PUBLISHED, Settings
 from hipsta_bids.types import Decision, Float
 
 #: Least number of hemispheres whose range is shown.
@@ -424,7 +426,24 @@ def _from(root: Path, path: Path) -> str:
     return Path(os.path.relpath(path, root)).as_posix()
 
 
-def correction_of(hemispheres: Sequence[Hemisphere]) -> Mapping[str, Any]:
+def settings_options(settings: Mapping[str, Any]) -> list[str]:
+    """Return the options that a later run in a folder with these resolved settings needs."""
+    recorded = flatten(settings)
+    frames = {"person": ["--longitudinal"], "shared": ["--longitudinal", "shared"]}
+    options = frames.get(str(recorded.pop("sheet.frame", None)), [])
+    recorded.pop("body.region", None)  # one folder may hold several
+    default = flatten(resolve(Settings()))
+    changed = {
+        key: value for key, value in recorded.items() if key in default and value != default[key]
+    }
+    if changed == flatten(PUBLISHED):
+        return [*options, "--method", "published"]
+    return [*options, "--settings", "FILE"] if changed else options
+
+
+def correction_of(
+    hemispheres: Sequence[Hemisphere], settings: Mapping[str, Any]
+) -> Mapping[str, Any]:
     """Name the files to correct, their folder, and the command that measures them again."""
     first = hemispheres[0].result.name
     choices = []
@@ -446,5 +465,11 @@ def correction_of(hemispheres: Sequence[Hemisphere]) -> Mapping[str, Any]:
     command = ["hipsta-bids", "BIDS_DIR", "OUT_DIR", "participant", "--edited-dir", "EDITS"]
     command += ["--participant-label", first.subject]
     command += ["--region", first.region] if first.region != "body" else []
-    folder = f"EDITS/{first.folder}"
-    return {"choices": choices, "folder": folder, "command": shlex.join(command)}
+    command += settings_options(settings)
+    return {
+        "choices": choices,
+        "folder": f"EDITS/{first.folder}",
+        "command": shlex.join(command),
+        "has_file": "FILE" in command,
+        "has_common_sheets": "--longitudinal" in command,
+    }

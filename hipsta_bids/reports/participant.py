@@ -448,7 +448,7 @@ def _cohort_profiles(series: Series, column: str) -> dict[str, Float]:
 def _correct(series: Series) -> Mapping[str, Any] | None:
     """How to correct what was measured; nothing if all is well."""
     doubtful = [h for h in series.hemispheres if h.decision != Decision.USE]
-    return correction_of(doubtful) if doubtful else None
+    return correction_of(doubtful, series.cohort.settings) if doubtful else None
 
 
 def _origin(series: Series) -> Mapping[str, Any]:

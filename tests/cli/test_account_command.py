@@ -251,3 +251,62 @@ def test_a_part_notes_its_own_participants_without_labels(tmp_path, capsys):
         notes.append([line for line in lines if "no segmentation" in line])
     numbers = ("2 participants (03, 04)", "1 participant (03)", "1 participant (04)")
     assert notes == [[f"note: no segmentation found for {text}"] for text in numbers]
+
+
+def put_visits(root, *names, sides="lr"):
+    for name in names:
+        for side in sides:
+            path = (
+                root / "derivatives/freesurfer" / name / f"mri/{side}h.hippoAmygLabels-T1.v22.mgz"
+            )
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(f"use {name} {side}")
+
+
+def test_sessions_of_the_dataset_are_named_where_none_matches(tmp_path, capsys):
+    put_visits(tmp_path / "bids", "sub-01_ses-m00", "sub-01_ses-m12", "sub-02_ses-m12")
+    command = (tmp_path / "bids", tmp_path / "out", "participant", "--session-label")
+    text = said_of(capsys, *command, "M12", code=ExitCode.NOTHING_TO_DO)
+    assert "--session-label M12" in text
+    assert "2 subjects (01, 02) and 2 sessions (m00, m12); looked for" in text
+    assert "; did you mean m12?" in text
+    text = said_of(capsys, *command, "baseline", code=ExitCode.NOTHING_TO_DO)
+    assert "2 sessions (m00, m12)" in text
+    assert "did you mean" not in text
+
+
+def test_a_dry_run_counts_common_sheets(tmp_path, capsys):
+    put_visits(tmp_path / "bids", "sub-01_ses-1", "sub-01_ses-2", "sub-02_ses-1", "sub-02_ses-3")
+    put_visits(tmp_path / "bids", "sub-01_ses-3", sides="r")
+    command = (tmp_path / "bids", tmp_path / "out", "participant", "--dry-run")
+    text = said_of(capsys, *command, "--longitudinal")
+    several = "sheets of several visits: 4 of 2 participants"
+    assert f"{several} (sub-01 ses-1 ses-2 ses-3, sub-02 ses-1 ses-3)\n" in text
+    assert "a single visit" not in text
+    put_visits(tmp_path / "bids", *(f"sub-1{n}_ses-1" for n in range(7)))
+    put_visits(tmp_path / "bids", "sub-03_ses-1")
+    put_visits(tmp_path / "bids", "sub-03_ses-2", sides="l")
+    text = said_of(capsys, *command, "--longitudinal")
+    assert "sheets of several visits: 5 of 3 participants (sub-01" in text
+    assert "sheets of a single visit: 15 of 8 participants (sub-03 ses-1, sub-10 ses-1" in text
+    assert "sub-14 ses-1, ...)\n" in text
+    assert "sheets of" not in said_of(capsys, *command)
+
+
+@pytest.mark.parametrize("is_relative", [False, True])
+def test_files_passed_over_in_another_folder_have_one_row(
+    tmp_path, capsys, monkeypatch, is_relative
+):
+    put_visits(tmp_path / "bids", "sub-01_ses-1", "sub-01_ses-1.long.sub-01")
+    monkeypatch.chdir(tmp_path)
+    bids_dir = "bids" if is_relative else tmp_path / "bids"
+    command = (bids_dir, tmp_path / "out", "participant", "--no-reports")
+    text = said_of(capsys, *command, "--dry-run")
+    assert "inputs: 2 used, 0 failed, 2 not used, 0 not a segmentation" in text
+    assert text.count("sub-01_ses-1.long.sub-01/mri/lh.") == 1
+    assert "no _dseg.tsv" not in text
+    said_of(capsys, *command)
+    rows = table(tmp_path)
+    folder = "derivatives/freesurfer/sub-01_ses-1.long.sub-01/mri"
+    passed = [row for row in rows.values() if row["status"] == "not used"]
+    assert [row["path"].rpartition("/")[0] for row in passed] == 2 * [folder]

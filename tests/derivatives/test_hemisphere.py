@@ -23,7 +23,7 @@ from hipsta_bids.derivatives.results import SHEET_COLUMNS, ResultPlace, read_she
 from hipsta_bids.errors import GeometryError, InputError
 from hipsta_bids.geometry.catalog import DIERS, MAPS, SECTIONS, SUMMARY
 from hipsta_bids.io.gifti import COORDINATE_NAMES
-from hipsta_bids.types import Flag
+from hipsta_bids.types import Flag, position_text
 
 HOLE = (2, 1)
 ROW = HOLE[0] * NY + HOLE[1]
@@ -344,6 +344,9 @@ def test_the_flag_with_the_largest_consequence_decides():
     assert [f.message for f in make_maps(flags=flags).flags] == ["three", "two", "four", "one"]
 
 
+PLACE = "(PRESUBICULUM, SUBICULUM, CA1)"
+
+
 @pytest.mark.parametrize(
     ("message", "short"),
     [
@@ -352,10 +355,24 @@ def test_the_flag_with_the_largest_consequence_decides():
         (" ".join(26 * ["a"]), " ".join(25 * ["a"]) + "..."),
         (f"{' '.join(20 * ['a'])}: {' '.join(20 * ['b'])}", " ".join(20 * ["a"])),
         (f"a: {' '.join(30 * ['b'])}", f"a: {' '.join(24 * ['b'])}..."),
+        (f"{' '.join(23 * ['a'])} {PLACE}; correct", f"{' '.join(23 * ['a'])} {PLACE}; correct"),
+        (f"{' '.join(25 * ['a'])} {PLACE}; correct", f"{' '.join(25 * ['a'])}..."),
+        (
+            f"{' '.join(20 * ['a'])} (b, {PLACE}). {' '.join(9 * ['c'])}",
+            f"{' '.join(20 * ['a'])} (b, {PLACE})",
+        ),
     ],
 )
 def test_headlines_have_25_words_at_most(message, short):
     assert headline(message) == short
+
+
+def test_headlines_keep_the_subfields_of_a_place_and_the_remedy():
+    place = position_text((-20.8, -19.0, -16.8), "PRESUBICULUM, SUBICULUM, CA1, CA3")
+    problem = "holes or bridges of the labels cannot be repaired (Euler number -3, closed 1)"
+    message = f"{problem}, near {place}; correct them there"
+    assert len(message.split()) > 25
+    assert headline(message) == message
 
 
 def test_the_record_says_what_a_flag_means_for_the_map(tmp_path):

@@ -199,7 +199,7 @@ def test_labels_restrict_the_search(tmp_path, options, expected):
     ("options", "message"),
     [
         ({"participant_labels": ("99",)}, r"--participant-label 99 .* 2 subjects \(01, 02\)"),
-        ({"session_labels": ("b",)}, "--session-label b"),
+        ({"session_labels": ("b",)}, r"--session-label b .* 2 subjects .* and 0 sessions; looked"),
     ],
 )
 def test_labels_that_match_nothing(tmp_path, options, message):

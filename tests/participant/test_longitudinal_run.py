@@ -16,7 +16,7 @@ from hipsta_bids.derivatives.results import ResultPlace, list_results, read_reco
 from hipsta_bids.errors import ExitCode
 from hipsta_bids.io import files
 from hipsta_bids.phantom import Hemisphere, PhantomSpec, write_dataset
-from hipsta_bids.reports.cohort import read_cohort
+from hipsta_bids.reports.cohort import correction_of, read_cohort
 from hipsta_bids.reports.participant import participant_page
 
 SEG = "freesurfer"
@@ -292,7 +292,16 @@ def test_a_folder_holds_one_kind_of_maps(data, out, capsys):
     options = ["--settings", data / "coarse.toml", "--no-reports"]
     code = main.main(list(map(str, [data, out, "participant", *options])))
     assert code == ExitCode.USAGE
-    assert "sheet.frame" in capsys.readouterr().err
+    assert "made with --longitudinal; add --longitudinal, or" in capsys.readouterr().err
+
+
+def test_the_command_for_corrections_is_accepted_by_its_folder(data, out, tmp_path):
+    cohort = read_cohort(out)
+    command = correction_of(cohort.hemispheres, cohort.settings)["command"]
+    words = {"BIDS_DIR": data, "OUT_DIR": out, "EDITS": tmp_path, "FILE": data / "coarse.toml"}
+    arguments = [str(words.get(word, word)) for word in command.split()[1:]]
+    assert main.main([*arguments, "--no-reports", "--n-procs", "1"]) == ExitCode.OK
+    assert words.keys() <= set(command.split())
 
 
 @pytest.mark.parametrize("option", [("--region", "extended"), ("--uncertainty", "2")])

@@ -345,7 +345,7 @@ def test_page_names_the_parts_and_what_has_no_value(out: Path) -> None:
     assert scene["ends"] == [10, 30]
     for part in ("tail", "body", "head"):
         assert f"{part}, " in "".join(re.findall("<figcaption>(.*?)</figcaption>", page))
-    command = correction_of(cohort.hemispheres)["command"]
+    command = correction_of(cohort.hemispheres, cohort.settings)["command"]
     assert "participant --edited-dir EDITS --participant-label 01 --region whole" in command
     assert "nan mm" not in page
     assert '"title": "Region"' in (cohort_page(cohort) or "")

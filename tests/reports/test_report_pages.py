@@ -19,6 +19,7 @@ from hipsta_bids.reports.cells import FILTERS
 from hipsta_bids.reports.cohort import cohort_page, read_cohort
 from hipsta_bids.reports.page import Section
 from hipsta_bids.reports.participant import participant_page
+from hipsta_bids.settings import PUBLISHED
 
 EVIL = "<script>document.title='owned'</script>\"'&"
 
@@ -153,6 +154,40 @@ def spoil(path, change):
     record = json.loads(path.read_text())
     change(record)
     path.write_text(json.dumps(record))
+
+
+PUBLISHED_METHOD = {group: dict(values) for group, values in PUBLISHED.items()}
+
+
+@pytest.mark.parametrize(
+    ("changes", "options"),
+    [
+        ({}, ""),
+        ({"sheet": {"frame": "person"}}, " --longitudinal"),
+        (
+            {"sheet": {"frame": "shared"}, "grid": {"spacing": 0.5}},
+            " --longitudinal shared --settings FILE",
+        ),
+        ({"grid": {"spacing": 0.5}}, " --settings FILE"),
+        (PUBLISHED_METHOD, " --method published"),
+        ({"body": {"region": "whole"}}, ""),
+        ({"checks": {"of_another_version": 1}}, ""),
+    ],
+)
+def test_a_correction_has_the_options_of_its_folder(copy, changes, options):
+    def change(record):
+        for group, values in changes.items():
+            record["settings"][group] |= values
+
+    spoil(copy / DATASET_FILES["settings"], change)
+    assert main.main(["-", str(copy), "participant", "--reports-only"]) == 0
+    text = (copy / "sub-02.html").read_text()
+    command = "hipsta-bids BIDS_DIR OUT_DIR participant --edited-dir EDITS --participant-label 02"
+    assert f"<code>{command}{options}</code>" in text
+    assert ("FILE is the settings file" in text) == ("FILE" in options)
+    shared = "--longitudinal" in options
+    assert ("All visits of the side are measured again" in text) == shared
+    assert ("Only what changed is measured again" in text) != shared
 
 
 def test_tags_in_any_text_of_the_results_stay_text(copy):
