@@ -324,6 +324,12 @@ def name_of_record(file_name: str) -> HemisphereName | None:
     return HemisphereName(**parts | {"region": parts["region"] or "body"})
 
 
+def natural_order(label: str) -> tuple[tuple[str | int, ...], str]:
+    """Return a key that sorts labels with numbers by value: ``2`` before ``10``."""
+    parts = re.split(r"([0-9]+)", label)  # text and numbers alternate
+    return tuple(int(part) if i % 2 else part for i, part in enumerate(parts)), label
+
+
 def participant_report(subject: str, session: str | None) -> str:
     """File name of the page about one visit, in the root of the output dataset."""
     return f"sub-{subject}{f'_ses-{session}' if session else ''}.html"

@@ -21,7 +21,7 @@ from hipsta_bids.io import files
 from hipsta_bids.io.files import checked_foreign
 from hipsta_bids.protocols.toml import settings_hash
 from hipsta_bids.settings import Settings, SheetSettings
-from hipsta_bids.types import PARTICIPANT, SESSION, Decision
+from hipsta_bids.types import PARTICIPANT, SESSION, Decision, VisitKey
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,6 +73,11 @@ class SheetRecord:
     """Where its labels come from, in the order of ``PROVENANCE``."""
     doubtful: bool = False
     """Whether the participant level asks to look before use, and nobody has rated it for use."""
+
+    @property
+    def visit(self) -> VisitKey:
+        """Return subject and session."""
+        return self.result.name.subject, self.result.name.session
 
 
 @dataclass(frozen=True)

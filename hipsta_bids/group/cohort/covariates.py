@@ -3,6 +3,7 @@
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import cache
 from pathlib import Path, PurePosixPath
@@ -12,6 +13,7 @@ import numpy as np
 import pandas as pd
 
 from hipsta_bids.derivatives.dataset import linked_path, read_links
+from hipsta_bids.derivatives.names import natural_order
 from hipsta_bids.errors import InputError, MissingFileError, ModelError
 from hipsta_bids.group.design.formula import as_factor, check_numbers, level_name, listed, typed
 from hipsta_bids.group.design.model import FIRST_AGE, Comparison, VisitTime
@@ -319,6 +321,26 @@ def _number(text: str) -> float | None:
     return value if value > 0 else None
 
 
+def order_sessions(table: pd.DataFrame, settings: GroupSettings) -> list[str]:
+    """List the sessions of a cohort by their median time; in natural order if some have none.
+
+    Medians are of participants with several sessions, since a single one is always at time 0.
+    """
+    sessions = sorted(table[SESSION].dropna().unique(), key=natural_order)
+    time = None
+    with suppress(ModelError):  # a model with this time reports it
+        time = add_time(table, settings)
+    if time is None or time.column is None:
+        return sessions
+    values = typed(time.table[time.column]).astype(np.float64)
+    is_repeated = table[PARTICIPANT].duplicated(keep=False)
+    single = values.groupby(table[SESSION]).median()
+    medians = values[is_repeated].groupby(table[SESSION]).median().combine_first(single)
+    if medians.reindex(sessions).isna().any():
+        return sessions
+    return sorted(sessions, key=lambda name: float(medians[name]))
+
+
 def add_time(
     table: pd.DataFrame, settings: GroupSettings, comparison: Comparison | None = None
 ) -> VisitTime:
@@ -356,17 +378,18 @@ def add_time(
         columns[column] = own
     time = VisitTime(table.assign(**columns), column, covariates)
     if comparison and (comparison.endpoint or settings.longitudinal.random == "visits"):
-        return _with_visits(time, comparison)
+        return _with_visits(time, settings, comparison)
     return time
 
 
-def _with_visits(time: VisitTime, comparison: Comparison) -> VisitTime:
+def _with_visits(time: VisitTime, settings: GroupSettings, comparison: Comparison) -> VisitTime:
     """Make a factor of the sessions, in the column ``visit``; a single one is none."""
     labels = (
         time.table[SESSION].astype(object).map(lambda name: str(name or "").removeprefix("ses-"))
     )
-    order = [name.removeprefix("ses-") for name in comparison.endpoint[1:]] or sorted(set(labels))
-    if "" in order or len(order) < 2:  # noqa: PLR2004 -- visits to compare
+    named = comparison.endpoint[1:] or order_sessions(time.table, settings)
+    order = [name.removeprefix("ses-") for name in named]
+    if "" in set(labels) or len(order) < 2:  # noqa: PLR2004 -- visits to compare
         raise ModelError("visits as categories need two sessions, with labels (ses-LABEL)")
     table = time.table.assign(**{VISIT: pd.Categorical(labels, categories=order)})
     after = tuple(order[1:] if comparison.adjusted else order)

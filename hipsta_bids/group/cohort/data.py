@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from hipsta_bids.derivatives.names import natural_order
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.design.formula import listed
 from hipsta_bids.group.design.model import BOTH, Comparison, asymmetry_name
@@ -87,7 +88,7 @@ def choose_visits(cohort: Cohort, comparison: Comparison) -> tuple[Cohort, Mappi
     """Keep the visits that are compared."""
     table = cohort.table
     named = comparison.pair or comparison.endpoint[1:]
-    sessions = sorted(table[SESSION].dropna().unique())
+    sessions = sorted(table[SESSION].dropna().unique(), key=natural_order)
     if unknown := sorted(set(named) - set(sessions)):
         option = "--paired" if comparison.pair else "--endpoint"
         if not sessions:

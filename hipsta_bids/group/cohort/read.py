@@ -145,15 +145,8 @@ def read_sheets(
             if region in EXPERIMENTAL:
                 for values in sides[hemi].maps.values():
                     leave_rare(values)
-    table = pd.DataFrame(
-        {
-            PARTICIPANT: [f"sub-{subject}" for subject, _ in visits],
-            SESSION: pd.array([s and f"ses-{s}" for _, s in visits], dtype=object),
-        },
-        index=[visit_name(*visit) for visit in visits],
-    )
     return Measured(
-        table=table,
+        table=table_of(visits),
         sides=sides,
         x=x,
         y=y,
@@ -192,6 +185,17 @@ def _damage(side: SideMaps, i: int, doubtful: Mapping[str, Float], max_gap: floa
 def visits_of(records: Sequence[SheetRecord]) -> list[VisitKey]:
     """List subjects and sessions that have sheets, each once."""
     return list(dict.fromkeys((r.result.name.subject, r.result.name.session) for r in records))
+
+
+def table_of(visits: Sequence[VisitKey]) -> pd.DataFrame:
+    """Return a row of participant and session per visit; the index names the visits."""
+    return pd.DataFrame(
+        {
+            PARTICIPANT: [f"sub-{subject}" for subject, _ in visits],
+            SESSION: pd.array([s and f"ses-{s}" for _, s in visits], dtype=object),
+        },
+        index=[visit_name(*visit) for visit in visits],
+    )
 
 
 def node_coordinates(grid: SheetSettings, region: str) -> tuple[Float, Float]:

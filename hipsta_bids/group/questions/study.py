@@ -18,6 +18,7 @@ from hipsta_bids.group.cohort.covariates import add_icv, add_time, read_covariat
 from hipsta_bids.group.cohort.crop import Places, crop_maps
 from hipsta_bids.group.cohort.data import SHEET, Cohort, Measures, choose_visits
 from hipsta_bids.group.cohort.masks import mask_sheets
+from hipsta_bids.group.cohort.order import read_in_order
 from hipsta_bids.group.design import model as designs
 from hipsta_bids.group.design.formula import ascii_letters, check_names, listed, with_factors
 from hipsta_bids.group.design.settings import GroupSettings
@@ -306,6 +307,9 @@ def read_study(
         read.visits_of(collection.records),
         collect.wanted_by(options.sheets),
     )
+    collection, visits, (covariates, absent, spelled) = read_in_order(
+        collection, visits, options.bids_dir, options.covariates, settings
+    )
     names = {one.name for one in requests}
     sheets = read.read_sheets(
         collection.records,
@@ -330,9 +334,6 @@ def read_study(
         records = collection.records
         measured, masked, mask_notes = mask_sheets(measured, records, options.sheets.masks)
     read.check_summaries(measures, measured.sides)
-    covariates, absent, spelled = read_covariates(
-        measured.table, options.bids_dir, options.covariates, settings
-    )
     lacking = (
         f"participants.tsv: has no row of {listed(sorted(absent))}; add it, or check its label"
     )

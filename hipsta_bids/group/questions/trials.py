@@ -14,6 +14,7 @@ from hipsta_bids import __version__
 from hipsta_bids.derivatives import dataset
 from hipsta_bids.derivatives.names import TRIAL_MAPS, TRIAL_TABLES
 from hipsta_bids.errors import ModelError
+from hipsta_bids.group.cohort.covariates import order_sessions
 from hipsta_bids.group.cohort.data import SHEET, SUMMARY, Cohort, Layer, layers, participants_with
 from hipsta_bids.group.design import model as designs
 from hipsta_bids.group.design.formula import listed, model_from_shortcut, parse_model
@@ -82,15 +83,14 @@ class Retested:
         """Take variances of one visit of a trial, or of several."""
         self._has_visits, self._settings = has_visits, settings.retest
         table = cohort.table
-        counts = table[SESSION].fillna("").value_counts().sort_index()
-        self.sessions = tuple(str(name) for name in counts.index if name)
+        counts = table[SESSION].fillna("").value_counts()
+        self.sessions = tuple(order_sessions(table, settings))
         session_counts = table[PARTICIPANT].map(table.groupby(PARTICIPANT)[SESSION].nunique())
         self.complete: Bool = (session_counts == len(self.sessions)).to_numpy()
         self._table = table[self.complete]
         self.participants = sorted(self._table[PARTICIPANT].unique())
-        sessions_text = listed(
-            [f"{name or 'without a name'} ({count})" for name, count in counts.items()]
-        )
+        names = [*[""] * ("" in counts.index), *self.sessions]
+        sessions_text = listed([f"{one or 'without a name'} ({counts[one]})" for one in names])
         if len(self.sessions) < 2:  # noqa: PLR2004 -- two sessions
             raise ModelError(
                 f"--retest: there is no second session, only {sessions_text}; measure repeated"
@@ -111,7 +111,7 @@ class Retested:
         visits = self._table.iloc[rows]
         filled = np.full((len(self.participants), len(self.sessions), values.shape[1]), np.nan)
         participant = np.searchsorted(self.participants, visits[PARTICIPANT].astype(str))
-        session = np.searchsorted(self.sessions, visits[SESSION].astype(str))
+        session = pd.Index(self.sessions).get_indexer(pd.Index(visits[SESSION]))
         filled[participant, session] = values
         return filled
 
