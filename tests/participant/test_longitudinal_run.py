@@ -176,6 +176,9 @@ def test_one_visit_more_makes_all_be_measured_again(data, tmp_path, capsys):
     capsys.readouterr()
     assert run(data, out, "--session-label", "1", "2", "-v") == ExitCode.OK
     assert "2 unchanged, skipped" in capsys.readouterr().out
+    assert run(data, out, "--session-label", "3") == ExitCode.OK
+    assert main.main([str(data), str(out), "group"]) == ExitCode.BAD_DATA
+    assert "sessions are on different sheets (1, 2; 3)" in capsys.readouterr().err
     assert run(data, out) == ExitCode.OK
     printed = capsys.readouterr().out
     assert "measured again on a sheet of the sessions 1, 2, 3 (before: 1, 2)" in printed

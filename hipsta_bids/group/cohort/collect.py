@@ -11,7 +11,7 @@ import pandas as pd
 
 from hipsta_bids.derivatives import dataset
 from hipsta_bids.derivatives.dataset import NOT_FINISHED, name_of, provenance_of, read_status
-from hipsta_bids.derivatives.names import DATASET_FILES, HemisphereName
+from hipsta_bids.derivatives.names import DATASET_FILES, HemisphereName, natural_order
 from hipsta_bids.derivatives.results import ResultPlace, list_results, read_record
 from hipsta_bids.errors import InputError, MissingFileError, NothingToDoError
 from hipsta_bids.group.cohort.covariates import relocate
@@ -71,6 +71,8 @@ class SheetRecord:
     """Address of the segmentation."""
     provenance: tuple[str, ...]
     """Where its labels come from, in the order of ``PROVENANCE``."""
+    sheet: tuple[str, ...] = ()
+    """Sessions that share its sheet; none if it has its own."""
     doubtful: bool = False
     """Whether the participant level asks to look before use, and nobody has rated it for use."""
 
@@ -164,6 +166,7 @@ def collect_sheets(request: GroupRequest, *, may_lack: bool = False) -> Collecti
             f"{request.roots[0]}: no hemisphere is left for the group level ({reasons})"
         )
     digest, grid = _one_settings(records), grid_of(records[0].result.root)
+    _refuse_several_sheets(records)
     return Collection(
         records=tuple(records),
         exclusions=tuple(left_out),
@@ -336,6 +339,7 @@ def _judge(
             version=intern(str(record.get("version"))),
             source=relocate(str(inputs[0].get("file", "")), request.segmentations),
             provenance=tuple(intern(text) for text in provenance_of(record).values()),
+            sheet=tuple(dict.fromkeys(str(v.get("session")) for v in record.get("visits") or ())),
             doubtful=decision == Decision.LOOK and not choices.approves(*rated),
         )
     return Exclusion.of_sheet(result.name, reason, message)
@@ -381,6 +385,23 @@ def _one_settings(records: Sequence[SheetRecord]) -> str:
             " with the same"
         )
     return next(iter(counts))
+
+
+def _refuse_several_sheets(records: Iterable[SheetRecord]) -> None:
+    """Refuse participants whose sessions were measured on sheets of different sessions."""
+    sheets: dict[tuple[str, str], dict[tuple[str, ...], None]] = {}
+    for record in records:
+        side = record.result.name.subject, record.result.name.hemi
+        sheets.setdefault(side, {})[tuple(sorted(record.sheet, key=natural_order))] = None
+    mixed = {side: sessions for side, sessions in sheets.items() if len(sessions) > 1}
+    for (subject, hemi), sessions in mixed.items():
+        names = "; ".join(", ".join(sheet) for sheet in sessions)
+        further = f", and {len(mixed) - 1} more" if len(mixed) > 1 else ""
+        raise InputError(
+            f"sub-{subject} hemi-{hemi}{further}: sessions are on different sheets ({names}); run"
+            " participant --longitudinal without --session-label, and delete results of removed"
+            " sessions"
+        )
 
 
 def _shared_sheets(grid: SheetSettings) -> tuple[str, ...]:

@@ -5,8 +5,15 @@ import json
 import numpy as np
 import pandas as pd
 import pytest
+from small_cohorts import begin_dataset, place_of, write_hemisphere
 
-from hipsta_bids.group.cohort.collect import _shared_sheets, grid_of
+from hipsta_bids.errors import InputError
+from hipsta_bids.group.cohort.collect import (
+    GroupRequest,
+    _shared_sheets,
+    collect_sheets,
+    grid_of,
+)
 from hipsta_bids.group.cohort.data import Cohort
 from hipsta_bids.group.design.settings import GroupSettings
 from hipsta_bids.group.questions.analysis import register_side
@@ -87,3 +94,50 @@ def test_datasets_of_earlier_versions_have_separate_sheets(tmp_path):
     del grid["frame"]
     (tmp_path / "desc-settings.json").write_text(json.dumps({"settings": {"sheet": grid}}))
     assert _shared_sheets(grid_of(tmp_path)) == ()
+
+
+def write_on_sheets(folder, sheets, subject="02"):
+    """Write a hemisphere per session, with the sessions of its common sheet."""
+    for session, sessions in sheets.items():
+        visits = [
+            {"session": name, "file": f"bids:fs:{name}/{part}", "sha256": "0"}
+            for name in sessions
+            for part in ("labels.mgz", "mask.mgz")
+        ]
+        maps = np.ones((2, 3)), np.ones((2, 3))
+        write_hemisphere(place_of(folder, subject, "L", session=session), *maps, visits=visits)
+
+
+EARLIER = ("base", "m12")
+
+
+@pytest.mark.parametrize(
+    ("sheets", "words"),
+    [
+        ({"base": EARLIER, "m12": EARLIER, "m24": ("m24",)}, "base, m12; m24"),
+        # The result of a session is left over after its labels were removed.
+        ({"base": ("base",), "m12": EARLIER}, "base; base, m12"),
+    ],
+)
+def test_sessions_on_different_sheets_are_refused(tmp_path, sheets, words):
+    _, out = begin_dataset(tmp_path)
+    write_on_sheets(out, {"base": EARLIER, "m12": EARLIER}, "01")
+    write_on_sheets(out, sheets)
+    with pytest.raises(InputError) as refusal:
+        collect_sheets(GroupRequest(roots=(out,)))
+    text = f"sub-02 hemi-L: sessions are on different sheets ({words}); run participant"
+    assert str(refusal.value).startswith(text)
+    # Those on one sheet can be analyzed.
+    found = collect_sheets(GroupRequest(roots=(out,), sessions=("base",)))
+    assert [record.result.name.subject for record in found.records] == ["01", "02"]
+
+
+def test_participants_may_differ_in_their_sessions(tmp_path):
+    _, out = begin_dataset(tmp_path)
+    write_on_sheets(out, {"base": EARLIER, "m12": EARLIER[::-1]}, "01")
+    write_on_sheets(out, {"base": ("base", "m24"), "m24": ("base", "m24")})
+    assert len(collect_sheets(GroupRequest(roots=(out,))).records) == 4
+    write_on_sheets(out, {"base": ("base",)}, "01")
+    write_on_sheets(out, {"base": ("base",)})
+    with pytest.raises(InputError, match="sub-01 hemi-L, and 1 more: sessions"):
+        collect_sheets(GroupRequest(roots=(out,)))
