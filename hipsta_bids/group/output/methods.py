@@ -34,6 +34,10 @@ _FAMILIES = {
     "all": "the points of all maps of a contrast",
 }
 _SIDES = {"L": "left", "R": "right"}
+#: Of sheets that visits share.
+COMMON_SHEETS = (
+    " All visits of a participant were measured on one sheet. It was laid out from the mean labels."
+)
 #: Procedures that hold false discovery rates.
 PROCEDURES: Mapping[str, str] = {
     "bh": "the procedure of Benjamini and Hochberg",
@@ -132,7 +136,8 @@ def _sample(
     ]
     text += f", with {joined(sheets)} sheets" if sheets else ""
     excluded = "1 hemisphere or visit was" if n_out == 1 else f"{n_out} hemispheres or visits were"
-    return f"{text}. In addition, {excluded} excluded." if n_out else f"{text}."
+    text += f". In addition, {excluded} excluded." if n_out else "."
+    return text + COMMON_SHEETS * (cohort.shared and has_sheets)
 
 
 def _registration(

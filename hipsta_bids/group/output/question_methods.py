@@ -7,7 +7,7 @@ import pandas as pd
 from hipsta_bids import __version__
 from hipsta_bids.group.design import settings as group_settings
 from hipsta_bids.group.output.citations import Citations, escaped
-from hipsta_bids.group.output.methods import PROCEDURES
+from hipsta_bids.group.output.methods import COMMON_SHEETS, PROCEDURES
 from hipsta_bids.group.output.saved import NormsFile
 from hipsta_bids.group.stats.norms import CENTILE_FOLDS, LEVELS, SHAPE_LEVEL
 from hipsta_bids.group.stats.trials import THINNING, TrialEffect, point_level
@@ -23,6 +23,7 @@ def norms_text(
     coverage: pd.DataFrame | None,
     new: Sequence[str],
     controls: tuple[str, str] | None,
+    shared: bool = False,
 ) -> str:
     """Return how norms were estimated, or how participants were scored by them.
 
@@ -39,6 +40,7 @@ def norms_text(
             f" {len(file.sites) - len(new)} sites (hipsta_bids {__version__}; norms made by"
             f" {file.version})."
         )
+    first += COMMON_SHEETS * shared
     if file.template is not None:
         template = "each other" if coverage is not None else "the template of the norms"
         first += f" Sheets were registered to {template} by curvature profiles {cite('registr')}."

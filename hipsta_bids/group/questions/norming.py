@@ -200,6 +200,7 @@ def _write(study: studies.Study, scoring: _Made, notes: Iterable[str]) -> studie
         coverage=scoring.tables.get("coverage"),
         new=list(file.sites)[scoring.known :],
         controls=scoring.controls,
+        shared=study.cohort.shared,
     )
 
     def fill(folder: Path) -> list[str]:

@@ -23,6 +23,7 @@ from hipsta_bids.group.output import write
 from hipsta_bids.group.output.citations import Citations, code, escaped
 from hipsta_bids.group.output.columns import frame_of
 from hipsta_bids.group.output.ground import grounds_of
+from hipsta_bids.group.output.methods import COMMON_SHEETS
 from hipsta_bids.group.output.panels import draw_pages
 from hipsta_bids.group.output.question_methods import power_text, retest_text
 from hipsta_bids.group.output.style import Drawing
@@ -436,9 +437,12 @@ def _methods(
         f"{subject} of {visits[PARTICIPANT].nunique()} participants{among} with"
         f" {len(visits)} visits were analyzed with hipsta_bids {__version__}."
     )
+    shared = study.cohort.shared and SHEET in surfaces
+    first += COMMON_SHEETS * shared
     if SHEET in surfaces and settings.registration.align != "none":
+        owner = "participant" if shared else "session"
         first += (
-            f" Sheets of each session were registered by their curvature profiles"
+            f" Sheets of each {owner} were registered by their curvature profiles"
             f" {cite('registr')}."
         )
     elif SHEET in surfaces:

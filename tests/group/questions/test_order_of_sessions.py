@@ -1,5 +1,7 @@
 """The first session and the order of visits: by time if known, else by numbers in names."""
 
+import json
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -7,6 +9,7 @@ from small_cohorts import (
     FAST,
     PLAN,
     begin_dataset,
+    methods_of,
     place_of,
     table,
     write_hemisphere,
@@ -45,7 +48,9 @@ def write_visits(folder, sessions, dates=None):
 
 def run(study, *options):
     data, out = study
-    assert main([str(data), str(out), "group", *FAST, *options, "--name", "run"]) == 0
+    # Repeatability has no classification to leave out.
+    fast = [one for one in FAST if "--retest" not in options or one != "--no-classification"]
+    assert main([str(data), str(out), "group", *fast, *options, "--name", "run"]) == 0
     return out / "group" / "run"
 
 
@@ -86,6 +91,21 @@ def test_tables_have_visits_in_order(study):
     folder = run(folders, "--longitudinal", "visits", "--formula", "visit")
     visits = table(folder / "covariates.tsv")
     assert visits.session_id.tolist() == [f"ses-{name}" for name in sessions] * 12
+
+
+COMMON = "All visits of a participant were measured on one sheet"
+
+
+@pytest.mark.parametrize("frame", ["visit", "person", "shared"])
+@pytest.mark.parametrize("options", [(), ("--retest",)])
+def test_methods_name_common_sheets(tmp_path, frame, options):
+    folders = write_visits(tmp_path, ("1", "2"))
+    path = folders[1] / "desc-settings.json"
+    settings = json.loads(path.read_text())
+    settings["settings"]["sheet"]["frame"] = frame
+    path.write_text(json.dumps(settings))
+    text = methods_of(run(folders, *(options or ("--formula", "age"))))
+    assert (COMMON in text) == (frame != "visit")
 
 
 def ordered(rows, **columns):
