@@ -13,12 +13,19 @@ from hipsta_bids.derivatives.names import (
     TEXTS,
     HemisphereName,
     ignore_file,
+    natural_order,
     output_name,
     output_path,
     participant_report,
 )
 
 FULL = HemisphereName(subject="01", session="02", hemi="R", seg="freesurfer")
+
+
+def test_numbers_in_labels_are_sorted_by_value():
+    labels = ["ses-11", "ses-2", "m6", "02", "10", "post", "ses-10", "m24", "2", "1b", "1a3", ""]
+    ordered = ["", "1a3", "1b", "02", "2", "10", "m6", "m24", "post", "ses-2", "ses-10", "ses-11"]
+    assert sorted(labels, key=natural_order) == ordered
 
 
 @pytest.mark.parametrize(

@@ -149,6 +149,29 @@ def test_pages_show_all_visits_on_the_same_columns(out):
         assert any(text in page for text in (words, *near))
 
 
+def visits_of_page(out, bids_dir):
+    call = [bids_dir, out, "participant", "--reports-only", "--no-anatomy"]
+    assert main.main(list(map(str, call))) == ExitCode.OK
+    page = (out / "sub-01_ses-2.html").read_text()
+    section = page.split('data-visits="')[1]
+    titles = [section.index(f"left, ses-{session} mean") for session in THICKNESS]
+    visits = json.loads(html.unescape(section.split('"')[0]))
+    return visits, [list(THICKNESS)[i] for i in np.argsort(titles)]
+
+
+def test_pages_show_visits_by_time(out, tmp_path):
+    table = tmp_path / "in/sub-01/sub-01_sessions.tsv"
+    table.parent.mkdir(parents=True)
+    shutil.copytree(out, tmp_path / "out")
+    rows = "ses-1\t2021-02-01T11:00:00\nses-2\t2021-02-01T09:00:00Z\nses-3\t{}\n"
+    for last, order in (("2020-01-05", "321"), ("n/a", "123"), ("5.1.2020", "123")):
+        table.write_text("session_id\tacq_time\n" + rows.format(last))
+        visits, maps = visits_of_page(tmp_path / "out", tmp_path / "in")
+        assert [visit.split(",")[0] for visit in visits] == [f"ses-{one}" for one in order]
+        assert maps == list(order)
+    assert visits[0] == "ses-1, 2021-02-01"
+
+
 @pytest.mark.parametrize("option", [(), ("--no-anatomy",)])
 def test_pages_show_dates_of_sessions_with_and_without_anatomy(out, tmp_path, option):
     table = tmp_path / "in/sub-01/sub-01_sessions.tsv"
