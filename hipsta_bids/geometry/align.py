@@ -79,8 +79,8 @@ def align(volumes: Sequence[LabelVolume], hemi: str, *, shared: bool = False) ->
     distance = float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
     if shared and distance > _REACH:
         raise GeometryError(
-            f"the labels of a visit lie {distance:.0f} mm from their mean: the visits share no space; "
-            "use --longitudinal without shared",
+            f"the labels of a visit lie {distance:.0f} mm from their mean: the visits share no "
+            "space; use --longitudinal without shared",
             reason="visit-unlike",
         )
     if shared or len(volumes) == 1:
