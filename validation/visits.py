@@ -22,7 +22,7 @@ from hipsta_bids.geometry.measures import column_area
 from hipsta_bids.group.stats.trials import participants_needed
 from hipsta_bids.inputs.search import HemisphereInput
 from hipsta_bids.participant.job import peak_memory, reset_peak_memory
-from hipsta_bids.participant.longitudinal import Frame, make_frame, measure_visit
+from hipsta_bids.participant.longitudinal import Frame, lay_visit, make_frame, measure_laid
 from hipsta_bids.phantom import PhantomSpec, Thinning
 from hipsta_bids.protocols.protocol import Part, Tissue
 from hipsta_bids.settings import BodySettings, Settings
@@ -248,7 +248,10 @@ def measure_frame(
 def measure_on(frame: Frame, volumes: Sequence[LabelVolume], hemi: str) -> list[HemisphereMaps]:
     """Measure visits on a sheet."""
     return [
-        measure_visit(frame, number, volume, hemi, untimed) for number, volume in enumerate(volumes)
+        measure_laid(
+            frame, motion, volume, lay_visit(frame, number, volume, hemi, untimed), untimed
+        )
+        for number, (motion, volume) in enumerate(zip(frame.motions, volumes, strict=True))
     ]
 
 

@@ -156,6 +156,11 @@ class HemisphereInput(Hemisphere):
         """Return the edit of one kind, if there is one."""
         return next((edit for edit in self.edits if edit.kind == kind), None)
 
+    @property
+    def side(self) -> tuple[str, str, str]:
+        """Return what visits on a common sheet have in common: participant, side and protocol."""
+        return self.subject, self.hemi, self.protocol.name
+
     def path_of(self, name: str) -> Path:
         """Return the path of a file that was passed over: beside the labels, or as written."""
         return self.files[0].parent / name if Path(name).name == name else Path(name)

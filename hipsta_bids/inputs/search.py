@@ -247,8 +247,7 @@ def sheet_notes(items: Iterable[HemisphereInput]) -> list[str]:
     visits: dict[tuple[str, str, str], list[str]] = {}
     for item in items:
         if item.problem is None:
-            side = (item.subject, item.hemi, item.protocol.name)
-            visits.setdefault(side, []).append(f"ses-{item.session}" if item.session else "")
+            visits.setdefault(item.side, []).append(f"ses-{item.session}" if item.session else "")
     notes = []
     for title, is_common in (("several visits", True), ("a single visit", False)):
         sides = {side: labels for side, labels in visits.items() if (len(labels) > 1) == is_common}

@@ -30,6 +30,7 @@ from hipsta_bids.protocols.load import for_region
 from hipsta_bids.protocols.protocol import Tissue
 from hipsta_bids.settings import Settings
 from hipsta_bids.types import (
+    Bool,
     Coordinates,
     End,
     Finding,
@@ -206,7 +207,10 @@ def find_common(
         except GeometryError:
             if len(numbers) <= _PAIR:
                 raise
+            with clock("alignment"):
+                motions = align(part, hemi, shared=shared)
         else:
+            motions = list(frame.motions)
             for place, n in enumerate(numbers):
                 try:
                     laid[n] = lay_visit(frame, place, volumes[n], hemi, clock)
@@ -216,8 +220,7 @@ def find_common(
             if fit or len(numbers) <= _PAIR:
                 return frame, laid
         refused = [n for n in numbers if not isinstance(laid.get(n), Laid)]
-        with clock("alignment"):
-            overlap = _resemblance(part, align(part, hemi, shared=shared))
+        overlap = _resemblance(part, motions)
         numbers.remove(min(refused, key=lambda n: overlap[numbers.index(n)]))
 
 
@@ -228,14 +231,23 @@ def _resemblance(volumes: Sequence[LabelVolume], motions: Sequence[Float]) -> li
         apply_affine(np.linalg.inv(motion), voxel_points(mask, volume.affine))
         for mask, volume, motion in zip(masks, volumes, motions, strict=True)
     ]
-    shares = np.ones((len(volumes), len(volumes)))
-    for number, (mask, volume, motion) in enumerate(zip(masks, volumes, motions, strict=True)):
-        to_voxels = np.linalg.inv(volume.affine) @ motion
-        for n, points in enumerate(places):
-            index = np.rint(apply_affine(to_voxels, points)).astype(np.intp)
-            within = ((index >= 0) & (index < mask.shape)).all(axis=1)
-            shares[number, n] = mask[tuple(index[within].T)].sum() / len(points)
+    shares = np.array(
+        [
+            [
+                _count_in(mask, volume.affine, apply_affine(m, points)) / len(points)
+                for points in places
+            ]
+            for mask, volume, m in zip(masks, volumes, motions, strict=True)
+        ]
+    )
     return [float(share) for share in np.minimum(shares, shares.T).mean(axis=1)]
+
+
+def _count_in(mask: Bool, affine: Float, points: Float) -> int:
+    """Count the points (N, 3), RAS mm, whose nearest voxel is in a mask."""
+    voxel = np.rint(apply_affine(np.linalg.inv(affine), points)).astype(np.intp)
+    within = ((voxel >= 0) & (voxel < mask.shape)).all(axis=1)
+    return int(np.count_nonzero(mask[tuple(voxel[within].T)]))
 
 
 def lay_visit(frame: Frame, number: int, volume: LabelVolume, hemi: str, clock: Clock) -> Laid:
@@ -254,14 +266,6 @@ def lay_visit(frame: Frame, number: int, volume: LabelVolume, hemi: str, clock: 
     with clock("sheet"):
         visit, walls = _carry(frame, motion, solid.field)
     return Laid(image=image, body=body, side=side, solid=solid, visit=visit, walls=walls)
-
-
-def measure_visit(
-    frame: Frame, number: int, volume: LabelVolume, hemi: str, clock: Clock
-) -> HemisphereMaps:
-    """Lay the common sheet on a visit and measure it; for errors see :func:`lay_visit`."""
-    laid = lay_visit(frame, number, volume, hemi, clock)
-    return measure_laid(frame, frame.motions[number], volume, laid, clock)
 
 
 def measure_laid(
@@ -388,9 +392,7 @@ def _overlap(body: Body, frame: Frame, motion: Float) -> float:
     """Compute Dice's coefficient of the bodies of a visit and of the mean."""
     mean = frame.evidence.body
     points = apply_affine(np.linalg.inv(motion), body.inside_points()[1])
-    voxel = np.rint(mean.to_voxels(points)).astype(np.intp)
-    within = ((voxel >= 0) & (voxel < mean.inside.shape)).all(axis=1)
-    shared = np.count_nonzero(mean.inside[tuple(voxel[within].T)]) * body.voxel_volume
+    shared = _count_in(mean.inside, mean.affine, points) * body.voxel_volume
     total = len(points) * body.voxel_volume + np.count_nonzero(mean.inside) * mean.voxel_volume
     return float(2 * shared / total)
 

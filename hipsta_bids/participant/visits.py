@@ -12,7 +12,6 @@ from hipsta_bids import __version__
 from hipsta_bids.derivatives import template
 from hipsta_bids.derivatives.results import ResultPlace, read_record
 from hipsta_bids.errors import GeometryError, HipstaError, InputError, OutputError, UsageError
-from hipsta_bids.inputs.scan import HemisphereInput
 from hipsta_bids.io import files
 from hipsta_bids.participant import job as one_job
 from hipsta_bids.participant.job import CostClock, Job, Measure, Outcome, fail, finished
@@ -22,15 +21,10 @@ if TYPE_CHECKING:
     from hipsta_bids.participant.longitudinal import Frame
 
 
-def side(item: HemisphereInput) -> tuple[str, str, str]:
-    """Return what visits that share a sheet have in common: participant, side and protocol."""
-    return item.subject, item.hemi, item.protocol.name
-
-
 def by_side(jobs: Iterable[Job]) -> list[tuple[Job, ...]]:
     """Group hemispheres that share a sheet; each other one is alone."""
-    ordered = sorted(jobs, key=lambda job: side(job.item))
-    return [tuple(group) for _, group in groupby(ordered, key=lambda job: side(job.item))]
+    ordered = sorted(jobs, key=lambda job: job.item.side)
+    return [tuple(group) for _, group in groupby(ordered, key=lambda job: job.item.side)]
 
 
 def share_sheets(jobs: Sequence[Job]) -> list[Job]:
@@ -38,8 +32,8 @@ def share_sheets(jobs: Sequence[Job]) -> list[Job]:
     if not any(job.item.session for job in jobs):
         raise UsageError("--longitudinal: no segmentation has a session; name the visits (ses-)")
     usable = [[job.item for job in unit if job.item.problem is None] for unit in by_side(jobs)]
-    visits = {side(items[0]): tuple(items) for items in usable if items}
-    return [replace(job, visits=visits.get(side(job.item), ())) for job in jobs]
+    visits = {items[0].side: tuple(items) for items in usable if items}
+    return [replace(job, visits=visits.get(job.item.side, ())) for job in jobs]
 
 
 def run_visits(jobs: tuple[Job, ...]) -> list[Outcome]:

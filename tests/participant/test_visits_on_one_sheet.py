@@ -11,9 +11,9 @@ from hipsta_bids.errors import GeometryError
 from hipsta_bids.participant.longitudinal import (
     check_alone,
     find_common,
+    lay_visit,
     make_frame,
     measure_laid,
-    measure_visit,
 )
 from hipsta_bids.participant.measure import measure_hemisphere
 from hipsta_bids.phantom import Phantom, PhantomSpec
@@ -44,11 +44,16 @@ def clock(_stage):
     return nullcontext()
 
 
+def measure_one(frame, number, volume, hemi):
+    laid = lay_visit(frame, number, volume, hemi, clock)
+    return measure_laid(frame, frame.motions[number], volume, laid, clock)
+
+
 def measure(volumes, hemi="L", *, shared=False):
     settings = Settings()
     frame = make_frame(volumes, hemi, settings, clock, shared=shared)
     return frame, [
-        measure_visit(frame, number, volume, hemi, clock) for number, volume in enumerate(volumes)
+        measure_one(frame, number, volume, hemi) for number, volume in enumerate(volumes)
     ]
 
 
@@ -157,7 +162,7 @@ def test_another_body_among_the_visits_is_not_accepted(thinning):
     stranger = draw(PhantomSpec(kind="tight", thickness=1.4, width=16.0), POSES[1])
     frame = make_frame([*thinning[:2], stranger], "L", Settings(), clock, shared=False)
     try:
-        maps = measure_visit(frame, 2, stranger, "L", clock)
+        maps = measure_one(frame, 2, stranger, "L")
     except GeometryError as error:
         assert error.reason == "visit-unlike"  # noqa: PT017 -- either is right
     else:
