@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from hipsta_bids.protocols.protocol import Tissue
 from validation import visits
@@ -17,6 +18,11 @@ def result(noise, separate, random):
         frame=maps,
         smooth=own,
         separate=own,
+        true=None,
+        smoother=(own, maps),
+        volume=np.array([400.0, 360.0, 320.0]),
+        separate_volume=np.array([400.0, 364.0, 328.0]),
+        labels_volume=np.array([410.0, 369.0, 328.0]),
         ca1=np.tile(np.arange(12)[:, None] > 3, (1, 8)) & (np.arange(12)[:, None] < 11),
         filled=0.0,
         overlap=0.95,
@@ -90,3 +96,35 @@ def test_tables_say_which_targets_are_met():
         assert row["measured, mm per year"] == pytest.approx(planted, rel=0.02)
         assert row["bias met"] is True
     assert row["leakage met"] is True
+
+
+def test_a_lost_layer_is_as_thick_as_planted():
+    volume, _ = visits.load(plain(0))
+    before, after = (visits.lose_layer(volume, layer) for layer in (0.0, visits.LAYER))
+    sheets = [np.isin(v.tissue, [*v.protocol.sheet, Tissue.HIPPOCAMPUS]) for v in (before, after)]
+    assert not (sheets[1] & ~sheets[0]).any()
+    size = visits.FINEST**3
+    lost = np.count_nonzero(sheets[0] & ~sheets[1]) * size
+    depth = ndimage.distance_transform_edt(sheets[0], sampling=visits.FINEST)
+    surface = np.count_nonzero(sheets[0] & (depth <= 3 * visits.FINEST)) * size
+    # The layer over a layer of three voxels, whose depths are of centers.
+    assert lost / surface == pytest.approx(visits.LAYER / (3 * visits.FINEST), rel=0.15)
+
+
+def test_the_share_of_a_loss_that_is_measured_is_its_bias():
+    random = np.random.default_rng(3)
+    loss = np.array([0.0, -2 * visits.LAYER])[:, None, None]
+    group = []
+    for _ in range(3):
+        one = result(0.01, 0.01, random)
+        maps, own = one.frame[:2] + 0.99 * loss, one.separate[:2] + 0.8 * loss
+        group.append(replace(one, frame=maps, separate=own))
+    (row,) = visits._losses({"set": group}, [result(0.05, 0.1, random)]).rows
+    assert row["common, mm"] == pytest.approx(-0.198, abs=0.003)
+    assert row["separate, mm"] == pytest.approx(-0.16, abs=0.003)
+    assert row["bias met"] is True
+    assert row["volume, common"] == row["volume of labels"] == "-10.0%"
+    (worse,) = visits._losses(
+        {"set": [replace(one, frame=one.separate) for one in group]}, group[:1]
+    ).rows
+    assert worse["bias met"] is False
