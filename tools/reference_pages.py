@@ -115,7 +115,7 @@ CHANGED: Mapping[str, str] = {
     "maps": "min_known",
     "surrogate": "positions",
     "registration": "align standardize",
-    "model": "group_columns reference_levels covariates age icv_columns",
+    "model": "group_columns covariates age icv_columns",
     "design": "factors mixed",
     "glm": "covariance",
     "longitudinal": "random",

@@ -33,7 +33,8 @@ LEVEL = "group"
 _EPILOG = """\
 without --model and --formula: group + age + sex (+ site) from BIDS_DIR/participants.tsv
 
-each group is compared with its reference level (CN, CU, HC, control ..., else the most frequent)
+each group is compared with the reference level: CN, CU, healthy control ..., else the first.
+The run prints the reference level; --reference FACTOR=LEVEL changes it.
 
 --retest, --power, --fit-norms and --norms answer questions of their own, in OUT_DIR/group/retest/,
 power-.../, norms/ and scores/

@@ -327,8 +327,8 @@ def test_names_of_groups_may_have_any_signs(study):
     call = [str(study.data), str(study.out), "group", *FAST, "--name", "signs"]
     assert main(call) == 0
     maps = files.read_tsv(study.out / "group" / "signs" / "maps.tsv")
-    assert {row["contrast"] for row in maps} == {"âgé 女>=24-=low()"}
-    files_of = (study.out / "group" / "signs").glob("*contrast-AgeU597324Low_*.shape.gii")
+    assert {row["contrast"] for row in maps} == {"=low()-âgé 女>=24"}
+    files_of = (study.out / "group" / "signs").glob("*contrast-LowAgeU597324_*.shape.gii")
     assert len(list(files_of)) > 0
 
 
@@ -441,7 +441,7 @@ def test_sidecar_makes_factors_and_names_their_levels(study, capsys):
     assert main([str(study.data), str(study.out), "group", *options]) == 0
     assert "as a line" not in capsys.readouterr().out
     (design,) = study.out.glob("group/*/design.tsv")
-    assert list(files.read_tsv(design)[0])[-2:] == ["stage[T.none]", "stage[T.some]"]
+    assert list(files.read_tsv(design)[0])[-2:] == ["stage[T.much]", "stage[T.some]"]
 
 
 @pytest.mark.usefixtures("without_figures")

@@ -169,7 +169,12 @@ def _with_levels(values: pd.Series, description: object) -> pd.Series:
     codes = all(_CODE.fullmatch(code) for code in present)
     if codes and all(names) and len(set(names)) == len(names):
         factor = factor.cat.rename_categories(names)
-    return factor
+        names_of = dict(zip(present, names, strict=True))
+        present = [names_of[code] for code in levels if code in names_of]
+    else:
+        present = [code for code in levels if code in present]
+    # The order of the description, which the choice of a reference level follows.
+    return factor.cat.reorder_categories(present, ordered=True)
 
 
 def _levels(description: object) -> dict[str, str]:

@@ -15,6 +15,7 @@ from hipsta_bids.errors import ModelError, did_you_mean
 from hipsta_bids.group.design import contrasts as texts
 from hipsta_bids.group.design.contrasts import ContrastSpec, contrast_json, refusal
 from hipsta_bids.group.design.grammar import CONTEXT, closed_formula
+from hipsta_bids.group.design.references import Reference, choose_reference
 from hipsta_bids.group.design.settings import DefaultModelSettings, DesignSettings
 from hipsta_bids.io.files import MISSING
 from hipsta_bids.types import Float, Int64
@@ -379,10 +380,13 @@ def check_left(variables: pd.DataFrame, dropped: Mapping[str, tuple[str, ...]]) 
 
 
 def set_levels(
-    variables: pd.DataFrame, references: Mapping[str, str], settings: DesignSettings
-) -> dict[str, list[str]]:
-    """Make factors of text columns in place."""
-    levels = {}
+    variables: pd.DataFrame,
+    references: Mapping[str, str],
+    settings: DesignSettings,
+    declared: Mapping[str, Sequence[str]],
+) -> tuple[dict[str, list[str]], dict[str, Reference]]:
+    """Make factors of text columns in place; also return why each has its reference."""
+    levels, choices = {}, {}
     for column in variables.columns:
         name = str(column)
         if pd.api.types.is_numeric_dtype(variables[name]):
@@ -394,20 +398,32 @@ def set_levels(
                     "remove it"
                 )
         else:
-            levels[name] = _levels(variables[name], name, references.get(name), settings)
+            levels[name] = _levels(variables[name], name, settings)
+            choices[name] = choose_reference(
+                levels[name],
+                settings.reference_levels,
+                requested=references.get(name),
+                declared=declared.get(name, ()),
+            )
+            first = choices[name].level
+            if first not in levels[name]:
+                raise ModelError(
+                    f"model: {name!r} has no level {first!r} in the complete rows, only"
+                    f" {listed(levels[name])}"
+                )
+            levels[name].remove(first)
+            levels[name].insert(0, first)
             variables[name] = pd.Categorical(variables[name], categories=levels[name])
     if unknown := sorted(set(references) - set(levels)):
         raise ModelError(
             f"model: reference level given for {listed(unknown)}, which is no factor of the model;"
             f" its factors: {listed(levels) or 'none'}{did_you_mean(unknown, levels)}"
         )
-    return levels
+    return levels, choices
 
 
-def _levels(
-    values: pd.Series, name: str, reference: str | None, settings: DesignSettings
-) -> list[str]:
-    """Levels of a factor, reference first."""
+def _levels(values: pd.Series, name: str, settings: DesignSettings) -> list[str]:
+    """Return the levels of a factor in their order, or refuse them."""
     counts = {str(level): int(count) for level, count in values.value_counts().items()}
     check_spelling(counts, name)
     levels = sorted(counts, key=in_order)
@@ -419,21 +435,24 @@ def _levels(
             " among words: a code for missing values? mark them n/a (or change the setting"
             " design.missing_codes)"
         )
-    first = levels[0] if reference is None else reference
-    if first not in levels:
-        raise ModelError(
-            f"model: {name!r} has no level {first!r} in the complete rows, only {listed(levels)}"
-        )
     if len(levels) == 1:
-        raise ModelError(f"model: all {len(values)} complete rows have {name!r} {first}; remove it")
+        raise ModelError(
+            f"model: all {len(values)} complete rows have {name!r} {levels[0]}; remove it"
+        )
     small = [f"{level} ({counts[level]})" for level in levels if counts[level] < settings.min_level]
     if small:
         raise ModelError(
             f"model: too few complete rows in {name!r}: {listed(small)}; at least"
             f" {settings.min_level} are needed; merge levels or remove {name}"
         )
-    levels.remove(first)
-    return [first, *levels]
+    return levels
+
+
+def declared_levels(values: pd.Series) -> list[str]:
+    """Return the levels of a factor in the order of its description; empty without one."""
+    kind = values.dtype
+    is_declared = isinstance(kind, pd.CategoricalDtype) and kind.ordered
+    return [str(level) for level in values.cat.categories] if is_declared else []
 
 
 def in_order(level: str) -> tuple[float, str]:

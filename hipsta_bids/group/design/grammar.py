@@ -67,6 +67,8 @@ class ClosedFormula:
     """Those of them that stand in ``C`` only."""
     numbers: frozenset[str] = frozenset()
     """Those of them that stand in other functions, which take numbers."""
+    references: tuple[tuple[str, str], ...] = ()
+    """Factors and reference levels of codings, as in ``C(group, contr.treatment("CN"))``."""
 
 
 def closed_formula(text: str) -> ClosedFormula:
@@ -74,6 +76,7 @@ def closed_formula(text: str) -> ClosedFormula:
     names: dict[str, None] = {}
     plain: set[str] = set()
     numbers: set[str] = set()
+    references: dict[str, str] = {}
     parts: list[str] = []
     sizes: deque[str] = deque()
     tokens = _tokens(text)
@@ -87,7 +90,9 @@ def closed_formula(text: str) -> ClosedFormula:
             _refuse(text, f"{tokens[position - 1][1]} {word}")
         if is_call:
             end = _call_end(tokens, position)
-            inside = _check_call(text, tokens[position:end])
+            call = _check_call(text, tokens[position:end])
+            inside = call.names
+            references |= dict.fromkeys(inside, call.base) if call.base else {}
             names |= dict.fromkeys(inside)
             numbers |= set(inside) if word != "C" else set()
         elif kind == "number":
@@ -111,7 +116,9 @@ def closed_formula(text: str) -> ClosedFormula:
             " write fewer * and lower powers"
         )
     factors = frozenset(names) - plain - numbers
-    return ClosedFormula(" ".join(parts), tuple(names), factors, frozenset(numbers))
+    return ClosedFormula(
+        " ".join(parts), tuple(names), factors, frozenset(numbers), tuple(references.items())
+    )
 
 
 def _columns_of_call(tokens: Sequence[_Token]) -> str:
@@ -203,8 +210,8 @@ def _column(text: str, word: str) -> str:
     return word.strip("`")
 
 
-def _check_call(text: str, tokens: Sequence[_Token]) -> list[str]:
-    """Check the call of a function, and list the columns in it."""
+def _check_call(text: str, tokens: Sequence[_Token]) -> "_Call":
+    """Check the call of a function, and return the columns and the reference level in it."""
     quoted = [word for kind, word in tokens if kind == "quoted"]
     if any(word.startswith(_PLACEHOLDER) for _, word in tokens):
         _refuse(text, _PLACEHOLDER)
@@ -216,7 +223,9 @@ def _check_call(text: str, tokens: Sequence[_Token]) -> list[str]:
         tree = ast.parse(source, mode="eval").body
     except SyntaxError:
         _refuse(text, " ".join(word for _, word in tokens))
-    return _Call(text, quoted).columns(tree)
+    call = _Call(text, quoted)
+    call.names = call.columns(tree)
+    return call
 
 
 class _Call:
@@ -224,6 +233,8 @@ class _Call:
 
     def __init__(self, text: str, quoted: Sequence[str]) -> None:
         self.text, self.quoted = text, quoted
+        self.names: list[str] = []
+        self.base = ""
 
     def columns(self, node: ast.expr) -> list[str]:
         """Columns in arithmetic or in a call."""
@@ -264,7 +275,11 @@ class _Call:
     def _check_coding(self, node: ast.expr) -> None:
         if isinstance(node, ast.Call):
             self._check_options(node.args, node.keywords)
+            bases = [*node.args, *(option.value for option in node.keywords)]
             node = node.func
+            is_treatment = isinstance(node, ast.Attribute) and node.attr == "treatment"
+            if is_treatment and bases and isinstance(bases[0], ast.Constant):
+                self.base = str(bases[0].value)
         match node:
             case ast.Attribute(value=ast.Name(id="contr"), attr=name) if name in _CODINGS:
                 return

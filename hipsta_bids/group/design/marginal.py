@@ -18,7 +18,7 @@ from scipy.linalg import null_space
 
 from hipsta_bids.errors import ModelError, did_you_mean
 from hipsta_bids.group.design.contrasts import Contrast, ContrastSpec, split_name
-from hipsta_bids.group.design.formula import level_name, listed
+from hipsta_bids.group.design.formula import INTERCEPT, in_order, level_name, listed
 from hipsta_bids.group.design.grammar import CONTEXT, closed_formula, term_text
 from hipsta_bids.types import Float
 
@@ -30,6 +30,11 @@ _EXACT = 1e-6
 _STEP = 1e-3
 #: Rows of the largest reference grid.
 _LARGEST_GRID = 200_000
+
+
+def _is_code(level: str) -> bool:
+    """Check for a number, which says nothing without its factor."""
+    return in_order(level)[0] < np.inf
 
 
 class Terms:
@@ -52,6 +57,28 @@ class Terms:
     def contrast(self, spec: ContrastSpec) -> Contrast:
         """Return a contrast with its weights; ModelError lists unknown names."""
         return Contrast(spec.name, self._weights(spec), spec.side, spec.margin)
+
+    def dummies(self, test: str) -> tuple[ContrastSpec, ...]:
+        """Return a contrast per column: reference minus level of factors, else the column."""
+        named: dict[str, tuple[str, ...]] = {}
+        for variables, columns in self._structures():
+            factors, slopes = variables & set(self.levels), sorted(variables - set(self.levels))
+            factor, *further = factors or [""]
+            first, *remaining = self.levels.get(factor, [""])
+            # Else these are the means of levels, a bent variable, or several factors.
+            is_difference = not further and len(slopes) < 2 and len(columns) == len(remaining)  # noqa: PLR2004
+            ending = "".join(f":{name}" for name in slopes)
+            for level in remaining if is_difference else ():
+                name = f"{first}-{level}{ending}"
+                name = f"{factor} {name}" if name in named or _is_code(level) else name
+                named[name] = f"{factor}[{first}]{ending}", f"{factor}[{level}]{ending}"
+            named |= {} if is_difference else {name: (name,) for name in columns}
+        named |= {name: (name,) for name in self.names[len(self.columns) :]}
+        return tuple(
+            ContrastSpec(name, parts, ((1.0, -1.0)[: len(parts)],), test)
+            for name, parts in named.items()
+            if name != INTERCEPT
+        )
 
     def _weights(self, spec: ContrastSpec) -> Float:
         variable = re.fullmatch(rf"{NONLINEAR}\(`?([^`]+)`?\)", spec.conditions[0])

@@ -14,9 +14,11 @@ from formulaic import Formula
 
 from hipsta_bids.errors import ModelError, UsageError
 from hipsta_bids.group.design import formula as formulas
-from hipsta_bids.group.design.contrasts import Contrast, ContrastSpec
+from hipsta_bids.group.design.contrasts import Contrast
+from hipsta_bids.group.design.formula import declared_levels
 from hipsta_bids.group.design.grammar import CONTEXT, closed_formula, term_text
 from hipsta_bids.group.design.marginal import NONLINEAR, Terms
+from hipsta_bids.group.design.references import choose_reference, references_note
 from hipsta_bids.group.design.settings import DefaultModelSettings, DesignSettings, GroupSettings
 from hipsta_bids.group.design.visits import VISIT, check_endpoint, visit_contrasts
 from hipsta_bids.io import files
@@ -73,23 +75,16 @@ def find_groups(
             continue
         counts = Counter(formulas.level_name(value) for value in values)
         formulas.check_spelling(counts, column)
-        first = reference or _reference(counts, settings.model)
+        ordered = sorted(counts, key=formulas.in_order)
+        words, declared = settings.design.reference_levels, declared_levels(table[column])
+        first = choose_reference(ordered, words, requested=reference, declared=declared).level
         if first not in counts:
             raise ModelError(
                 f"model: no participant has {column!r} {first!r}; there are"
                 f" {', '.join(sorted(counts))}"
             )
-        remaining = sorted((level for level in counts if level != first), key=formulas.in_order)
-        return Groups(column, (first, *remaining))
+        return Groups(column, (first, *(level for level in ordered if level != first)))
     return None
-
-
-def _reference(counts: Counter[str], settings: DefaultModelSettings) -> str:
-    by_name = {level.casefold().rstrip("s"): level for level in sorted(counts)}
-    for name in settings.reference_levels:
-        if name.casefold().rstrip("s") in by_name:
-            return by_name[name.casefold().rstrip("s")]
-    return min(counts, key=lambda level: (-counts[level], level))
 
 
 def default_formula(
@@ -238,10 +233,10 @@ def choose_model(
 ) -> tuple[Mapping[str, Any], formulas.ModelSpec, Groups | None, dict[str, str]]:
     """Return the model as a BIDS Stats Model and read, the groups, and reference levels.
 
-    The reference of the groups is the user's, else that which ``find_groups`` finds; it is the
-    reference of their column in the design too, if the formula has it.
+    The request names reference levels; the design chooses the others by the rule of
+    ``find_groups``.
     """
-    references = dict(request.references)
+    references = _requested_references(request)
     groups = find_groups(table, settings)
     if groups is not None and groups.column in references:
         groups = find_groups(table, settings, references[groups.column])
@@ -251,9 +246,22 @@ def choose_model(
     model = formulas.parse_model(document)
     if visits is not None and visits.labels and VISIT in closed_formula(model.formula).names:
         references[VISIT] = visits.labels[0]
-    if groups is not None and groups.column in closed_formula(model.formula).names:
-        references.setdefault(groups.column, groups.reference)
     return document, model, groups, references
+
+
+def _requested_references(request: ModelRequest) -> dict[str, str]:
+    """Return reference levels of options and of codings in the formula; they must not differ."""
+    references = dict(request.references)
+    formula = formulas.split_maps(request.formula or "1")[0]
+    if request.file is not None:
+        formula = formulas.parse_model(files.read_json(request.file)).formula
+    for factor, level in closed_formula(formula).references:
+        if references.setdefault(factor, level) != level:
+            raise UsageError(
+                f"--reference {factor}={references[factor]}, but the formula has"
+                f" contr.treatment({level!r}); give one"
+            )
+    return references
 
 
 def model_document(
@@ -404,7 +412,11 @@ def build_design(
     formulas.check_left(variables, dropped)
     numeric = variables.select_dtypes("number")
     notes = {name: formulas.coding_note(numeric[name]) for name in map(str, numeric.columns)}
-    levels_used = formulas.set_levels(variables, references, settings)
+    declared = {name: levels for name in names if (levels := declared_levels(table[name]))}
+    levels_used, choices = formulas.set_levels(
+        variables, dict(closed.references) | dict(references), settings, declared
+    )
+    notes |= {"references": references_note(choices)} if choices else {}
     for name in map(str, numeric.columns):
         _check_possible(numeric[name], name.casefold())
     if words := sorted(closed.numbers & set(levels_used)):
@@ -432,11 +444,7 @@ def build_design(
     doubts = _doubts(numeric, len(set(columns) - {formulas.INTERCEPT}), people)
     specs = model.contrasts
     if model.dummy is not None:
-        specs += tuple(
-            ContrastSpec(name, (name,), ((1.0,),), model.dummy)
-            for name in terms.names
-            if name != formulas.INTERCEPT
-        )
+        specs += terms.dummies(model.dummy)
     return Design(
         matrix=matrix,
         columns=columns,

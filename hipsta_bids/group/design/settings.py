@@ -77,6 +77,9 @@ class DesignSettings(toml.SettingsTable):
     )
     """Columns of names, in any case of letters, even if they are written as numbers. Other columns
     are too if the table's sidecar has ``Levels`` for all their values."""
+    reference_levels: toml.Texts = ()
+    """Further words for controls. A level that is a word for controls, in several languages, is
+    the reference of its factor."""
     missing_codes: Codes = (
         *(-9.0, -99.0, -999.0, -9999.0, -99999.0),
         *(99.0, 999.0, 9999.0, 99999.0, 777.0, 7777.0, 888.0, 8888.0),
@@ -96,9 +99,6 @@ class DefaultModelSettings(toml.SettingsTable):
         *("group", "diagnosis", "dx", "diagnostic_group", "arm", "treatment"),
     )
     """The first of these columns, in any case of letters, has the groups."""
-    reference_levels: toml.Texts = ("CN", "CU", "HC", "NC", "CTRL", "control", "healthy", "placebo")
-    """The reference level of the groups: the first of these, in any case and number; else the
-    most frequent level."""
     covariates: toml.Texts = ("age", "sex", "site")
     """Further columns of the model, where the table has them and they vary."""
     age: Literal["linear", "quadratic", "spline"] = "linear"

@@ -175,6 +175,14 @@ def summary_tests(
     return with_fdr(_stacked(blocks), settings) if blocks else pd.DataFrame()
 
 
+def with_references(table: pd.DataFrame, analysis: results.Analysis) -> pd.DataFrame:
+    """Add the reference levels of the model to a table of contrasts."""
+    levels = analysis.design.references.items()
+    if "contrast" not in table or not levels:
+        return table
+    return table.assign(references="; ".join(f"{factor}={level}" for factor, level in levels))
+
+
 def overview_table(discoveries: Mapping[MapKey, Discoveries]) -> pd.DataFrame:
     """Return one row per map: how many points survive, and at which p."""
     return pd.DataFrame(

@@ -92,9 +92,10 @@ def write_results(
         for name, table in tables.result_tables(
             surface, surface_cohort, analyses[surface], settings, averages
         ):
-            write_table(folder, name, table)
+            write_table(folder, name, tables.with_references(table, analysis))
     if analysis.found:
-        write_table(folder, "maps", tables.overview_table(analysis.found))
+        overview = tables.overview_table(analysis.found)
+        write_table(folder, "maps", tables.with_references(overview, analysis))
     write_exclusions(folder, exclusions)
     rows_of_model = analysis.compared.table.iloc[analysis.design.rows]
     write_table(folder, "covariates", rows_of_model, described=False)

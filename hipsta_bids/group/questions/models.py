@@ -208,7 +208,8 @@ def group(
         Such as ``"group + age + sex"``; names are columns of the table.
     contrasts : sequence of str
         Such as ``"CN-AD = group[CN] - group[AD]"``. Without any, groups in the formula are compared
-        with their reference, and else each column of the design is tested.
+        with their reference. Else each column of the design is tested, of factors as reference
+        minus level.
     references : mapping, optional
         Reference level by factor.
     correction : {"fdr2", "bh", "permutation-tfce", "permutation-max"}, optional

@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 from scipy import stats
 
-from hipsta_bids.errors import ModelError
+from hipsta_bids.errors import ModelError, UsageError
 from hipsta_bids.group.design.contrasts import parse_expression
 from hipsta_bids.group.design.formula import (
     listed,
@@ -17,11 +17,13 @@ from hipsta_bids.group.design.formula import (
 from hipsta_bids.group.design.model import (
     ModelRequest,
     build_design,
+    choose_model,
     default_formula,
     find_groups,
     folder_name,
     model_document,
 )
+from hipsta_bids.group.design.references import choose_reference
 from hipsta_bids.group.design.settings import DesignSettings, GlmSettings, GroupSettings
 from hipsta_bids.group.stats.glm import fit_points
 
@@ -59,7 +61,7 @@ def test_matrix_of_groups_and_covariates():
     np.testing.assert_array_equal(found.matrix[:, 1], table["group"] == "DAT")
     np.testing.assert_array_equal(found.matrix[:, 3], table["age"])
     assert dict(found.references) == {"group": "CU", "sex": "F"}
-    assert [contrast.name for contrast in found.contrasts] == list(found.columns[1:])
+    assert [contrast.name for contrast in found.contrasts] == ["CU-DAT", "CU-MCI", "age", "F-M"]
 
 
 @pytest.mark.parametrize("reference", ["CU", "MCI", "DAT"])
@@ -259,8 +261,8 @@ def test_refuses_models_that_say_something_else():
     [
         (["MCI", "AD", "CN"], "CN"),
         (["patients", "Controls"], "Controls"),
-        (["a", "b", "b"], "b"),  # the most frequent one
-        (["b", "a"], "a"),  # equally frequent
+        (["a", "b", "b"], "a"),  # the first by name, whatever the numbers of participants
+        (["b", "a"], "a"),
         (["HC", "CU", "CU"], "CU"),  # the settings' order
     ],
 )
@@ -269,6 +271,87 @@ def test_reference_level(levels, reference):
     assert groups.column == "Diagnosis"
     assert groups.reference == reference
     assert groups.levels[1:] == tuple(sorted(set(levels) - {reference}))
+
+
+WORDS = SETTINGS.reference_levels
+
+
+@pytest.mark.parametrize(
+    ("levels", "reference"),
+    [
+        ("AD|healthy control", "healthy control"),
+        ("demented|non-demented", "non-demented"),
+        ("demented|nondemented", "nondemented"),
+        ("Alzheimer|Gesund", "Gesund"),
+        ("Alzheimer|Kontrollgruppe", "Kontrollgruppe"),
+        ("patients|témoins", "témoins"),
+        ("patients|te\u0301moins", "te\u0301moins"),  # accents as characters of their own
+        ("EA|sano", "sano"),
+        ("患者|健康对照", "健康对照"),
+        ("больной|здоровый", "здоровый"),
+        ("abnormal|normal", "normal"),
+        ("healthy|not healthy", "healthy"),
+        ("AD|Cognitively Normal", "Cognitively Normal"),
+        ("impaired|unimpaired", "unimpaired"),
+        ("affected|unaffected", "unaffected"),
+        ("amyloid negative|amyloid positive", "amyloid negative"),
+        ("APOE4+|APOE4-", "APOE4-"),
+        ("no|yes", "no"),
+        ("drug|none", "none"),
+        ("HC_1|MCI_1", "HC_1"),
+        ("con demencia|sin demencia", "sin demencia"),
+        ("CON|PAT", "CON"),
+        ("AD|normal control|normal pressure hydrocephalus", "normal control"),
+        ("AD|healthy control|healthy sibling", "healthy control"),
+        ("uncontrolled|well-treated control", "well-treated control"),
+    ],
+)
+def test_controls_are_recognized_in_phrases_and_languages(levels, reference):
+    for order in (levels.split("|"), levels.split("|")[::-1]):
+        chosen = choose_reference(order, WORDS)
+        assert (chosen.level, chosen.is_known) == (reference, True)
+
+
+@pytest.mark.parametrize("levels", ["1|2", "0|1", "AD|MCI", "F|M", "healthy old|healthy young"])
+def test_what_names_do_not_decide_is_the_first_in_order_and_is_no_knowledge(levels):
+    chosen = choose_reference(levels.split("|"), WORDS)
+    assert (chosen.level, chosen.is_known) == (levels.split("|")[0], False)
+
+
+@pytest.mark.parametrize("column", ["group", "diag", "clinical status"])
+@pytest.mark.parametrize("coding", ["{}", "C({})", "C({}, contr.sum)"])
+def test_names_of_columns_and_codings_do_not_change_signs(column, coding):
+    table = pd.DataFrame({column: ["patient", "control"] * 10, "age": np.arange(60, 80)})
+    y = np.where(table[column] == "control", 2.5, 2.0) + 1e-3 * np.cos(np.arange(20))
+    formula = f"{coding.format(f'`{column}`' if ' ' in column else column)} + age"
+    request = ModelRequest(formula=formula)
+    _, spec, _, references = choose_model(request, table, DEFAULTS)
+    found = build_design(table, spec, SETTINGS, references)
+    (contrast,) = (one for one in found.contrasts if one.name == "control-patient")
+    coefficients = np.linalg.lstsq(found.matrix, y, rcond=None)[0]
+    np.testing.assert_allclose(contrast.weights @ coefficients, 0.5, atol=1e-3)  # noise of y
+    assert "control (control)" in found.notes["references"]
+
+
+def test_the_coding_of_a_formula_sets_the_reference_of_contrasts():
+    table = participants()
+    request = ModelRequest(formula="C(group, contr.treatment('DAT')) + age")
+    _, spec, groups, references = choose_model(request, table, DEFAULTS)
+    assert groups.reference == references["group"] == "DAT"
+    assert [one.name for one in spec.contrasts] == ["DAT-CU", "DAT-MCI"]
+    found = build_design(table, spec, SETTINGS, references)
+    assert found.references["group"] == "DAT"
+    request = ModelRequest(formula=request.formula, references=(("group", "CU"),))
+    with pytest.raises(UsageError, match=r"--reference group=CU, but the formula has"):
+        choose_model(request, table, DEFAULTS)
+
+
+def test_slopes_and_levels_without_a_control_are_named_with_their_factor():
+    table = pd.DataFrame({"dose": ["2", "1"] * 10, "age": np.arange(20.0)})
+    spec = parse_model(model_from_shortcut("C(dose) * age", [], "m"))
+    found = build_design(table, spec, SETTINGS, {})
+    assert [one.name for one in found.contrasts] == ["dose 1-2", "age", "dose 1-2:age"]
+    assert "--reference dose=LEVEL" in found.notes["references"]
 
 
 def test_contrasts_are_positive_where_the_reference_has_more():
@@ -335,5 +418,5 @@ def test_numbers_in_brackets_of_c_are_levels():
     table = participants().assign(dose=[str(k % 4 * 5) for k in range(60)])
     found = design("group + C(dose)", ["dose[0]-dose[10]"], table)
     assert found.columns[3:] == ("C(dose)[T.5]", "C(dose)[T.10]", "C(dose)[T.15]")
-    assert not found.notes
-    assert list(design("group + dose", table=table).notes) == ["dose"]
+    assert set(found.notes) == {"references"}
+    assert list(design("group + dose", table=table).notes) == ["dose", "references"]
