@@ -14,7 +14,7 @@ _WORDS = tomllib.loads(
 #: Words that negate the words after them, and levels that state an absence.
 _NEGATIONS = frozenset(_WORDS["negations"])
 #: Controls by the whole level only; in phrases, these mean something else.
-_ALONE = frozenset(_WORDS["alone"])
+_WHOLE_LEVELS = frozenset(_WORDS["alone"])
 #: Beginnings that negate another level: nondemented, unaffected.
 _NEGATING = ("non", "un", "a")
 _MINUS = re.compile(r"(.+?)\s*[-\u2212\u2013]")  # APOE4- beside APOE4+
@@ -87,7 +87,7 @@ def _singular(text: str) -> str:
 def _has_control(text: str, control: str) -> bool:
     """Check for a control word that no word negates; scripts without blanks by parts of words."""
     words = text.split()
-    if control in _ALONE or _NEGATIONS & set(words):
+    if control in _WHOLE_LEVELS or _NEGATIONS & set(words):
         return False
     return control in map(_singular, words) or (not control.isascii() and control in text)
 
