@@ -65,13 +65,10 @@ def choose_reference(
 
 def references_note(references: Mapping[str, Reference]) -> str:
     """Note the reference levels of a model, and how to change levels that names do not decide."""
-    texts = (
-        f"{factor} {chosen.level} ({chosen.reason}"
-        + ("" if chosen.is_known else f"; --reference {factor}=LEVEL changes it")
-        + ")"
-        for factor, chosen in references.items()
-    )
-    return f"reference levels: {', '.join(texts)}"
+    texts = [f"{factor} {choice.level} ({choice.reason})" for factor, choice in references.items()]
+    is_certain = all(choice.is_known for choice in references.values())
+    hint = "" if is_certain else "; change with --reference FACTOR=LEVEL"
+    return f"reference levels: {', '.join(texts)}{hint}"
 
 
 def _words(level: str) -> list[str]:

@@ -351,7 +351,7 @@ def test_slopes_and_levels_without_a_control_are_named_with_their_factor():
     spec = parse_model(model_from_shortcut("C(dose) * age", [], "m"))
     found = build_design(table, spec, SETTINGS, {})
     assert [one.name for one in found.contrasts] == ["dose 1-2", "age", "dose 1-2:age"]
-    assert "--reference dose=LEVEL" in found.notes["references"]
+    assert "dose 1 (first in order); change with --reference" in found.notes["references"]
 
 
 def test_contrasts_are_positive_where_the_reference_has_more():
