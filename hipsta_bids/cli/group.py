@@ -204,6 +204,12 @@ def _add_model(parser: Parser) -> None:
         "add a test for nonlinearity",
         choices=["linear", "quadratic", "spline"],
     )
+    add(
+        "--allow-missing",
+        "",
+        "analyze although participants.tsv has no row of more than 10 %% of the participants",
+        action="store_true",
+    )
     add("--reference", "FACTOR=LEVEL...", "reference levels", type=factor_level)
     add(
         "--measures",
@@ -399,7 +405,7 @@ def _run(parsed: argparse.Namespace, arguments: Sequence[str]) -> ExitCode:
         warn(f"warning: {warning}")
     for note in result.notes:
         echo(f"note: {note}")
-    left_out = f"{result.n_excluded} hemispheres or visits excluded"
+    left_out = f"{result.n_excluded} exclusions of participants, visits or hemispheres"
     left_out += " (see excluded.tsv for the reasons)" if result.n_excluded else ""
     echo(f"{result.n_participants} participants in the model, {left_out}")
     echo(f"results: {result.folder}")

@@ -5,12 +5,10 @@ over its final name. The same values give the same bytes.
 """
 
 import contextlib
-import csv
 import errno
 import fcntl
 import glob
 import hashlib
-import io
 import json
 import math
 import os
@@ -249,11 +247,11 @@ def read_json(path: Path, limit: float = opening.TABLE) -> dict[str, Any]:
         ) from error
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(
-            f"{path}: not readable as JSON ({error}); restore or delete it",
+            f"{path}: not readable as JSON ({error}); correct or restore it",
             reason="bad-json",
         ) from error
     if not isinstance(value, dict):
-        raise InputError(f"{path}: not a JSON object; restore or delete it", reason="bad-json")
+        raise InputError(f"{path}: not a JSON object; correct or restore it", reason="bad-json")
     return value
 
 
@@ -293,21 +291,32 @@ def read_tsv(path: Path) -> list[dict[str, str]]:
         ) from error
     except (OSError, ValueError) as error:
         raise InputError(
-            f"{path}: not readable as a table ({error}); restore or delete it",
+            f"{path}: not readable as a table ({error}); save it as UTF-8 text with tabs",
             reason="unreadable-table",
         ) from error
-    reader = csv.reader(io.StringIO(text), delimiter="\t", quoting=csv.QUOTE_NONE)
-    header = [name.strip() for name in next(reader, [])]
-    rows = [row for row in reader if any(map(str.strip, row))]
-    if any(len(row) != len(header) for row in rows):
-        raise InputError(
-            f"{path}: rows and header differ in length; restore or delete it", reason="bad-table"
-        )
+    lines = [line.split("\t") for line in re.split(r"\r\n?|\n", text)]
+    rows = [(number, cells) for number, cells in enumerate(lines, 1) if any(map(str.strip, cells))]
+    header = [name.strip() for name in _shortened(rows[0][1], 0)] if rows else []
+    size = len(header)
+    table = [(number, _shortened(cells, size)) for number, cells in rows[1:]]
+    for number, cells in table:
+        if len(cells) != size:
+            raise InputError(
+                f"{path}: line {number} has {len(cells)} cells, the header {size}; separate"
+                " cells by one tab, and write n/a in empty ones",
+                reason="bad-table",
+            )
     if repeated := sorted({name for name in header if header.count(name) > 1}):
         raise InputError(
             f"{path}: column {repeated[0]!r} occurs more than once; keep one", reason="bad-table"
         )
-    return [dict(zip(header, row, strict=True)) for row in rows]
+    return [dict(zip(header, cells, strict=True)) for _, cells in table]
+
+
+def _shortened(cells: Sequence[str], size: int) -> list[str]:
+    """Remove blank cells at the end of a row beyond a size, as spreadsheets write them."""
+    last = max((i for i, cell in enumerate(cells, 1) if cell.strip()), default=0)
+    return list(cells[: max(last, size)])
 
 
 def sha256_of(path: Path) -> str:

@@ -397,7 +397,10 @@ def test_damaged_hemispheres_are_left_out_by_name_and_other_versions_told(study,
     edit_record(place_of(study.out, "07", "R"), version="0.0.9")
     assert main([str(study.data), str(study.out), "group", *FAST]) == 0
     said = capsys.readouterr()
-    assert "29 participants in the model, 3 hemispheres or visits excluded" in said.out
+    assert (
+        "29 participants in the model, 3 exclusions of participants, visits or hemispheres"
+        in said.out
+    )
     assert "sub-05, hemisphere L, is excluded: thickness reaches 1e+30 mm" in said.out
     assert "sub-06, hemisphere R, is excluded: 100% of the curvature profile" in said.out
     assert said.err.startswith("warning: hemispheres were measured by several versions, 0.0.9 (1),")
@@ -458,6 +461,7 @@ def test_smaller_groups_that_vary_more_are_told_unless_the_model_allows_for_it(s
             files.write_tsv(path, list(rows[0]), [row.values() for row in rows])
         (study.out / "own.toml").write_text(settings)
         options = [*FAST, "--settings", str(study.out / "own.toml"), "--name", "spread"]
+        options.append("--allow-missing")
         assert main([str(study.data), str(study.out), "group", *options]) == 0
         said.append(capsys.readouterr().out)
     assert ["the smaller group varies more" in one for one in said] == [False, True, False]

@@ -130,10 +130,33 @@ def test_table_round_trip_keeps_rows_whole(tmp_path):
     assert files.read_tsv(path) == [{"a": "1", "b": "x y z"}, {"a": "n/a", "b": "n/a"}]
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        "a\tb\n1\t2\t\n3\t4\n",  # a tab at the end of a row
+        "a\tb\t\n1\t2\t\n3\t4\t\n",  # a column without name and cells
+        "a\tb\n1\t2\n\n3\t4\n\t\n\n",
+        "\ufeffa\tb\r\n1\t2\r\n3\t4\r\n",
+        "a\tb\r1\t2\r3\t4",
+    ],
+)
+def test_tables_of_spreadsheets_are_read(tmp_path, text):
+    path = tmp_path / "a.tsv"
+    path.write_bytes(text.encode())
+    assert files.read_tsv(path) == [{"a": "1", "b": "2"}, {"a": "3", "b": "4"}]
+
+
+def test_lines_of_errors_count_blank_lines(tmp_path):
+    path = tmp_path / "a.tsv"
+    path.write_text("a\tb\n\n1\t2\n1\t2\t3\n")
+    with pytest.raises(InputError, match="line 4 has 3 cells, the header 2"):
+        files.read_tsv(path)
+
+
 def test_broken_table_is_named(tmp_path):
     path = tmp_path / "a.tsv"
     path.write_text("a\tb\n1\n")
-    with pytest.raises(InputError, match="differ in length"):
+    with pytest.raises(InputError, match="line 2 has 1 cells, the header 2; separate cells by"):
         files.read_tsv(path)
     with pytest.raises(InputError, match="file not found"):
         files.read_tsv(tmp_path / "missing.tsv")

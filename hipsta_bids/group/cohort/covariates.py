@@ -15,6 +15,7 @@ import pandas as pd
 from hipsta_bids.derivatives.dataset import linked_path, read_links
 from hipsta_bids.derivatives.names import natural_order
 from hipsta_bids.errors import InputError, MissingFileError, ModelError
+from hipsta_bids.group.cohort.labels import match_labels
 from hipsta_bids.group.design.formula import as_factor, check_numbers, level_name, listed, typed
 from hipsta_bids.group.design.model import FIRST_AGE, Comparison, VisitTime
 from hipsta_bids.group.design.settings import GroupSettings
@@ -24,8 +25,14 @@ from hipsta_bids.io.files import MISSING, is_missing
 from hipsta_bids.opening import SETTINGS, read_bounded
 from hipsta_bids.types import PARTICIPANT, SESSION
 
-Spellings = Counter[tuple[str, str]]
-"""Numbers of cells that were read as missing, by column and spelling."""
+
+class Spellings(Counter[tuple[str, str]]):
+    """Numbers of cells that were read as missing, by column and spelling; also notes on labels."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.notes: list[str] = []
+
 
 #: Column of BIDS' sessions.tsv with dates, and columns that are made here.
 _DATE, TIME, _ICV = "acq_time", "time", "icv"
@@ -33,6 +40,8 @@ _DAYS_PER_YEAR = 365.25
 #: Levels of factors that are numbers, and characters of a name for one.
 _CODE = re.compile(r"-?\d+(\.\d+)?")
 _LONGEST_NAME = 40
+#: A level among words, and a missing value among numbers.
+_NO_DRUG = "none"
 #: A level whose description is this long, and spells a missing value, is one.
 _SHORTEST_MEANING = 5
 
@@ -69,12 +78,13 @@ def read_covariates(
     main = bids_dir / "participants.tsv"
     tables = [main] if main.exists() else []
     described: dict[str, object] = {}
-    spelled: Spellings = Counter()
+    spelled = Spellings()
     absent: frozenset[str] = frozenset()
     if not bids_dir.is_dir():
         raise MissingFileError(f"{bids_dir}: folder not found; check its name")
     for path in (*tables, *sorted((bids_dir / "phenotype").glob("*.tsv")), *extra):
         table, sidecar = _read(path), _sidecar(path.with_suffix(".json"))
+        _match(table, joined, path, spelled.notes)
         if path == main:
             _check_known(joined, table, path)
             absent = frozenset(joined[PARTICIPANT]) - frozenset(table[PARTICIPANT])
@@ -83,7 +93,9 @@ def read_covariates(
         described |= sidecar
         if path == main and (parts := _read_sessions(joined, bids_dir)):
             sidecar = _sidecar(bids_dir / "sessions.json")
-            table = mark_missing(pd.concat(parts, ignore_index=True), sidecar, spelled)
+            table = pd.concat(parts, ignore_index=True)
+            _match(table, joined, bids_dir / "sub-*_sessions.tsv", spelled.notes)
+            table = mark_missing(table, sidecar, spelled)
             joined = _join(joined, table, bids_dir / "sub-*_sessions.tsv")
             described |= sidecar
     for column in described.keys() & set(joined.columns):
@@ -103,13 +115,19 @@ def mark_missing(
 ) -> pd.DataFrame:
     """Mark cells that spell a missing value, and count the spellings by column.
 
-    A level that a sidecar lists is not missing, unless the sidecar marks it (``"9": "unknown"``).
+    A level that a sidecar lists is not missing, unless the sidecar marks it (``"9": "unknown"``),
+    or lists it as one of ``MissingValues``. ``none`` is a level among words: no drug, no diagnosis.
     """
     marked = table.copy()
     for name in table.columns:
-        levels = _levels(described.get(name))
+        description = described.get(name)
+        levels, declared = _levels(description), _missing_values(description)
         words = [cell for cell in table[name].unique() if isinstance(cell, str)]
-        is_cell_missing = table[name].isin([word for word in words if _is_missing(word, levels)])
+        missing = {word for word in words if _is_missing(word, levels)}
+        if not all(map(_is_number, set(words) - missing)):
+            missing -= {word for word in missing if word.strip().casefold() == _NO_DRUG}
+        missing |= {word for word in words if level_name(word) in declared}
+        is_cell_missing = table[name].isin(missing)
         cells = table.loc[is_cell_missing, name]
         spelled.update((str(name), cell) for cell in cells if cell.strip() not in {"", MISSING})
         if len(cells):
@@ -123,6 +141,21 @@ def _is_missing(cell: str, levels: Mapping[str, str]) -> bool:
         return is_missing(cell)
     # Shorter words, as none, say nothing of whether the level is known.
     return len(meaning) >= _SHORTEST_MEANING and is_missing(meaning)
+
+
+def _missing_values(description: object) -> set[str]:
+    """Return what a description of a column lists as ``MissingValues``, one or several."""
+    listed_values = description.get("MissingValues") if isinstance(description, Mapping) else None
+    values = listed_values if isinstance(listed_values, list) else [listed_values]
+    return {level_name(value) for value in values if value is not None}
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell.replace(",", "."))
+    except ValueError:
+        return False
+    return True
 
 
 def _without_codes(values: pd.Series, codes: Sequence[float], spelled: Spellings) -> pd.Series:
@@ -192,6 +225,16 @@ def _levels(description: object) -> dict[str, str]:
 def _level_word(meaning: str) -> str:
     """Name a level by what its description says, if that is short and may stand in a contrast."""
     return meaning if len(meaning) <= _LONGEST_NAME and not set(meaning) & set("[]=,") else ""
+
+
+def _match(table: pd.DataFrame, data: pd.DataFrame, path: Path, notes: list[str]) -> None:
+    """Write labels of participants and sessions as in the data, in place, and note it."""
+    for column in (PARTICIPANT, SESSION):
+        if column in table and data[column].notna().any():
+            labels = table[column].dropna()
+            matches, lines = match_labels(labels, data[column].dropna(), path.name)
+            table[column] = table[column].replace(matches)
+            notes += lines
 
 
 def _check_known(visits: pd.DataFrame, table: pd.DataFrame, path: Path) -> None:
@@ -315,7 +358,9 @@ def _read_text(path: Path) -> str:
     try:
         return read_bounded(path, SETTINGS).decode(errors="replace")
     except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error}); restore or delete it") from error
+        raise InputError(
+            f"{path}: cannot be read ({error}); check that it is a readable file"
+        ) from error
 
 
 def _number(text: str) -> float | None:

@@ -35,6 +35,8 @@ _LARGEST = 1e100
 INTERCEPT = "Intercept"
 #: Rows that a message names.
 _NAMED = 8
+#: Codes for missing values that may be values.
+_SMALL_CODES = (-4.0, -1.0)
 #: Two values are the same on a line and as a factor.
 _LEAST_LINE = 3
 
@@ -315,6 +317,7 @@ def check_numbers(values: pd.Series, settings: DesignSettings) -> None:
             )
     if not len(present):
         return
+    _refuse_small_codes(values.name, present)
     quartiles = np.quantile(present, [0.25, 0.5, 0.75])
     reach = settings.farthest * (quartiles[2] - quartiles[0])
     far = (present - quartiles[1]).abs() > reach
@@ -322,6 +325,26 @@ def check_numbers(values: pd.Series, settings: DesignSettings) -> None:
         raise ModelError(
             f"model: {values.name!r} has {cells(present[far])}, half of the others "
             f"{quartiles[0]:.4g} to {quartiles[2]:.4g}; correct them, or mark them n/a"
+        )
+
+
+def _refuse_small_codes(name: object, present: pd.Series) -> None:
+    """Refuse -1 and -4, which ADNI has for missing values, where other values are far above zero.
+
+    Far is more than the range of the middle half of the values, so that changes may be -1.
+    """
+    coded = present[present.isin(_SMALL_CODES)]
+    values_left = present[~present.isin(_SMALL_CODES)]
+    if not len(coded) or not len(values_left) or values_left.min() <= 0:
+        return
+    first, last = np.quantile(values_left, [0.25, 0.75])
+    if float(values_left.min()) - float(coded.max()) > last - first:
+        counts = ", ".join(
+            f"{code:g} ({n})" for code, n in coded.value_counts().sort_index().items()
+        )
+        raise ModelError(
+            f"model: {name!r} has {counts}, other values are from {values_left.min():g}; missing?"
+            f' write "MissingValues" of {name} in participants.json, or n/a'
         )
 
 

@@ -1,6 +1,5 @@
 """Registration and models of the group level on arrays, without files."""
 
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -270,7 +269,7 @@ def group(
         and any(values.ndim == _VERTICES for values in sides.values())
     ):
         raise ValueError("clusters of vertices need triangles, (faces, 3)")
-    spelled: Spellings = Counter()
+    spelled = Spellings()
     table = with_factors(mark_missing(table, {}, spelled), settings.design, settings.model)
     _, spec, _, levels = choose_model(request, table, settings)
     design = build_design(table, spec, settings.design, levels)

@@ -12,7 +12,7 @@ import pandas as pd
 from hipsta_bids import __version__
 from hipsta_bids.derivatives import dataset
 from hipsta_bids.derivatives.names import group_report
-from hipsta_bids.errors import ModelError, UsageError
+from hipsta_bids.errors import InputError, ModelError, UsageError
 from hipsta_bids.group.cohort import collect, external, read
 from hipsta_bids.group.cohort.covariates import add_icv, add_time, read_covariates, spelled_note
 from hipsta_bids.group.cohort.crop import Places, crop_maps
@@ -37,6 +37,8 @@ from hipsta_bids.protocols.toml import resolve
 from hipsta_bids.reports.group import write_group_report
 from hipsta_bids.types import PARTICIPANT, SESSION
 
+#: Share of participants that may be without a row in participants.tsv.
+_MOST_ABSENT = 0.1
 #: Hemispheres that notes name.
 _MOST_NOTES = 4
 
@@ -67,6 +69,8 @@ class GroupOptions:
     export_summary: str | None = None
     """Name of this site in a summary for other sites, empty for that of the folder; ``None`` for no
     summary."""
+    allow_missing: bool = False
+    """Whether many participants may be without a row in participants.tsv."""
     part: str = ""
     """End of the folder's name: of one analysis of several."""
     reports: bool = True
@@ -85,7 +89,7 @@ class GroupResult:
     n_participants: int
     """In the model."""
     n_excluded: int
-    """Hemispheres and visits."""
+    """Rows of excluded.tsv: participants, visits and hemispheres."""
     notes: tuple[str, ...]
     """What to know, one line each."""
     warnings: tuple[str, ...]
@@ -334,11 +338,8 @@ def read_study(
         records = collection.records
         measured, masked, mask_notes = mask_sheets(measured, records, options.sheets.masks)
     read.check_summaries(measures, measured.sides)
-    lacking = (
-        f"participants.tsv: has no row of {listed(sorted(absent))}; add it, or check its label"
-    )
     quality = _with_covariates(collection.quality, covariates, options, settings)
-    table_notes = [lacking] * bool(absent)
+    table_notes = [*spelled.notes, *_absence(absent, covariates, options)]
     if spelled:
         file = options.model.file and files.read_json(options.model.file)
         table_notes.append(spelled_note(spelled, options.model.formula or str(file), settings))
@@ -389,6 +390,19 @@ def read_study(
     )
     keep = members(cohort.table, among)
     return study.take(keep, ("not-asked", "another level than --among"))
+
+
+def _absence(absent: frozenset[str], covariates: pd.DataFrame, options: GroupOptions) -> list[str]:
+    """Note participants without a row in participants.tsv, or refuse to go on without many."""
+    count, names = covariates[PARTICIPANT].nunique(), listed(sorted(absent))
+    if len(absent) > _MOST_ABSENT * count and not options.allow_missing:
+        raise InputError(
+            f"participants.tsv: has no row of {len(absent)} of {count} participants: {names};"
+            " correct the labels, or give --allow-missing",
+            reason="bad-table",
+        )
+    note = f"participants.tsv: has no row of {names}; add it, or check its label"
+    return [note] * bool(absent)
 
 
 def _places(collection: collect.Collection) -> Places:

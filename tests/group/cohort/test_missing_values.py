@@ -1,15 +1,17 @@
 """Spellings of missing values: one list, for all kinds of columns and all tables."""
 
+import re
+
 import numpy as np
 import pandas as pd
 import pytest
 from small_cohorts import place_of
 
-from hipsta_bids.errors import InputError
+from hipsta_bids.errors import InputError, ModelError
 from hipsta_bids.group.cohort.covariates import read_covariates, spelled_note
 from hipsta_bids.group.cohort.exclusions import Choices
 from hipsta_bids.group.cohort.external import read_volumes
-from hipsta_bids.group.design.formula import typed, with_factors
+from hipsta_bids.group.design.formula import check_numbers, typed, with_factors
 from hipsta_bids.group.design.settings import GroupSettings
 from hipsta_bids.group.questions.models import group
 from hipsta_bids.inputs.edits import read_ends
@@ -68,17 +70,61 @@ def test_there_are_spellings_enough():
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_no_spelling_is_a_level_or_a_number_and_each_is_counted(tmp_path, kind):
-    cells = [*KINDS[kind], *SPELLINGS, "-99"]
+    # Among words, none is a level: no drug, no diagnosis.
+    nones = {"None", "NONE", "none"} if kind in {"sex", "group"} else set()
+    spellings = [cell for cell in SPELLINGS if cell not in nones]
+    cells = [*KINDS[kind], *spellings, "-99"]
     table, absent, spelled = read(tmp_path, {kind: cells}, visits=len(cells))
     values = typed(table[kind])
     assert not absent
     assert [cell for cell, value in zip(cells, values, strict=True) if pd.notna(value)] == KINDS[
         kind
     ]
-    expected = dict.fromkeys(SPELLINGS, 1) | {"-99": 2}
+    expected = dict.fromkeys(spellings, 1) | {"-99": 2}
     assert dict(spelled) == {
         (kind, cell): n for cell, n in expected.items() if cell.strip() not in {"", "n/a"}
     }
+
+
+def test_missing_values_of_the_sidecar_are_missing(tmp_path):
+    columns = {
+        "apoe": ["None" if i % 2 else "e4" for i in range(N)],
+        "cdr": ["-1" if i % 4 == 0 else str(i) for i in range(N)],
+    }
+    table, _, spelled = read(tmp_path, columns)
+    assert not spelled
+    assert set(typed(table["apoe"])) == {"None", "e4"}
+    sidecar = {"apoe": {"MissingValues": "None"}, "cdr": {"MissingValues": [-1, -4]}}
+    table, _, spelled = read(tmp_path, columns, sidecar)
+    assert dict(spelled) == {("apoe", "None"): N / 2, ("cdr", "-1"): N / 4}
+    assert typed(table["apoe"]).dropna().unique().tolist() == ["e4"]
+    assert typed(table["cdr"]).min() == 1
+
+
+@pytest.mark.parametrize(
+    ("values", "code"),
+    [
+        ([*range(18, 31), -4, -4], "-4 (2)"),  # scores of a test
+        ([*range(8, 21), -1], "-1 (1)"),  # years of education
+        ([*range(55, 90), -4, -1], "-4 (1), -1 (1)"),
+    ],
+)
+def test_codes_of_adni_are_refused_with_their_counts(values, code):
+    with pytest.raises(ModelError, match=re.escape(f"'mmse' has {code}, other values are from")):
+        check_numbers(pd.Series(values, dtype=float, name="mmse"), GroupSettings().design)
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        [-1.0, 0.3, 1.2, -0.4, 0.0, 2.1],  # z-scores
+        [0.5, 1.5, 2.0, 3.5, 6.0, -1.0],  # changes
+        [*range(30), -1],  # zero is a value
+        [-4, -1, -3, -2, -5],
+    ],
+)
+def test_true_values_of_minus_one_are_numbers(values):
+    check_numbers(pd.Series(values, dtype=float), GroupSettings().design)
 
 
 def test_words_that_look_alike_are_levels(tmp_path):
@@ -95,7 +141,8 @@ def test_a_level_that_the_sidecar_lists_is_one(tmp_path):
         "smoker": [("yes", "no", "NA")[i % 3] for i in range(N)],
     }
     table, _, spelled = read(tmp_path, columns)
-    assert spelled["treatment", "none"] == spelled["amyloid", "-"] == N / 2
+    assert spelled["treatment", "none"] == 0
+    assert spelled["amyloid", "-"] == N / 2
     levels = {
         "treatment": {"none": "no treatment", "drug": "10 mg"},
         "amyloid": {"-": "", "+": "", "n/a": "not measured"},
