@@ -201,15 +201,17 @@ def summarize(
     notes = []
     if lacking := len(analysis.design.rows) - len(rows):
         notes.append(f"{SUMMARY}: without {lacking} participants who lack a hemisphere")
-    kept = _most_complete(analysis, rows, settings.exchange.min_cell)
+    sample = _most_complete(analysis, rows, settings.exchange.min_cell)
     try:
-        summary, omissions = _summarize(cohort, analysis, settings, kept, site=site, inputs=inputs)
+        summary, omissions = _summarize(
+            cohort, analysis, settings, sample, site=site, inputs=inputs
+        )
     except ModelError:
-        if len(kept) == len(rows):
+        if len(sample) == len(rows):
             raise
-        kept = rows
+        sample = rows
         summary, omissions = _summarize(cohort, analysis, settings, rows, site=site, inputs=inputs)
-    if omitted := len(rows) - len(kept):
+    if omitted := len(rows) - len(sample):
         notes.append(f"{SUMMARY}: without {omitted} participants who lack values at many points")
     return summary, notes + omissions
 
@@ -220,11 +222,15 @@ def _most_complete(analysis: Analysis, rows: Int, least: int) -> Int:
     At least ``least`` rows are omitted, and at most a tenth, if this is more.
     """
     blocks = [
-        np.isnan(values[np.searchsorted(one.maps.rows, rows)]).reshape(len(rows), -1)
-        for one in analysis.fitted.values()
-        for values in (one.maps.maps[measure] for measure in one.fits)
+        np.isnan(side.maps.maps[measure][np.searchsorted(side.maps.rows, rows)])
+        for side in analysis.fitted.values()
+        for measure in side.fits
     ]
-    missing = np.hstack(blocks) if blocks else np.zeros((len(rows), 0), dtype=np.bool_)
+    missing = (
+        np.hstack([b.reshape(len(rows), -1) for b in blocks])
+        if blocks
+        else np.zeros((len(rows), 0), dtype=np.bool_)
+    )
     missing = missing[:, ~missing.all(axis=0)]
     order, left = np.arange(len(rows)), np.ones(len(rows), dtype=np.bool_)
     options = [(int((~missing.any(axis=0)).sum()) * len(rows), rows)]
