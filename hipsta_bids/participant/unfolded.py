@@ -28,8 +28,8 @@ Unfolded = tuple[str, Float]
 """Label of an unfolded surface, and shares of its vertices."""
 _LARGEST = 1 + 1e-4
 """Of a proximal-distal coordinate, with room for rounding."""
-_REACH = 1.5
-"""mm of HippUnfold's sheet: the grid ends 1 mm before its edges, 1.3 mm by proximal-distal x."""
+_REACH = 1.75
+"""mm of HippUnfold's sheet: by proximal-distal x the grid ends up to 1.5 mm before its edges."""
 
 
 class Correspondence:

@@ -114,7 +114,7 @@ def test_a_map_comes_back_and_what_is_missing_stays_missing(flat, tmp_path, caps
 
 
 def test_vertices_far_from_the_grid_or_beside_missing_values_have_no_value():
-    """A grid up to 0.8 ends 2 mm before the edges of 20 mm; 1.5 mm are filled."""
+    """A grid up to 0.8 ends 2 mm before the edges of 20 mm; 1.75 mm are filled."""
     sheet = Settings().sheet.changed(x_extent=0.8)
     x, y, _ = sheet_levels(sheet, "whole")
     lateral = np.array([0.05, 0.95, 0.03, 0.0, 1.0, 0.5])  # 1, 1, 1.4, 2, 2 mm beyond, and inside
