@@ -32,7 +32,7 @@ _VIEW = {"L": (38.0, -140.0), "R": (38.0, -40.0)}
 
 
 def plot_sheet(
-    data: Measurement | xr.Dataset,
+    data: Measurement | xr.Dataset | xr.DataArray,
     measure: str = "thickness",
     *,
     ax: "Axes | None" = None,
@@ -46,10 +46,11 @@ def plot_sheet(
 
     Parameters
     ----------
-    data : Measurement or xarray.Dataset
-        What :func:`hipsta_bids.measure` gave, or one hemisphere of :func:`hipsta_bids.load`.
+    data : Measurement, xarray.Dataset or xarray.DataArray
+        What :func:`hipsta_bids.measure` gave, or one hemisphere of :func:`hipsta_bids.load`, or
+        one map of it.
     measure : str
-        Name of a map.
+        Name of a map; a DataArray that has a name keeps its own.
     ax : Axes, optional
         Where to draw; else the current axes of pyplot.
     limits : tuple of float, optional
@@ -76,12 +77,16 @@ def plot_sheet(
     >>> ax.get_title(), ax.get_xlabel()
     ('left', 'medial  ←  mm  →  lateral')
     """
+    if isinstance(data, xr.DataArray):
+        measure = measure if data.name is None else str(data.name)
+        data = data.to_dataset(name=measure)
     data = _one_hemisphere(data)
     columns, side = _columns(data, measure)
     sheet = _sheet(data, columns)
     kind = _kind(measure)
     ax = ax or _current_axes()
-    extents = [float(np.nanmean(columns.get(f"extent_{axis}", np.nan))) for axis in "xy"]
+    names = "extent_x", "extent_y"
+    extents = [float(np.nanmean(columns[n])) if n in columns else np.nan for n in names]
     scale = limits or display.scale_of(kind, [columns[measure]])
     image = draw_sheet(ax, sheet, kind, scale, extents=extents, hemi=side)
     ax.set_ylabel("  ←  →  ".join(display.Y_ENDS))

@@ -122,9 +122,10 @@ def surface_bytes(
     return _encode([vertices, faces], hemi)
 
 
-def shape_bytes(values: Float, *, hemi: str, name: str, unit: str) -> bytes:
+def shape_bytes(values: Float, *, hemi: str, name: str, unit: str, note: str = "") -> bytes:
     """Encode one number per vertex, NaN where missing."""
-    return _encode([_array(values, "SHAPE", {"Name": name, "Units": unit})], hemi)
+    meta = {"Name": name, "Units": unit} | ({"Description": note} if note else {})
+    return _encode([_array(values, "SHAPE", meta)], hemi)
 
 
 def maps_bytes(values: Float, *, hemi: str, names: Sequence[str], series: bool = True) -> bytes:
@@ -134,14 +135,15 @@ def maps_bytes(values: Float, *, hemi: str, names: Sequence[str], series: bool =
     return _encode(arrays, hemi)
 
 
-def cifti_bytes(values: Mapping[str, Float], names: Sequence[str]) -> bytes:
+def cifti_bytes(values: Mapping[str, Float], names: Sequence[str], note: str = "") -> bytes:
     """Encode maps of both sides as CIFTI-2; ``values`` are (maps, vertices) by hemisphere."""
     models = [
         BrainModelAxis.from_surface(np.arange(one.shape[1]), one.shape[1], _STRUCTURE[hemi])
         for hemi, one in values.items()
     ]
     data = np.concatenate(list(values.values()), axis=1).astype(np.float32)
-    axes = ScalarAxis(list(names)), sum(models[1:], start=models[0])
+    meta = [{"Description": note} if note else {} for _ in names]
+    axes = ScalarAxis(list(names), meta), sum(models[1:], start=models[0])
     image = Cifti2Image(data, axes)
     image.nifti_header.set_intent("ConnDenseScalar")
     content: bytes = image.to_bytes()

@@ -2,7 +2,8 @@
 
 Both versions have one rectangle, 40 mm from the posterior to the anterior end and 20 mm from the
 subiculum to CA3 (5 mm of the dentate gyrus). Version 1 has the long axis along x (DeKraker et al.
-2022, eLife 11:e77945), version 2 along y.
+2022, eLife 11:e77945), as early versions 2 do; later ones have it along y, and x of the left side
+has the opposite sign (https://github.com/khanlab/hippunfold/pull/534, MICA-MNI/z-brains issue 81).
 """
 
 import re
@@ -14,8 +15,12 @@ from hipsta_bids.io.files import entities
 from hipsta_bids.types import Float, Mesh
 
 _LOW, _LENGTH = np.array([-40.0, -200.0]), 40.0  # mm
+#: mm, of the hippocampus.
+SHEET_SIZE = np.array([40.0, 20.0])
 _WIDTHS = {"hipp": 20.0, "dentate": 5.0}  # mm
 _ROOM = 0.5  # mm by which vertices may lie outside the rectangle
+#: Columns of the long and the short axis, and their signs: x first, y first, y first on the left.
+_ORDERS = (([0, 1], [1, 1]), ([1, 0], [1, 1]), ([1, 0], [1, -1]))
 #: Share of the rectangle that a surface covers; outer vertices may lie a spacing inside of it.
 _COVERED = 0.9, 0.7
 
@@ -32,11 +37,12 @@ def unfolded_shares(flat: Mesh) -> tuple[str, Float] | None:
 
     Returns the surface's label, ``hipp`` or ``dentate``, and shares (V, 2) of the way from the
     posterior to the anterior end, and from the subiculum to CA3, or across the dentate gyrus.
+    The ranges of x and y differ, so that they decide which of them is the long axis.
     """
     for label, width in _WIDTHS.items():
         size = np.array([_LENGTH, width])
-        for axes in ([0, 1], [1, 0]):
-            shares = (flat.points[:, axes] - _LOW) / size
+        for axes, signs in _ORDERS:
+            shares = (flat.points[:, axes] * signs - _LOW) / size
             low, high = shares.min(axis=0), shares.max(axis=0)
             inside = (low >= -_ROOM / size).all() and (high <= 1 + _ROOM / size).all()
             if flat.flat and inside and (high - low >= _COVERED).all():

@@ -10,13 +10,14 @@ from pathlib import Path
 
 import numpy as np
 from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
+from scipy.spatial import cKDTree
 
 from hipsta_bids.errors import InputError, UsageError
 from hipsta_bids.geometry.catalog import MAPS
 from hipsta_bids.geometry.sheet import sheet_levels
 from hipsta_bids.io import files, gifti
 from hipsta_bids.io.gifti import DENSE_SCALARS, PointMap
-from hipsta_bids.io.hippunfold import unfolded_shares
+from hipsta_bids.io.hippunfold import SHEET_SIZE, unfolded_shares
 from hipsta_bids.participant.maps import write_nodes
 from hipsta_bids.settings import SheetSettings
 from hipsta_bids.types import Float
@@ -27,6 +28,8 @@ Unfolded = tuple[str, Float]
 """Label of an unfolded surface, and shares of its vertices."""
 _LARGEST = 1 + 1e-4
 """Of a proximal-distal coordinate, with room for rounding."""
+_REACH = 1.75
+"""mm of HippUnfold's sheet: by proximal-distal x the grid ends up to 1.5 mm before its edges."""
 
 
 class Correspondence:
@@ -41,6 +44,8 @@ class Correspondence:
         """
         x, y, _ = sheet_levels(settings, "whole")
         anterior, lateral = shares.T
+        #: mm of HippUnfold's sheet per unit of x and y.
+        self.scale: Float = SHEET_SIZE[::-1] / [2, y[-1] - y[0]]
         #: (V, 2) from -1 to 1 between the edges, and y between the ends of the sheet.
         self.places: Float = np.column_stack([2 * lateral - 1, y[0] + anterior * (y[-1] - y[0])])
         along = np.broadcast_to(y, (len(x), len(y)))
@@ -50,11 +55,21 @@ class Correspondence:
         #: (Nx, Ny, 2) the same of the nodes; NaN where the sheet has none.
         self.nodes: Float = np.stack([across, np.where(np.isnan(across), np.nan, along)], axis=-1)
 
-    def to_vertices(self, values: Float) -> Float:
-        """Interpolate a map (Nx, Ny) at the vertices (V,); NaN beside NaN and beyond the nodes."""
+    def to_vertices(self, values: Float) -> tuple[Float, Float]:
+        """Interpolate a map (Nx, Ny) at the vertices (V,), NaN beside NaN.
+
+        Vertices beyond the nodes take the value of the nearest node, up to `_REACH`. Also returns
+        how far (V,) that node is, mm of HippUnfold's sheet; 0 where the map was interpolated.
+        """
         finite = np.isfinite(self.nodes).all(axis=-1)
-        sample = LinearNDInterpolator(self.nodes[finite], values[finite])
-        return np.asarray(sample(self.places), dtype=np.float64)
+        nodes, sources = self.nodes[finite], values[finite]
+        # A second column without gaps distinguishes vertices beyond the nodes from missing values.
+        sample = LinearNDInterpolator(nodes, np.column_stack([sources, np.zeros(len(sources))]))
+        moved, beyond = sample(self.places).T
+        distance, nearest = cKDTree(nodes * self.scale).query(self.places * self.scale)
+        is_near = np.isnan(beyond) & (distance <= _REACH)
+        moved = np.where(is_near, sources[nearest], moved)
+        return moved, np.where(is_near & np.isfinite(moved), distance, 0.0)
 
     def to_nodes(self, values: Float) -> Float:
         """Interpolate numbers (V, ...) at the nodes (Nx, Ny, ...), NaN beside NaN and beyond."""
@@ -91,6 +106,7 @@ def resample(
     positions_of = {hemi: side.values for path in sheets for hemi, side in _read(path, column)}
     moved: dict[str, PointMap] = {}
     path_of: dict[str, Path] = {}
+    distances: list[Float] = []
     to_vertices = bool(targets)
     sides = ((path, *pair) for path in paths for pair in _read(path, column))
     for path, hemi, side in sides:
@@ -101,23 +117,30 @@ def resample(
             target = _of_side(target_of, hemi, path, "--to-surface")
             values = _to_surface(path, side, surface, target)
         else:
-            on_nodes, values = _to_other(path, side, surface, settings, positions_of.get(hemi))
+            on_nodes, values, distance = _to_other(
+                path, side, surface, settings, positions_of.get(hemi)
+            )
+            distances.append(distance[distance > 0])
             if moved and on_nodes != to_vertices:
                 raise _several(f"{path}: is not on the same points as {paths[0]}")
             to_vertices = on_nodes
         moved[hemi], path_of[hemi] = replace(side, values=values), path
-    _write(out, moved, to_nodes=not to_vertices)
+    filled = np.concatenate(distances) if distances else np.zeros(0)
+    note = f"{filled.size} have the nearest value, up to {filled.max(initial=0):.2f} mm away"
+    _write(out, moved, to_nodes=not to_vertices, note=note if filled.size else "")
     missing = np.mean(np.isnan(np.concatenate([side.values.ravel() for side in moved.values()])))
     points = "vertices of HippUnfold" if to_vertices else "nodes of the whole sheet"
     points_each = ", ".join(f"{side.values.size} {hemi}" for hemi, side in moved.items())
-    return f"{out}: {points_each} {points}, {missing:.0%} without a value"
+    text = f"{out}: {points_each} {points}, {missing:.0%} without a value"
+    return f"{text}; {note}" if filled.size else text
 
 
 def _to_other(
     path: Path, side: PointMap, surface: Unfolded, settings: SheetSettings, places: Float | None
-) -> tuple[bool, Float]:
+) -> tuple[bool, Float, Float]:
     """Move a map from the nodes of the sheet to vertices, or from there; return whether the former.
 
+    Also returns how far each vertex beyond the nodes is from the node whose value it has.
     ``places`` are the sheet's proximal-distal coordinates, if they were given.
     """
     label, shares = surface
@@ -134,14 +157,14 @@ def _to_other(
         places = places.reshape(nodes)
     between = Correspondence(shares, settings, places)
     if len(side.values) == nodes[0] * nodes[1] and side.nodes in (None, nodes):
-        return True, between.to_vertices(side.values.reshape(nodes))
+        return True, *between.to_vertices(side.values.reshape(nodes))
     if len(side.values) != len(shares):
         raise InputError(
             f"{path}: {len(side.values)} points fit neither the sheet ({nodes[0]} x "
             f"{nodes[1]}) nor the surface ({len(shares)}); give its surface, or "
             "--settings"
         )
-    return False, between.to_nodes(side.values)
+    return False, between.to_nodes(side.values), np.zeros(0)
 
 
 def _to_surface(path: Path, side: PointMap, surface: Unfolded, target: Unfolded) -> Float:
@@ -196,17 +219,17 @@ def _of_side(
     return surface
 
 
-def _write(out: Path, maps: Mapping[str, PointMap], *, to_nodes: bool) -> None:
+def _write(out: Path, maps: Mapping[str, PointMap], *, to_nodes: bool, note: str) -> None:
     (hemi, first), *further_maps = maps.items()
     if out.name.endswith(DENSE_SCALARS):
         sides = {hemi: maps[hemi].values.ravel()[None] for hemi in sorted(maps)}
-        files.write_bytes(out, gifti.cifti_bytes(sides, [first.name]))
+        files.write_bytes(out, gifti.cifti_bytes(sides, [first.name], note))
         return
     if further_maps:
         raise UsageError(f"{out}: holds one side; name a {DENSE_SCALARS} file for both")
     if out.suffix != TABLE:
         values = first.values.ravel()
-        content = gifti.shape_bytes(values, hemi=hemi, name=first.name, unit=first.unit)
+        content = gifti.shape_bytes(values, hemi=hemi, name=first.name, unit=first.unit, note=note)
         files.write_bytes(out, content)
         return
     if not to_nodes:

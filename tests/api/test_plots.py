@@ -34,6 +34,17 @@ class TestSheet:
         assert {text.get_text() for text in axis.texts} >= {"CA1", "Sub"}
         assert axis.figure.axes[1].get_ylabel() == "mean curvature [1/mm]"
 
+    def test_a_map_alone_is_drawn_as_in_its_dataset(self):
+        maps = found("L").dataset
+        axis = hb.plot_sheet(maps["curvature"], ax=Figure().subplots())
+        np.testing.assert_array_equal(drawn(axis).get_array(), found("L").maps["curvature"].T)
+        assert axis.figure.axes[1].get_ylabel() == "mean curvature [1/mm]"
+        unnamed = maps["thickness"].transpose("y", "x").rename(None)
+        axis = hb.plot_sheet(unnamed, ax=Figure().subplots())
+        np.testing.assert_array_equal(drawn(axis).get_array(), found("L").maps["thickness"].T)
+        with pytest.raises(ValueError, match="thickness has the axes x; select one"):
+            hb.plot_sheet(maps["thickness"].isel(y=0, drop=True), ax=Figure().subplots())
+
     def test_both_sides_lie_alike(self):
         """As on all pages."""
         axes = Figure().subplots(1, 2)

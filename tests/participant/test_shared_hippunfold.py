@@ -1,22 +1,27 @@
 """HippUnfold's labels and surfaces: its own walls are known, so thickness can be compared."""
 
+import re
 from functools import cache
 from pathlib import Path
 
 import nibabel as nib
 import numpy as np
+import pandas as pd
 import pytest
-from hippunfold_like import write_map
+from hippunfold_like import write_map, write_surface
 from measured_phantoms import measure
 from scipy.spatial import cKDTree
 
 from hipsta_bids.cli.main import main
 from hipsta_bids.errors import GeometryError
+from hipsta_bids.geometry.sheet import sheet_levels
 from hipsta_bids.inputs.labels import read_label_volume
 from hipsta_bids.inputs.scan import HemisphereInput
 from hipsta_bids.inputs.search import InputRequest, find_hemispheres
 from hipsta_bids.io.gifti import read_mesh
+from hipsta_bids.io.hippunfold import unfolded_shares
 from hipsta_bids.protocols.load import load_protocol
+from hipsta_bids.settings import Settings
 from validation import hippunfold
 
 DATA = (Path(__file__).parents[2] / ".." / "shared" / "data" / "hippunfold").resolve()
@@ -131,3 +136,49 @@ def test_labels_of_surfaces_that_are_moved_have_to_agree(tmp_path, capsys):
     assert "give surfaces of one label" in capsys.readouterr().err
     assert main(["resample", str(path), out, "--surface", dentate]) == 65
     assert "the sheet has no dentate" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("label", ["hipp", "dentate"])
+@pytest.mark.parametrize("order", ["x first", "y first", "y first, left"])
+def test_maps_are_the_same_on_canonical_surfaces_by_both_orders_of_axes(tmp_path, label, order):
+    """HippUnfold 2 swapped x and y late; then x of left surfaces has the other sign."""
+    start, goal = canonical("0p5mm", label), read_mesh(MAPS / FLAT.format("unfold", "2k", label))
+    assert np.ptp(goal.points[:, 1]) > np.ptp(goal.points[:, 0])  # the published file: y is long
+    turned = {
+        "x first": goal.points[:, [1, 0, 2]],
+        "y first": goal.points,
+        "y first, left": goal.points * [-1, 1, 1],
+    }[order]
+    moved = []
+    values, source = np.sin(start[:, 1] / 6) + 0.05 * start[:, 0], tmp_path / "hemi-L_a.shape.gii"
+    write_map(source, values)
+    for number, points in enumerate((goal.points, turned)):
+        flat = tmp_path / f"{number}_unfold.surf.gii"
+        write_surface(flat, points, goal.triangles)
+        out = tmp_path / f"hemi-L_{number}.shape.gii"
+        dense = MAPS / FLAT.format("unfold", "0p5mm", label)
+        given = source, out, "--surface", dense, "--to-surface", flat
+        assert main(["resample", *map(str, given)]) == 0
+        moved.append(nib.load(out).agg_data())
+    np.testing.assert_allclose(moved[1], moved[0], atol=1e-6)  # of 32-bit floats
+    nearest = cKDTree(start).query(canonical("2k", label))[1]
+    assert np.corrcoef(moved[1], values[nearest])[0, 1] >= 0.99
+
+
+@pytest.mark.parametrize("density", ["0p5mm", "2k", "512"])
+def test_all_vertices_of_both_versions_have_a_value_of_a_whole_sheet(tmp_path, density, capsys):
+    x, y, _ = sheet_levels(Settings().sheet, "whole")
+    rows = [
+        (i + 1, j + 1, (1 + at) / 2) for i, at in enumerate(x) for j in range(len(y))
+    ]  # the share of the way to CA3
+    sheet = tmp_path / "sub-01_hemi-L_seg-hippunfold_label-whole_desc-sheet_morph.tsv"
+    pd.DataFrame(rows, columns=["x", "y", "thickness"]).to_csv(sheet, sep="\t", index=False)
+    flat, out = MAPS / FLAT.format("unfold", density, "hipp"), tmp_path / "hemi-L_a.shape.gii"
+    assert main(["resample", str(sheet), str(out), "--surface", str(flat)]) == 0
+    _, shares = unfolded_shares(read_mesh(flat))
+    expected = np.clip(shares[:, 1], (1 + x[0]) / 2, (1 + x[-1]) / 2)
+    np.testing.assert_allclose(nib.load(out).agg_data(), expected, atol=1e-6)  # 32-bit floats
+    assert "0% without a value; " in capsys.readouterr().out
+    text = nib.load(out).darrays[0].meta["Description"]
+    far = float(re.search(r"up to ([\d.]+) mm", text)[1])
+    assert 0.8 < far < 1.1  # 1 mm between grid and edge, and up to half a row of 0.8 mm

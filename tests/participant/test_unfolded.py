@@ -6,10 +6,11 @@ import pandas as pd
 import pytest
 from hippunfold_like import write_cifti, write_map, write_surface
 from scipy.ndimage import binary_dilation
-from scipy.spatial import Delaunay
+from scipy.spatial import Delaunay, cKDTree
 
 from hipsta_bids.cli.main import main
 from hipsta_bids.geometry.sheet import sheet_levels
+from hipsta_bids.participant.unfolded import Correspondence
 from hipsta_bids.settings import Settings
 
 X, Y, _ = sheet_levels(Settings().sheet, "whole")
@@ -57,8 +58,16 @@ def test_sides_meet_the_same_sides(flat, tmp_path):
         assert image.darrays[0].meta["Units"] == "mm"
         found = image.agg_data()
         on_grid = np.abs(2 * lateral - 1) <= X[-1]
-        np.testing.assert_array_equal(np.isfinite(found), on_grid)  # nothing is extrapolated
         np.testing.assert_allclose(found[on_grid], theirs[on_grid], atol=1e-6)
+        nearest = cKDTree(np.column_stack([40 * y.ravel(), 20 * x.ravel()])).query(
+            np.column_stack([40 * anterior, 20 * lateral])
+        )
+        # Beyond the grid, which ends 1 mm before the edges, the nearest node has the value.
+        expected = ours.ravel()[nearest[1]]
+        np.testing.assert_allclose(found[~on_grid], expected[~on_grid], atol=1e-6)
+        note = image.darrays[0].meta["Description"]
+        far = nearest[0][~on_grid].max()
+        assert note == f"{(~on_grid).sum()} have the nearest value, up to {far:.2f} mm away"
         path = tmp_path / f"{STEM.format('R')}_thickness.shape.gii"
         write_map(path, theirs)
         assert resample(path, tmp_path / "nodes.tsv", surface=surface) == 0
@@ -75,9 +84,8 @@ def test_the_own_coordinate_of_a_sheet_takes_the_place_of_x(flat, tmp_path, caps
     sheet, out = write_sheet(tmp_path, across), tmp_path / "vertices.shape.gii"
     assert resample(sheet, out, "--sheet", own, surface=surface) == 0
     found, lateral = nib.load(out).agg_data(), 2 * (points[:, 1] + 200) / 20 - 1
-    known = np.isfinite(found)
-    assert known[np.abs(lateral) < across.max() - 1e-6].all()
-    np.testing.assert_allclose(found[known], lateral[known], atol=1e-5)
+    expected = np.clip(lateral, across.min(), across.max())  # of the nearest node beyond the edges
+    np.testing.assert_allclose(found, expected, atol=1e-5)
     for wrong in (across.ravel()[:-1], across.ravel() + 1):  # the latter may be thickness
         write_map(own, wrong)
         capsys.readouterr()
@@ -103,6 +111,20 @@ def test_a_map_comes_back_and_what_is_missing_stays_missing(flat, tmp_path, caps
     assert not (np.isnan(found)[inner] & ~binary_dilation(gap, np.ones((3, 3)))[inner]).any()
     assert np.abs(found - values)[known].max() < 0.01
     assert np.abs(found - values)[known].mean() < 0.002
+
+
+def test_vertices_far_from_the_grid_or_beside_missing_values_have_no_value():
+    """A grid up to 0.8 ends 2 mm before the edges of 20 mm; 1.75 mm are filled."""
+    sheet = Settings().sheet.changed(x_extent=0.8)
+    x, y, _ = sheet_levels(sheet, "whole")
+    lateral = np.array([0.05, 0.95, 0.03, 0.0, 1.0, 0.5])  # 1, 1, 1.4, 2, 2 mm beyond, and inside
+    shares = np.column_stack([np.full(6, 0.5), lateral])
+    values = np.where(x[:, None] > 0.7, np.nan, np.ones((len(x), len(y))))
+    moved, distance = Correspondence(shares, sheet).to_vertices(values)
+    np.testing.assert_array_equal(moved, [1, np.nan, 1, np.nan, np.nan, 1])
+    # The middle of the sheet lies on no row: the nearest is up to 0.4 mm away along y.
+    assert distance[0] == pytest.approx(np.hypot(1, 40 * np.abs((y + 2) / 5 - 0.5).min()))
+    assert (distance[[1, 3, 4, 5]] == 0).all()
 
 
 def test_both_sides_go_into_one_cifti_file_and_out_of_it(flat, tmp_path):

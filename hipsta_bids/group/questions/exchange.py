@@ -195,13 +195,68 @@ def summarize(
     number that it could be traced to one of them.
     """
     _check_model(analysis, settings)
-    compared = analysis.compared
     rows: Int = analysis.design.rows
-    for side in compared.sides.values():
+    for side in analysis.compared.sides.values():
         rows = np.intersect1d(rows, side.rows)
     notes = []
     if lacking := len(analysis.design.rows) - len(rows):
         notes.append(f"{SUMMARY}: without {lacking} participants who lack a hemisphere")
+    sample = _most_complete(analysis, rows, settings.exchange.min_cell)
+    try:
+        summary, omissions = _summarize(
+            cohort, analysis, settings, sample, site=site, inputs=inputs
+        )
+    except ModelError:
+        if len(sample) == len(rows):
+            raise
+        sample = rows
+        summary, omissions = _summarize(cohort, analysis, settings, rows, site=site, inputs=inputs)
+    if omitted := len(rows) - len(sample):
+        notes.append(f"{SUMMARY}: without {omitted} participants who lack values at many points")
+    return summary, notes + omissions
+
+
+def _most_complete(analysis: Analysis, rows: Int, least: int) -> Int:
+    """Choose rows, all or without the least complete, that have most values at complete points.
+
+    At least ``least`` rows are omitted, and at most a tenth, if this is more.
+    """
+    blocks = [
+        np.isnan(side.maps.maps[measure][np.searchsorted(side.maps.rows, rows)])
+        for side in analysis.fitted.values()
+        for measure in side.fits
+    ]
+    missing = (
+        np.hstack([b.reshape(len(rows), -1) for b in blocks])
+        if blocks
+        else np.zeros((len(rows), 0), dtype=np.bool_)
+    )
+    missing = missing[:, ~missing.all(axis=0)]
+    order, left = np.arange(len(rows)), np.ones(len(rows), dtype=np.bool_)
+    options = [(int((~missing.any(axis=0)).sum()) * len(rows), rows)]
+    for n_omitted in range(1, min(max(least, len(rows) // 10), len(rows) - 1) + 1):
+        is_last = missing[left].sum(axis=0) == 1
+        freed = missing[left] @ is_last.astype(np.int64)
+        # Participants who alone lack a point are omitted first, then those who lack most.
+        first = np.lexsort((missing[left].sum(axis=1), freed))[-1]
+        left[order[left][first]] = False
+        if n_omitted >= least:
+            n_points = int((~missing[left].any(axis=0)).sum())
+            options.append((n_points * int(left.sum()), rows[left]))
+    return max(options, key=lambda option: option[0])[1]
+
+
+def _summarize(
+    cohort: Cohort,
+    analysis: Analysis,
+    settings: GroupSettings,
+    rows: Int,
+    *,
+    site: str,
+    inputs: Mapping[str, Any],
+) -> tuple[dict[str, Any], list[str]]:
+    """Make the summary of the participants in ``rows``, and note its omissions."""
+    compared, notes = analysis.compared, []
     table = compared.table.iloc[rows]
     designs = {}
     for formula in dict.fromkeys((analysis.model.formula, *(f for _, f in analysis.measures))):

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 from dataclasses import replace
 
 import nibabel as nib
@@ -18,6 +19,7 @@ from small_cohorts import (
 )
 
 from hipsta_bids.cli.main import main
+from hipsta_bids.geometry.catalog import MAPS
 from hipsta_bids.group.output import write
 from hipsta_bids.group.questions import analysis
 from hipsta_bids.io import files
@@ -165,6 +167,38 @@ def test_every_number_is_about_the_same_participants(cohort, tmp_path, capsys):
     assert content["participants"] == 23
     assert {model["df"] for model in content["models"]} == {19}
     assert "without 1 participants who lack a hemisphere" in capsys.readouterr().out
+
+
+def test_five_with_most_missing_points_are_omitted_unless_cells_get_small(cohort, tmp_path, capsys):
+    """All numbers are then about the others; with cells of six, all participants stay."""
+    data, out = cohort
+    results = tmp_path / "out"
+    shutil.copytree(out, results, ignore=shutil.ignore_patterns("group"))
+    for number, label in enumerate(("01", "02", "03", "25", "26")):
+        for hemi in "LR":
+            path = place_of(results, label, hemi).path("sheet")
+            sheet = pd.read_csv(path, sep="\t", dtype=str, keep_default_na=False)
+            maps = [name for name in sheet if name in {row.name for row in MAPS}]
+            sheet.loc[range(20 * number, 20 * number + 20), maps] = "n/a"
+            sheet.to_csv(path, sep="\t", index=False)
+    options = ("--align", "none", "--formula")
+    path = export((data, results), "a", *options, "group", name="holes")
+    content = json.loads(path.read_text())
+    assert "without 5 participants who lack values at many points" in capsys.readouterr().out
+    assert content["participants"] == 19
+    assert content["factors"] == {"group": {"CN": 9, "AD": 10}}
+    left = next(
+        m for m in content["models"] if m["hemi"] == "L" and m["measures"][0] == "thickness"
+    )
+    assert left["sd"].count(None) == 0
+    assert left["df"] == 17
+    path = export((data, results), "a", *options, "group * sex", name="small")
+    content = json.loads(path.read_text())
+    assert content["participants"] == 24
+    left = next(
+        m for m in content["models"] if m["hemi"] == "L" and m["measures"][0] == "thickness"
+    )
+    assert left["sd"].count(None) == 100
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,7 @@
 """What a summary for other sites must not hold: numbers about one to four participants."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -167,3 +169,53 @@ def test_the_attack_reads_most_summaries_without_the_rule(monkeypatch):
 def test_ordinary_cohorts_are_exported():
     assert share_of_ordinary(12) == 1
     assert share_of_ordinary(12, n=60) > 0.9
+
+
+def test_points_of_other_participants_would_disclose_a_participant():
+    """Attack: standard errors at a point without some participants, and at another point."""
+    table = people(15)
+    table["old"] = (table.group == "AD").astype(float)
+    columns = np.column_stack([np.ones(60), table.old, table.age])
+    for omitted, further in (([], [7]), ([1, 12, 20, 33, 50], [1, 7, 12, 20, 33, 50])):
+        sums = []
+        for rows in (np.delete(np.arange(60), gone) for gone in (omitted, further)):
+            spread = np.linalg.inv(columns[rows].T @ columns[rows])
+            # se / sd of contrasts of columns and of pairs of them are published.
+            pairs = [np.eye(3)[i] + np.eye(3)[j] for i in range(3) for j in range(3)]
+            ratio = np.array([w @ spread @ w for w in pairs]).reshape(3, 3)
+            single = np.diag(ratio) / 4
+            published = (ratio - single[:, None] - single) / 2
+            sums.append(np.linalg.inv(published))
+        participant = sums[0] - sums[1]
+        # Sums of squares of ages are 3e5: 1e-8 of them is the error of the two inversions.
+        assert participant[0, 0] == pytest.approx(1, abs=1e-3)
+        assert participant[0, 2] == pytest.approx(table.age[7], abs=0.01)
+        assert participant[0, 1] == pytest.approx(table.old[7], abs=1e-3)
+
+
+def missing_maps(missing):
+    """An analysis of one map, as far as the choice of participants reads it."""
+    values = np.where(missing, np.nan, 1.0)
+    maps = SimpleNamespace(rows=np.arange(len(values)), maps={"thickness": values})
+    return SimpleNamespace(fitted={"L": SimpleNamespace(maps=maps, fits={"thickness": None})})
+
+
+def test_participants_with_many_missing_points_are_omitted_only_five_or_more():
+    random, rows = np.random.default_rng(0), np.arange(55)
+    missing = np.zeros((55, 861), dtype=bool)
+    assert len(exchange._most_complete(missing_maps(missing), rows, 5)) == 55
+    missing[3] = True  # one alone is never omitted; with four others, no point is lost
+    kept = exchange._most_complete(missing_maps(missing), rows, 5)
+    assert len(kept) == 50
+    assert 3 not in kept
+    missing[3], missing[:5] = False, random.random((5, 861)) < 0.33
+    kept = exchange._most_complete(missing_maps(missing), rows, 5)
+    np.testing.assert_array_equal(kept, rows[5:])
+    missing = random.random((55, 861)) < 0.03  # at random: a tenth at most
+    kept = exchange._most_complete(missing_maps(missing), rows, 5)
+    assert len(kept) == 50
+    complete = (~missing[kept].any(axis=0)).sum()
+    assert complete > 1.15 * (~missing.any(axis=0)).sum()  # 0.97^-5 is 1.16, greedy gives more
+    few = missing[:, :40] & (rows[:, None] == 9)  # a gap at few points: all participants stay
+    few[9, 0] = True
+    assert len(exchange._most_complete(missing_maps(few), rows, 5)) == 55
