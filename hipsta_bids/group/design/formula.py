@@ -175,6 +175,14 @@ def ascii_letters(text: str, filler: str = " ") -> str:
     return re.sub(r"[^A-Za-z0-9]", filler, plain)
 
 
+def folder_name(formula: str, measures: tuple[str, ...] = ()) -> str:
+    """Spell measures and a formula as the name of a folder; products must not look like sums."""
+    right = formula.rpartition("~")[2].replace("*", " x ").replace(":", " by ")
+    right = right.replace(" - ", " without ")
+    words = "-".join(ascii_letters(right).split()) or "model"
+    return "_".join(part for part in ("-".join(measures), words) if part)
+
+
 def check_names(names: Iterable[str], columns: pd.Index) -> None:
     """Refuse names that the table does not have."""
     available = [str(column) for column in columns]

@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from formulaic import Formula
+from numpy.typing import NDArray
 
 from hipsta_bids.errors import ModelError, UsageError
 from hipsta_bids.group.design import formula as formulas
 from hipsta_bids.group.design.contrasts import Contrast
-from hipsta_bids.group.design.formula import declared_levels
+from hipsta_bids.group.design.formula import declared_levels, folder_name
 from hipsta_bids.group.design.grammar import CONTEXT, closed_formula, term_text
 from hipsta_bids.group.design.marginal import NONLINEAR, Terms
 from hipsta_bids.group.design.references import choose_reference, references_note
@@ -26,7 +27,6 @@ from hipsta_bids.types import PARTICIPANT, SESSION, Float, Int64
 
 #: A column is a combination of other columns if less than this fraction of its length is its own.
 DEPENDENCE = 1e-9
-
 #: Age at the first visit, where that of each visit is known.
 FIRST_AGE = "age_first"
 #: Columns of ages, which the default model may bend.
@@ -79,9 +79,9 @@ def find_groups(
         words, declared = settings.design.reference_levels, declared_levels(table[column])
         first = choose_reference(ordered, words, requested=reference, declared=declared).level
         if first not in counts:
+            available = ", ".join(sorted(counts))
             raise ModelError(
-                f"model: no participant has {column!r} {first!r}; there are"
-                f" {', '.join(sorted(counts))}"
+                f"model: no participant has {column!r} {first!r}; there are {available}"
             )
         return Groups(column, (first, *(level for level in ordered if level != first)))
     return None
@@ -257,10 +257,8 @@ def _requested_references(request: ModelRequest) -> dict[str, str]:
         formula = formulas.parse_model(files.read_json(request.file)).formula
     for factor, level in closed_formula(formula).references:
         if references.setdefault(factor, level) != level:
-            raise UsageError(
-                f"--reference {factor}={references[factor]}, but the formula has"
-                f" contr.treatment({level!r}); give one"
-            )
+            problem = f"--reference {factor}={references[factor]}, but the formula has"
+            raise UsageError(f"{problem} contr.treatment({level!r}); give one")
     return references
 
 
@@ -357,14 +355,6 @@ def interactions(formula: str) -> list[str]:
     ]
 
 
-def folder_name(formula: str, measures: tuple[str, ...] = ()) -> str:
-    """Spell measures and a formula as the name of a folder; products must not look like sums."""
-    right = formula.rpartition("~")[2].replace("*", " x ").replace(":", " by ")
-    right = right.replace(" - ", " without ")
-    words = "-".join(formulas.ascii_letters(right).split()) or "model"
-    return "_".join(part for part in ("-".join(measures), words) if part)
-
-
 @dataclass(frozen=True)
 class Design:
     """A design matrix for complete rows, and its contrasts."""
@@ -383,6 +373,9 @@ class Design:
     """What to know about the coding of variables, by their names."""
     levels: Mapping[str, Sequence[str]] = field(default_factory=dict)
     """Levels of each factor, the reference first."""
+    members: NDArray[np.bool_] | None = None
+    """(rows, levels) of all factors; a point needs ``min_level`` participants in each level."""
+    min_level: int = 0
 
 
 def build_design(
@@ -454,6 +447,10 @@ def build_design(
         contrasts=tuple(terms.contrast(spec) for spec in specs),
         notes={name: note for name, note in notes.items() if note} | doubts,
         levels=levels_used,
+        members=np.array(
+            [variables[name] == level for name in levels_used for level in levels_used[name]]
+        ).T,
+        min_level=settings.min_level,
     )
 
 

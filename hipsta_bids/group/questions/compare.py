@@ -13,6 +13,7 @@ from hipsta_bids.group.cohort.data import SHEET, modeled_table
 from hipsta_bids.group.cohort.masks import mask_note
 from hipsta_bids.group.cohort.quality import quality_notes, quality_table
 from hipsta_bids.group.design import model as designs
+from hipsta_bids.group.design.formula import folder_name
 from hipsta_bids.group.design.grammar import closed_formula
 from hipsta_bids.group.design.settings import GroupSettings
 from hipsta_bids.group.output.results import Analysis, harmonization_record
@@ -158,7 +159,7 @@ def _analyze(options: studies.GroupOptions, settings: GroupSettings) -> studies.
         return record
 
     return study.write_folder(
-        designs.folder_name(model.formula, measures) + options.comparison.suffix,
+        folder_name(model.formula, measures) + options.comparison.suffix,
         notes=notes,
         counts=(analysis.n_participants, len(exclusions)),
         fill=fill,

@@ -382,6 +382,10 @@ class RowModel:
         """Whose each row is, where participants have several."""
         return None
 
+    def people(self, rows: Int) -> Int:
+        """Return the number of the participant of each row."""
+        return rows
+
     def fit(
         self,
         values: Float,
@@ -463,7 +467,9 @@ def fit_maps(
             values = _values(side.maps[name], positions)
             if side.first is not None:
                 covariates = _values(side.first.maps[name], positions)[None]
-            fits[name] = model.fit(values, rows, tested, covariates)
+            counts = np.isfinite(values).sum(axis=0)
+            values = without_small_levels(values, model, rows)
+            fits[name] = replace(model.fit(values, rows, tested, covariates), n=counts)
             del values
     except ModelError as error:
         raise ModelError(f"hemisphere {hemi}: {error}") from error
@@ -485,6 +491,25 @@ def fit_maps(
         subfield=most_frequent(side.subfield[positions], len(side.names)),
         fits=fits,
     )
+
+
+def without_small_levels(values: Float, model: RowModel, rows: Int) -> Float:
+    """Set points to missing at which a level of a factor has too few participants with a value.
+
+    ``values`` (rows, points); complete maps are returned as they are.
+    """
+    members, least = model.design.members, model.design.min_level
+    known = np.isfinite(values)
+    if members is None or not len(members) or known.all():
+        return values
+    people = model.people(rows)
+    order = np.argsort(people, kind="stable")
+    starts = np.flatnonzero(np.diff(people[order], prepend=-1))
+    is_small = np.zeros(known.shape[1], dtype=bool)
+    for member in members[rows[order]].T:
+        has_value = np.logical_or.reduceat(known[order] & member[:, None], starts, axis=0)
+        is_small |= has_value.sum(axis=0) < least
+    return np.where(is_small, np.nan, values)
 
 
 def _covariates(side: SideMaps, positions: Int) -> Float | None:

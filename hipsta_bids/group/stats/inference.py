@@ -444,6 +444,11 @@ def _permuted(
             combine=combine,
         )
         corrected = [result.p_enhanced if enhanced else result.p_max for result in results]
+        if raw is not None:  # a test that ordinary p-values do not have is no test
+            corrected = [
+                np.where(np.isfinite(raw[key]), p, np.nan)
+                for key, p in zip(keys, corrected, strict=True)
+            ]
         rejected = [p <= rules.alpha for p in corrected]
         n_tests = sum(int(np.isfinite(p).sum()) for p in corrected)
         cutoff = np.nan
@@ -463,8 +468,10 @@ def _permuted(
 def _part(
     fitted: FittedMaps, measure: str, model: RowModel, rules: MultiplicitySettings
 ) -> PermutationPart:
+    is_fitted = np.isfinite(fitted.fits[measure].sigma)
+    values = fitted.values(measure)
     return PermutationPart(
-        maps=fitted.values(measure),
+        maps=values if is_fitted.all() else np.where(is_fitted, values, np.nan),
         matrix=model.design.matrix[fitted.rows],
         subjects=fitted.rows,
         edges=edges_of(fitted.maps, rules.neighbors),

@@ -377,6 +377,12 @@ class RepeatedRows(glm.RowModel):
         people = np.unique(self.participants, return_inverse=True)[1]
         return Visits(np.asarray(people, dtype=np.int64), self.times, self.slopes)
 
+    def people(self, rows: Int) -> Int:
+        """Return the number of the participant of each row."""
+        return np.asarray(
+            np.unique(self.participants, return_inverse=True)[1][rows], dtype=np.int64
+        )
+
     def fit(
         self,
         values: Float,

@@ -400,6 +400,12 @@ class VisitRows(glm.RowModel):
     """(rows,) of each row's visit, from 0."""
     longitudinal: LongitudinalSettings
 
+    def people(self, rows: Int) -> Int:
+        """Return the number of the participant of each row."""
+        return np.asarray(
+            np.unique(self.participants, return_inverse=True)[1][rows], dtype=np.int64
+        )
+
     def fit(
         self,
         values: Float,

@@ -214,3 +214,30 @@ def test_the_command_and_the_function_have_the_same_design(folders, design, monk
     assert dict(fit.design.references) == record["references"]
     weights = {contrast.name: contrast.weights.tolist() for contrast in fit.design.contrasts}
     assert weights == record["contrasts"]
+
+
+@pytest.mark.parametrize("left", [2, 3])
+def test_points_with_fewer_than_three_of_a_group_are_not_tested(left):
+    """The others are fitted as by statsmodels; no correction finds what is not estimated."""
+    random = np.random.default_rng(left)
+    n, points = 24, 6
+    table = pd.DataFrame({"group": ["CN", "AD"] * (n // 2), "age": random.normal(70, 5, n)})
+    values = random.normal(2, 0.1, (n, points, 1))
+    patients = np.flatnonzero(table["group"] == "AD")
+    values[patients] -= 1.0  # found wherever it is tested
+    values[patients[left:], 0] = np.nan  # few of a group
+    values[patients, 1] = np.nan  # none of it
+    values[np.flatnonzero(table["group"] == "CN")[:2], 2] = np.nan  # ten of it
+    for correction in ("fdr2", "permutation-max", "permutation-tfce"):
+        fit = hb.group(values, table, "group + age", correction=correction)
+        maps = {name: values_of[0, 0].ravel() for name, values_of in fit.maps.items()}
+        expected = [left == 3, False, True, True, True, True]
+        for name in ("estimate", "statistic", "p", "p_corrected"):
+            assert np.isfinite(maps[name]).tolist() == expected, name
+        significant = fit.significant[0, 0].ravel()
+        assert not significant[~np.array(expected)].any()
+        assert significant[3:].all()
+        rows = np.isfinite(values[:, 2, 0])
+        matrix = np.column_stack([np.ones(n), table["group"] == "CN", table["age"]])[rows]
+        tested = OLS(values[rows, 2, 0], matrix).fit()
+        np.testing.assert_allclose(maps["statistic"][2], tested.tvalues[1], rtol=1e-9)  # rounding
