@@ -1,5 +1,6 @@
 """Commands that make every page and figure, on small data; shared by tests here and in images."""
 
+import re
 import shlex
 import sys
 from dataclasses import replace
@@ -41,8 +42,10 @@ COMMANDS = [
         ["labels/out/report.html", "labels/out/sub-02.html", "labels/out/sub-01_ses-[12].html"],
     ),
     (
-        "labels labels/shared participant --longitudinal --participant-label 01"
-        " --settings coarse.toml --n-procs 1",
+        (
+            "labels labels/shared participant --longitudinal --participant-label 01"
+            " --settings coarse.toml --n-procs 1"
+        ),
         0,
         ["labels/shared/report.html", "labels/shared/sub-01_ses-[12].html"],
     ),
@@ -62,8 +65,10 @@ COMMANDS = [
     ),
     *(
         (
-            f"{GROUP} --name {site} --no-classification --export-summary {site}"
-            f" --participant-label {PEOPLE[site]}",
+            (
+                f"{GROUP} --name {site} --no-classification --export-summary {site}"
+                f" --participant-label {PEOPLE[site]}"
+            ),
             0,
             [f"cohort/out/group/{site}.html"],
         )
@@ -85,8 +90,10 @@ COMMANDS = [
         ["contrast.svg"],
     ),
     (
-        f"correlate {MAPS}_thickness.shape.gii {MAPS}_curv.shape.gii correlated"
-        f" --surface {MAPS}_midthickness.surf.gii --permutations 100",
+        (
+            f"correlate {MAPS}_thickness.shape.gii {MAPS}_curv.shape.gii correlated"
+            f" --surface {MAPS}_midthickness.surf.gii --permutations 100"
+        ),
         0,
         ["correlated/figures/*.svg"],
     ),
@@ -108,19 +115,37 @@ COMMANDS = [
         ["norms/out/group/norms.html"],
     ),
     (
-        "people/bids people/out group --norms norms/out/group/norms/norms.json"
-        " --controls group=CN --measures volume --name scores",
+        (
+            "people/bids people/out group --norms norms/out/group/norms/norms.json"
+            " --controls group=CN --measures volume --name scores"
+        ),
         0,
         ["people/out/group/scores.html"],
     ),
 ]
 
 
-def words(command: str) -> list[str]:
+#: What pages, notes and warnings say where something is missing.
+MISSING = re.compile(r"not made|could not be made|not drawn|TemplateNotFound|Traceback")
+
+
+def words(command):
     return shlex.split(command)
 
 
-def write_inputs(folder: Path) -> None:
+def check_pages(folder, said, patterns):
+    """Refuse output, pages and figures that say what is missing, or end early."""
+    assert MISSING.findall(said) == [], said
+    for pattern in patterns:
+        paths = sorted(folder.glob(pattern))
+        assert paths, pattern
+        for path in paths:
+            text = path.read_text(encoding="utf-8")
+            assert MISSING.findall(text) == [], path
+            assert text.rstrip().endswith(("</html>", "</svg>")), path
+
+
+def write_inputs(folder):
     """Write what the commands read, for runs in this folder."""
     (folder / "coarse.toml").write_text("[grid]\nspacing = 0.5\n[surrogate]\npositions = [0.5]\n")
     (folder / "quick.toml").write_text("[classification]\nrepeats = 1\nfolds = 3\n")

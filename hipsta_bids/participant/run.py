@@ -108,7 +108,7 @@ class RunResult:
 
     @property
     def exit_code(self) -> ExitCode:
-        """The gravest of what happened: a disk that is full, a bug or no page, bad data, failed hemispheres.
+        """The gravest: a disk that is full, a bug or no page, bad data, failed hemispheres.
 
         The data are to blame if every hemisphere failed because of its input.
         """
