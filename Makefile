@@ -62,10 +62,16 @@ layers: $(STAMP)
 	"$(BIN)/lint-imports" --no-cache
 
 # A thread each: the two processes would wait for each other's.
-PYTEST = OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 "$(BIN)/python" -m pytest -n 2 --dist loadfile
+THREADS = OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
+PYTEST = $(THREADS) "$(BIN)/python" -m pytest -n 2 --dist loadfile
 QUICK = geometry io protocols group/design group/stats
+# The wheel as users get it, tested from a folder that is not the checkout.
+INSTALLED := $(VENV)/installed
 unit: $(STAMP)
-	$(PYTEST) --ignore tests/validation
+	tools/install-wheel "$(BIN)/python" "$(INSTALLED)"
+	cd "$(INSTALLED)/away" && $(THREADS) HIPSTA_BIDS_INSTALLED=required ../bin/python -m pytest \
+		-n 2 --dist loadfile -c "$(CURDIR)/pyproject.toml" --rootdir "$(CURDIR)" \
+		-o "pythonpath=tools benchmarks" --ignore "$(CURDIR)/tests/validation" "$(CURDIR)/tests"
 
 quick: $(STAMP)
 	$(PYTEST) $(QUICK:%=tests/%)

@@ -31,7 +31,7 @@ EXIT_MEANINGS: dict[int, str] = {
     ExitCode.USAGE: "wrong use of the command line, wrong settings",
     ExitCode.BAD_DATA: "bad data: an unreadable folder, no usable hemisphere, or no possible model",
     ExitCode.NOTHING_TO_DO: "nothing to process",
-    ExitCode.INTERNAL: "internal error: please report it",
+    ExitCode.INTERNAL: "internal error, or a page could not be made: please report it",
     ExitCode.NOT_WRITABLE: "the output folder cannot be written, or the disk is full",
     128 + SIGINT: "stopped by Ctrl-C; run the same command again to complete",
     128 + SIGTERM: "stopped by SIGTERM; run the same command again to complete",

@@ -7,6 +7,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import hipsta_bids
+
 ROOT = Path(__file__).parents[1]
 BIN = Path(sys.executable).parent
 
@@ -25,7 +27,8 @@ def bosh(folder, *arguments):
     home = folder / "home"
     home.mkdir(exist_ok=True)
     path = os.pathsep.join([str(BIN), os.environ["PATH"]])
-    python_path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
+    package = Path(hipsta_bids.__file__).parents[1]
+    python_path = os.pathsep.join([str(package), os.environ.get("PYTHONPATH", "")])
     return subprocess.run(
         [BIN / "bosh", *map(str, arguments)],
         cwd=folder,

@@ -2,8 +2,14 @@
 
 import fnmatch
 import json
+import os
 import re
+import shutil
+import subprocess
+import sys
+import tarfile
 import tomllib
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -28,6 +34,41 @@ def test_metadata_have_this_version(name):
     content = json.loads(read(name))
     assert content["version"] == hipsta_bids.__version__
     assert "AGPL-3.0-or-later" in content["license"]
+
+
+def test_wheel_and_sdist_hold_the_files_of_the_package(tmp_path):
+    """None is missing, and none that Python or an editor left beside them is added."""
+    git = shutil.which("git")
+    if git is None or not (ROOT / ".git").exists():
+        pytest.skip("not a clone: there is no list of tracked files")
+    command = [git, "ls-files", "-z", "--cached", "--others", "--exclude-standard", "hipsta_bids"]
+    listed = subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True).stdout
+    names = {name for name in listed.split("\0") if name and (ROOT / name).is_file()}
+    for name in ("pyproject.toml", "README.md", "LICENSE", *names):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(ROOT / name, tmp_path / name)
+    for extra in ("__pycache__/x.cpython-311.pyc", "cli/__pycache__/y.pyc", "cli/help.toml~"):
+        (tmp_path / "hipsta_bids" / extra).parent.mkdir(exist_ok=True)
+        (tmp_path / "hipsta_bids" / extra).touch()
+    for kind in ("sdist", "wheel"):
+        build = f"from setuptools import build_meta; build_meta.build_{kind}('dist')"
+        subprocess.run([sys.executable, "-c", build], cwd=tmp_path, check=True, capture_output=True)
+    (wheel,) = (tmp_path / "dist").glob("*.whl")
+    (sdist,) = (tmp_path / "dist").glob("*.tar.gz")
+    with zipfile.ZipFile(wheel) as archive:
+        assert {n for n in archive.namelist() if n.startswith("hipsta_bids/")} == names
+    with tarfile.open(sdist) as archive:
+        members = [m.name.partition("/")[2] for m in archive.getmembers() if m.isfile()]
+    assert {n for n in members if n.startswith("hipsta_bids/")} == names
+
+
+def test_the_gate_tests_what_is_installed():
+    """The tests of `make test` import the wheel; nothing leads to the checkout's package."""
+    if os.environ.get("HIPSTA_BIDS_INSTALLED") != "required":
+        pytest.skip("not the gate: the package may be the checkout's")
+    assert Path(hipsta_bids.__file__).parents[1].name == "site-packages"
+    source = (ROOT / "hipsta_bids").resolve()
+    assert [one for one in sys.path if (Path(one) / "hipsta_bids").resolve() == source] == []
 
 
 def test_the_recipe_has_the_dependencies_of_the_package():

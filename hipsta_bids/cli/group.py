@@ -412,7 +412,7 @@ def _run(parsed: argparse.Namespace, arguments: Sequence[str]) -> ExitCode:
     echo(f"report: {result.page or result.folder / 'methods.md'}")
     if result.problem is not None:
         warn(f"report: {result.problem}")
-    return ExitCode.OK
+    return ExitCode.OK if result.problem is None else ExitCode.INTERNAL
 
 
 def _rebuild_reports(root: Path, name: str | None) -> ExitCode:

@@ -1,6 +1,6 @@
 """Makes the pages of an output dataset, side by side, after the hemispheres are measured.
 
-A page that cannot be made costs a line in the log, never a result.
+A page that cannot be made costs a line and the exit code, never a result.
 """
 
 import contextlib
@@ -35,8 +35,8 @@ _LOGGER = logging.getLogger(__name__)
 class Pages:
     """The pages of a run."""
 
-    problems: list[str] = field(default_factory=list)
-    """A line per page that could not be made."""
+    problems: list[HipstaError] = field(default_factory=list)
+    """Why pages could not be made."""
     enabled: bool = True
     """False where nothing can be written."""
 
@@ -125,7 +125,7 @@ def reports_after(plan: PagePlan | None, visits: Sequence[VisitKey]) -> Generato
         _try_all(plan, visits, pages.problems)
 
 
-def _try_all(plan: PagePlan, visits: Sequence[VisitKey], problems: list[str]) -> None:
+def _try_all(plan: PagePlan, visits: Sequence[VisitKey], problems: list[HipstaError]) -> None:
     """Make the pages that are older than their records, or show images that they must not."""
     root = plan.root
     stale = []
@@ -138,10 +138,10 @@ def _try_all(plan: PagePlan, visits: Sequence[VisitKey], problems: list[str]) ->
     if not stale and (not plan.cohort or _is_newer(root / _COHORT, root, *_RECORDS)):
         return
     try:
-        problems += [str(problem) for problem in write_reports(plan, stale)]
+        problems += write_reports(plan, stale)
     except Exception as error:  # results are worth more than pages
         _LOGGER.exception("report")
-        problems.append(f"not made ({type(error).__name__}: {error})")
+        problems.append(HipstaError(f"not made ({type(error).__name__}: {error})"))
 
 
 def _is_newer(page: Path, root: Path, *patterns: str) -> bool:

@@ -96,8 +96,8 @@ class RunResult:
     """Of all hemispheres that ended or were skipped."""
     n_requested: int
     log: Path
-    page_problems: tuple[str, ...] = ()
-    """One line per page that could not be made."""
+    page_problems: tuple[HipstaError, ...] = ()
+    """Why pages could not be made."""
     copies: tuple[str, ...] = ()
     """One line per group of hemispheres with the same labels."""
 
@@ -108,14 +108,15 @@ class RunResult:
 
     @property
     def exit_code(self) -> ExitCode:
-        """The gravest of what happened: a disk that is full, a bug, bad data, failed hemispheres.
+        """The gravest: a disk that is full, a bug or no page, bad data, failed hemispheres.
 
         The data are to blame if every hemisphere failed because of its input.
         """
         failed = [outcome for outcome in self.outcomes if outcome.decision == Decision.FAILED]
-        if any(isinstance(outcome.error, OutputError) for outcome in failed):
+        errors = [*(outcome.error for outcome in failed), *self.page_problems]
+        if any(isinstance(error, OutputError) for error in errors):
             return ExitCode.NOT_WRITABLE
-        if any(outcome.reason == INTERNAL for outcome in failed):
+        if self.page_problems or any(outcome.reason == INTERNAL for outcome in failed):
             return ExitCode.INTERNAL
         if not failed and len(self.outcomes) == self.n_requested:
             return ExitCode.OK

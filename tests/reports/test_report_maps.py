@@ -6,9 +6,10 @@ from pathlib import Path
 
 import pytest
 
+import hipsta_bids
 from hipsta_bids.reports.maps import usual_subfields
 
-ROOT = Path(__file__).parents[2]
+PACKAGE = Path(hipsta_bids.__file__).parents[1]
 DRAW = """
 import os
 from hipsta_bids.reports.maps import new_figure
@@ -31,7 +32,7 @@ assert dict(os.environ) == before
 def test_drawing_minds_no_surroundings(tmp_path, surroundings):
     aside = tmp_path / "aside"
     aside.mkdir()
-    environment = {"PYTHONPATH": str(ROOT), "TMPDIR": str(aside)} | surroundings
+    environment = {"PYTHONPATH": str(PACKAGE), "TMPDIR": str(aside)} | surroundings
     run = subprocess.run(
         [sys.executable, "-c", DRAW],
         cwd=tmp_path,
@@ -47,6 +48,7 @@ def test_drawing_minds_no_surroundings(tmp_path, surroundings):
 
 
 TIES = """
+import hipsta_bids
 from hipsta_bids.reports.maps import usual_subfields
 print(usual_subfields([["CA2", "CA1", "CA1", "CA2"], ["Sub", "CA1", "CA1"], ["DG", "CA3"]]))
 """
@@ -57,7 +59,7 @@ def test_of_subfields_as_frequent_the_first_is_named_in_every_process(seed):
     assert usual_subfields([["b", "a"]]) == ["b"]
     run = subprocess.run(
         [sys.executable, "-c", TIES],
-        env={"PYTHONPATH": str(ROOT), "PYTHONHASHSEED": seed},
+        env={"PYTHONPATH": str(PACKAGE), "PYTHONHASHSEED": seed},
         capture_output=True,
         text=True,
         check=True,

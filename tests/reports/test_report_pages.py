@@ -297,7 +297,8 @@ def test_no_pages_are_made_where_nothing_can_be_written(tmp_path, monkeypatch):
 
 def test_an_error_in_reporting_is_a_line(tmp_path, monkeypatch):
     monkeypatch.setattr(reporting, "write_reports", lambda *_: 1 / 0)
-    assert run_block(tmp_path) == ["not made (ZeroDivisionError: division by zero)"]
+    (problem,) = run_block(tmp_path)
+    assert str(problem) == "not made (ZeroDivisionError: division by zero)"
 
 
 def test_pages_up_to_date_are_left_alone(out, monkeypatch):

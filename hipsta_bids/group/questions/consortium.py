@@ -65,6 +65,7 @@ def run_meta(
         notes += write.write_figures(scratch, _figures(meta), prints=figures)
         files.write_text(scratch / "methods.md", _methods(meta))
         files.write_json(scratch / "meta.json", _record(meta, paths, command, notes))
+    files.remove([out_dir / META_REPORT])  # it may be that of an earlier one
     write_meta_report(out_dir)
     return out_dir / META_REPORT, notes
 
