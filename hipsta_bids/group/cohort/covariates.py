@@ -347,8 +347,8 @@ def _icv_beside(path: Path) -> float | None:
             if line.startswith("# Measure EstimatedTotalIntraCranialVol,"):
                 return _number(line.split(",")[-2])
     for folder in (path.parent, path.parent.parent, path.parent.parent / "final"):
-        for found in sorted(folder.glob("*icv.txt")):
-            words = _read_text(found).split()
+        for report in sorted(folder.glob("*icv.txt")):
+            words = _read_text(report).split()
             if words:  # subject and volume, or the volume alone
                 return _number(words[-1])
     return None
