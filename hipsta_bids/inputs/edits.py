@@ -15,7 +15,7 @@ import os
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 from hipsta_bids.errors import HipstaError, InputError
 from hipsta_bids.inputs import scan, tree
@@ -23,6 +23,7 @@ from hipsta_bids.inputs.generic import is_edited, table_protocol
 from hipsta_bids.inputs.selection import Selection
 from hipsta_bids.io import files
 from hipsta_bids.io.files import entities
+from hipsta_bids.io.labels import match_labels
 from hipsta_bids.types import End, GivenEnd, Visit
 
 #: Names under which ``--edited-dir`` and the output dataset appear in addresses.
@@ -309,11 +310,18 @@ def attach_ends(
     """
     if path is None:
         return tuple(items), ()
-    rows = read_ends(path)
+    rows, notes = read_ends(path), list[str]()
+    for name in ("subject", "session"):
+        labels = [getattr(row, name) or "" for row in rows]
+        data = [label for item in items if (label := getattr(item, name))]
+        matches, lines = match_labels(filter(None, labels), data, str(path))
+        changes: list[dict[str, Any]] = [{name: matches.get(x, x) or None} for x in labels]
+        rows = [replace(row, **change) for row, change in zip(rows, changes, strict=True)]
+        notes += lines
     attached = tuple(_attached(item, [r for r in rows if r.is_of(item)], items) for item in items)
     unused_rows = [row for row in rows if not any(row.is_of(item) for item in items)]
     if not unused_rows:
-        return attached, ()
+        return attached, tuple(notes)
     first = unused_rows[0]
     session = f" ses-{first.session}" if first.session else ""
     note = (
@@ -321,7 +329,7 @@ def attach_ends(
         " are "
         f"processed ({len(unused_rows)} of {len(rows)} rows are of no hemisphere here)"
     )
-    return attached, (note,)
+    return attached, (*notes, note)
 
 
 def _attached(

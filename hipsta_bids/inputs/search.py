@@ -33,6 +33,7 @@ from hipsta_bids.inputs.layouts import LAYOUTS, atlas_finder, find, volume_table
 from hipsta_bids.inputs.scan import HEMIS, HemisphereInput, InputRequest, Source
 from hipsta_bids.inputs.selection import Context, Selection, make_selection
 from hipsta_bids.io.files import entities
+from hipsta_bids.io.labels import refuse_alike
 from hipsta_bids.opening import not_fetched
 from hipsta_bids.protocols.protocol import Protocol
 from hipsta_bids.types import Hemisphere, VisitKey
@@ -108,10 +109,16 @@ def find_inputs(request: InputRequest) -> Findings:
     results.edited = list_edits(request, selection, results.unused)
     for source in sources:
         _search(source, selection, option, results)
-    results.unused += [
-        tree.Ignored(path=Path(folder), reason="named in --participants-map, but no dataset has it")
+    lacking = [
+        folder
         for folder in tree.read_people(request.participants_map)
         if not any((source.path / folder).is_dir() for source in sources)
+    ]
+    present = [name for s in sources if lacking for name in map(str, tree.list_folder(s.path)[0])]
+    refuse_alike(lacking, present, f"{request.participants_map}: column folder")
+    results.unused += [
+        tree.Ignored(path=Path(folder), reason="named in --participants-map, but no dataset has it")
+        for folder in lacking
     ]
     entries = [entry for entry in results.entries(sources) if selection.misses(entry)]
     ignored = tuple(entry for entry in entries if not entry.quiet)

@@ -42,6 +42,8 @@ _MISSING = re.compile(
     r"|not(applicable|assessed|available|collected|done|known|measured|recorded|reported|specified"
     r"|stated|tested)|prefernotto(answer|say)|desconocido|inconnu|keineangabe|unbekannt)?"
 )
+#: A cell as R writes text.
+_QUOTED = re.compile(r'\s*"([^"]*)"\s*')
 _SIGNS = re.compile(r"[\s?!.*/\\|()\[\]_\u2010-\u2015\u2026\u2212-]+")
 
 _DEEPEST = 100  # lists and objects within each other in JSON
@@ -294,7 +296,10 @@ def read_tsv(path: Path) -> list[dict[str, str]]:
             f"{path}: not readable as a table ({error}); save it as UTF-8 text with tabs",
             reason="unreadable-table",
         ) from error
-    lines = [line.split("\t") for line in re.split(r"\r\n?|\n", text)]
+    lines = [
+        [(match[1] if (match := _QUOTED.fullmatch(cell)) else cell) for cell in line.split("\t")]
+        for line in re.split(r"\r\n?|\n", text)
+    ]
     rows = [(number, cells) for number, cells in enumerate(lines, 1) if any(map(str.strip, cells))]
     header = [name.strip() for name in _shortened(rows[0][1], 0)] if rows else []
     size = len(header)

@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 from input_cases import touch
 
+from hipsta_bids.errors import InputError
 from hipsta_bids.inputs.account import count_inputs, input_table, other_entries_table
 from hipsta_bids.inputs.search import InputRequest, find_inputs
 
@@ -228,6 +229,16 @@ def test_a_table_says_whose_folders_are(tmp_path, option):
     assert reasons["P009"] == "named in --participants-map, but no dataset has it"
     assert reasons["V3"] == reasons["sub-07"]
     assert "not named in --participants-map" in reasons["V3"]
+
+
+def test_a_folder_without_its_zeros_is_refused(tmp_path):
+    put_ashs(tmp_path / "ashs" / "007")
+    table = write_people(tmp_path, ("7", "07", "n/a"))
+    request = InputRequest(
+        bids_dir=tmp_path, participants_map=table, ashs_dir=tmp_path / "ashs", ashs_atlas="ashsPMC"
+    )
+    with pytest.raises(InputError, match=f"{table}: column folder: 7 may be 007; write it so"):
+        find_inputs(request)
 
 
 def test_a_person_s_folder_of_visits_is_no_dataset(tmp_path):

@@ -135,6 +135,14 @@ def test_rows_of_hemispheres_that_are_not_there_are_reported(data, tmp_path, cap
     assert "line 2: not used, no labels of sub-09 hemi-L are processed (1 of 2 rows" in said
 
 
+def test_labels_of_a_spreadsheet_are_matched(data, tmp_path, capsys):
+    ends = table(tmp_path / "ends.tsv", f"1\tR\tanterior\t{point_at(0.75, 'R')}")
+    assert run(data, tmp_path / "out", "--ends", ends, "--dry-run") == ExitCode.OK
+    printed = capsys.readouterr().out
+    assert "ends.tsv: 1 is read as 01" in printed
+    assert "not used, no labels of" not in printed
+
+
 def test_a_plane_far_from_the_labels_is_refused(data, tmp_path):
     ends = table(tmp_path / "ends.tsv", "01\tL\tanterior\t100\t100\t100")
     out = tmp_path / "out"

@@ -146,7 +146,8 @@ def collect_sheets(request: GroupRequest, *, may_lack: bool = False) -> Collecti
     seg = _one_protocol(places, results, request)
     places = [result for result in places if result.name.seg == seg]
     _refuse_twice(places)
-    choices = Choices(request.exclude_table, request.ratings)
+    visits = [(result.name.subject, result.name.session) for result in results]
+    choices = Choices(request.exclude_table, request.ratings, visits)
     records: list[SheetRecord] = []
     left_out = [exclusion for root in roots for exclusion in _excluded_labels(root, request)]
     quality, digests = [], []
@@ -225,9 +226,11 @@ def _several_versions(records: Sequence[SheetRecord]) -> tuple[str, ...]:
     return (text,)
 
 
-def wanted_by(request: GroupRequest) -> Callable[[str, str | None, str], bool]:
-    """Check whether a hemisphere is asked for, and not in a table of exclusions."""
-    choices = Choices(request.exclude_table, request.ratings)
+def wanted_by(
+    request: GroupRequest, visits: Iterable[VisitKey]
+) -> Callable[[str, str | None, str], bool]:
+    """Check whether a hemisphere of some visits is asked for, and not in a table of exclusions."""
+    choices = Choices(request.exclude_table, request.ratings, visits)
 
     def is_wanted(subject: str, session: str | None, hemi: str) -> bool:
         name = HemisphereName(subject=subject, session=session, hemi=hemi, seg="")

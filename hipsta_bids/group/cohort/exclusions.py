@@ -11,7 +11,9 @@ from hipsta_bids.derivatives.names import HemisphereName
 from hipsta_bids.errors import InputError, UsageError, did_you_mean
 from hipsta_bids.group.design.formula import listed
 from hipsta_bids.io import files
+from hipsta_bids.io.labels import match_rows
 from hipsta_bids.reports.verdict import RATINGS
+from hipsta_bids.types import PARTICIPANT, SESSION, VisitKey
 
 #: Number of names that a note lists.
 SHOWN = 4
@@ -38,13 +40,26 @@ class UserTable:
     path: Path | None = None
     """``None`` if there is no table."""
     rows: tuple[Mapping[str, str], ...] = ()
+    lines: tuple[str, ...] = ()
+    """Notes on labels that the table spells in another way than the data."""
+
+    @classmethod
+    def of(
+        cls, path: Path, rows: Sequence[Mapping[str, str]], visits: Iterable[VisitKey]
+    ) -> "UserTable":
+        """Write labels of a table as in the data."""
+        subjects, sessions = zip(*visits, strict=True) if (visits := list(visits)) else ((), ())
+        data = {PARTICIPANT: subjects, SESSION: sessions}
+        written, lines = match_rows(rows, data, str(path))
+        return cls(path, tuple(written), tuple(lines))
 
     @cached_property
     def _by_subject(self) -> Mapping[str, list[Mapping[str, str]]]:
         rows_of: dict[str, list[Mapping[str, str]]] = {}
         for row in self.rows:
-            cell = row.get("participant_id", files.MISSING).removeprefix("sub-")
-            rows_of.setdefault("" if cell == files.MISSING else cell, []).append(row)
+            cell = row[PARTICIPANT]
+            key = "" if files.is_missing(cell) else cell.removeprefix("sub-")
+            rows_of.setdefault(key, []).append(row)
         return rows_of
 
     def about(self, name: HemisphereName) -> list[Mapping[str, str]]:
@@ -71,12 +86,11 @@ class UserTable:
             matched |= {id(row) for row in rows}
             if any(not _is_current(row, digest) for row in rows):
                 old.append(name.stem)
-        unmatched = [row["participant_id"] for row in self.rows if id(row) not in matched]
-        notes = (
-            [f"{self.path}: matches no hemisphere here: {listed(unmatched, SHOWN)}"]
-            if unmatched
-            else []
-        )
+        unmatched = [f"sub-{row[PARTICIPANT]}" for row in self.rows if id(row) not in matched]
+        text = f"{self.path}: matches no hemisphere here: {listed(unmatched, SHOWN)}"
+        if len(unmatched) == len(self.rows):
+            raise InputError(f"{text}; correct the labels, or omit the table", reason="bad-table")
+        notes = [*self.lines, *[text] * bool(unmatched)]
         if old:
             notes.append(
                 f"{self.path}: not applied to hemispheres whose labels have changed since they were"
@@ -88,16 +102,20 @@ class UserTable:
 class Choices:
     """The user's choices of hemispheres: a table of exclusions, and one of ratings.
 
-    A table of ratings may stand for one of exclusions. InputError if a table lacks a column, or has
-    another rating than `RATINGS`.
+    A table of ratings may stand for one of exclusions. The ``visits`` are of the data. InputError
+    if a table lacks a column, or has another rating than `RATINGS`.
     """
 
-    def __init__(self, exclusions: Path | None, ratings: Path | None) -> None:
-        excluded = [] if exclusions is None else _read(exclusions, ())
-        rated = [] if ratings is None else _read(ratings, (_RATING,))
-        last = [row for row in excluded if row.get(_RATING, RATINGS[-1]) == RATINGS[-1]]
-        self.excluded = UserTable(exclusions, tuple(last))
-        self.rated = UserTable(ratings, tuple(rated))
+    def __init__(
+        self, exclusions: Path | None, ratings: Path | None, visits: Iterable[VisitKey]
+    ) -> None:
+        self.excluded, self.rated, data = UserTable(), UserTable(), list(visits)
+        if exclusions is not None:
+            rows = _read(exclusions, ())
+            last = [row for row in rows if row.get(_RATING, RATINGS[-1]) == RATINGS[-1]]
+            self.excluded = UserTable.of(exclusions, last, data)
+        if ratings is not None:
+            self.rated = UserTable.of(ratings, _read(ratings, (_RATING,)), data)
 
     def reason_to_leave_out(
         self, name: HemisphereName, digest: str | None
@@ -163,7 +181,7 @@ def is_listed(name: HemisphereName, row: Mapping[str, str]) -> bool:
 
     One without a protocol, of other programs' maps, is meant by rows of any protocol and region.
     """
-    keys = {"participant_id": name.subject, "session_id": name.session or "", "hemi": name.hemi}
+    keys = {PARTICIPANT: name.subject, SESSION: name.session or "", "hemi": name.hemi}
     keys |= {"protocol": name.seg, "region": name.region} if name.seg else {}
     for key, value in keys.items():
         cell = row.get(key, files.MISSING)

@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import product
+from itertools import chain, product
 from pathlib import Path
 
 import numpy as np
@@ -94,13 +94,14 @@ def find_maps(
     root: Path,
     visits: Iterable[VisitKey],
     is_wanted: Callable[[str, str | None, str], bool],
+    matches: Iterable[Found],
 ) -> ExternalFiles:
-    """Find the files of one map."""
+    """Choose from the files of one map."""
     sessions: dict[str, list[str | None]] = {}
     for subject, session in visits:
         sessions.setdefault(subject, []).append(session)
     paths: dict[str, dict[VisitKey, Path]] = {}
-    for match in scan(request.pattern, root):
+    for match in matches:
         hemis = [match.hemi] if match.hemi else cifti_sides(match.path)
         for hemi, session in product(hemis, _sessions(match, sessions)):
             if not is_wanted(match.subject, session, hemi):
@@ -228,10 +229,15 @@ def find_all(
     requests: Sequence[MapPattern],
     root: Path,
     known: Sequence[VisitKey],
-    is_wanted: Callable[[str, str | None, str], bool],
+    choice: Callable[[Iterable[VisitKey]], Callable[[str, str | None, str], bool]],
 ) -> tuple[list[ExternalFiles], list[VisitKey]]:
     """Find the files of all maps, and who has them or a sheet."""
-    sources = [find_maps(request, root, known, is_wanted) for request in requests]
+    matches = [scan(request.pattern, root) for request in requests]
+    is_wanted = choice([*known, *((one.subject, one.session) for one in chain(*matches))])
+    sources = [
+        find_maps(request, root, known, is_wanted, files_of)
+        for request, files_of in zip(requests, matches, strict=True)
+    ]
     visits: set[VisitKey] = set(known).union(*(one.visits for one in sources))
     return sources, sorted(visits, key=lambda visit: (visit[0], visit[1] or ""))
 

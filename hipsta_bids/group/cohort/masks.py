@@ -1,6 +1,6 @@
 """Grid points that count as missing: columns that a repair touched, or rows of a table."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +13,7 @@ from hipsta_bids.group.cohort.collect import SheetRecord
 from hipsta_bids.group.cohort.exclusions import UserTable
 from hipsta_bids.group.cohort.read import Measured, visit_name
 from hipsta_bids.io import files
-from hipsta_bids.types import PARTICIPANT
+from hipsta_bids.types import PARTICIPANT, VisitKey
 
 #: Mask of the columns that a repair of the labels touched.
 REPAIRED = "repaired"
@@ -30,7 +30,8 @@ def mask_sheets(
     """
     if not records:
         raise UsageError("--mask is about sheets of the participant level, and there are none")
-    tables = [_read(Path(mask)) for mask in masks if mask != REPAIRED]
+    visits_of = [(r.result.name.subject, r.result.name.session) for r in records]
+    tables = [_read(Path(mask), visits_of) for mask in masks if mask != REPAIRED]
     by_place = {
         (visit_name(r.result.name.subject, r.result.name.session), r.result.name.hemi): r
         for r in records
@@ -66,7 +67,7 @@ def mask_note(shares: pd.DataFrame, groups: pd.Series | None) -> str:
     return f"{text}; summary measures are of all points"
 
 
-def _read(path: Path) -> UserTable:
+def _read(path: Path, visits: Iterable[VisitKey]) -> UserTable:
     """Read a table of grid points; participants, sessions and sides without a cell mean all."""
     rows = files.read_tsv(path)
     if rows and (lacking := [name for name in _NODES if name not in rows[0]]):
@@ -75,7 +76,7 @@ def _read(path: Path) -> UserTable:
             f" {PARTICIPANT}, session_id, hemi, protocol",
             reason="bad-table",
         )
-    return UserTable(path, tuple({PARTICIPANT: files.MISSING} | row for row in rows))
+    return UserTable.of(path, rows, visits)
 
 
 def _node(

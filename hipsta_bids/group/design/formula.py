@@ -236,7 +236,8 @@ def typed(values: pd.Series) -> pd.Series:
     text = text.map(lambda value: None if value is None else str(value).strip())
     text = text.where(~text.isin([MISSING, ""]), None)
     present = text.notna()
-    numbers = pd.to_numeric(text, errors="coerce").astype(np.float64)
+    ascii_text = text.replace("^\u2212", "-", regex=True)  # minus of print
+    numbers = pd.to_numeric(ascii_text, errors="coerce").astype(np.float64)
     if present.any() and numbers[present].notna().all():
         too_large = present & ~(numbers.abs() < _LARGEST)
         if too_large.any():
@@ -362,21 +363,24 @@ def cells(values: pd.Series) -> str:
     return listed(f"{row} ({cell})" for row, cell in zip(values.index, texts, strict=True))
 
 
+#: Columns whose levels begin with other letters.
+_SEXES = {"sex", "gender"}
+
+
 def check_spelling(levels: Mapping[str, int], name: str) -> None:
     """Refuse levels of a factor that differ in case or blanks only.
 
     The user has to choose between them: merged silently, a typing error would pass.
     """
     spellings: dict[str, list[str]] = {}
+    size = 1 if name.casefold() in _SEXES else None  # F and Female
     for level in levels:
-        spellings.setdefault("".join(level.split()).casefold(), []).append(level)
+        spellings.setdefault("".join(level.split()).casefold()[:size], []).append(level)
     for variants in spellings.values():
         if len(variants) > 1:
             words = ", ".join(f"{level!r} ({levels[level]})" for level in sorted(variants))
-            raise ModelError(
-                f"model: levels of {name!r} differ in capitals or blanks only: {words}; write them"
-                " alike"
-            )
+            fault = "are several spellings" if size else "differ in capitals or blanks only"
+            raise ModelError(f"model: levels of {name!r} {fault}: {words}; write them alike")
 
 
 def coding_note(values: pd.Series) -> str | None:

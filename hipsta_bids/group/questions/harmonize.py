@@ -20,6 +20,7 @@ from hipsta_bids.group.questions.scores import without_variable
 from hipsta_bids.group.stats import combat
 from hipsta_bids.group.stats.arrays import Bool, Float
 from hipsta_bids.group.stats.registration import Registration
+from hipsta_bids.io.labels import refuse_alike
 from hipsta_bids.types import PARTICIPANT, SESSION
 
 #: Share of a contrast's weights that counts as rounding.
@@ -64,6 +65,7 @@ def plan_sites(
     old = tuple(saved.sites) if saved else ()
     present = set(labels[usable])
     new = tuple(sorted(present - set(old)))
+    refuse_alike(new, old, f"--harmonize: column {column}")
     sites = (*old, *new)
     people = cohort.table[PARTICIPANT].to_numpy()
     counts = {one: len(set(people[usable & (labels == one).to_numpy()])) for one in sites}

@@ -37,6 +37,7 @@ from hipsta_bids.group.stats.arrays import Bool, Float, Int, Key
 from hipsta_bids.group.stats.glm import most_frequent
 from hipsta_bids.group.stats.warps import Template
 from hipsta_bids.io import files
+from hipsta_bids.io.labels import refuse_alike
 from hipsta_bids.progress import tell
 from hipsta_bids.protocols.toml import resolve
 from hipsta_bids.types import PARTICIPANT
@@ -322,6 +323,7 @@ def _people(study: studies.Study, file: NormsFile) -> normative.People:
     table = study.cohort.table
     check_names([file.age, *([file.sex] if file.sexes else [])], table.columns)
     age, labels = _ages(table, file.age), _site_labels(table, file.site)
+    refuse_alike(set(labels.dropna()), file.sites, f"norms: column {file.site}")
     low, high = file.knots[0], file.knots[-1]
     reach = f"outside of the norms' {low:g} to {high:g} years"
     sex = np.zeros((len(table), max(len(file.sexes) - 1, 0)))

@@ -309,7 +309,7 @@ def read_study(
         [one for one in requests if one.name in {*measures.maps, *covariate_maps}],
         options.bids_dir,
         read.visits_of(collection.records),
-        collect.wanted_by(options.sheets),
+        partial(collect.wanted_by, options.sheets),
     )
     collection, visits, (covariates, absent, spelled) = read_in_order(
         collection, visits, options.bids_dir, options.covariates, settings

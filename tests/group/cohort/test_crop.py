@@ -13,6 +13,7 @@ from hipsta_bids.cli.main import main
 from hipsta_bids.derivatives.results import read_sheet
 from hipsta_bids.group.cohort.crop import crop_maps
 from hipsta_bids.group.cohort.external import find_maps, map_patterns
+from hipsta_bids.inputs.maps import scan
 
 #: One person, where the shared data are present.
 HIPPUNFOLD = Path(__file__).parents[3] / ".." / "shared" / "data" / "hippunfold"
@@ -151,7 +152,9 @@ def test_real_maps_agree_with_the_sheet(tmp_path):
     assert main(arguments) == 0
     pattern = "sub-{subject}/surf/*_hemi-{hemi}_*_label-hipp_thickness.shape.gii"
     (request,) = map_patterns([("hipp", pattern)], (), ())
-    source = find_maps(request, HIPPUNFOLD, (), lambda *wanted: wanted[2] == "L")
+    source = find_maps(
+        request, HIPPUNFOLD, (), lambda *wanted: wanted[2] == "L", scan(request.pattern, HIPPUNFOLD)
+    )
     place = place_of(tmp_path, "001", "L", seg="hippunfold")
     sides, _, notes = crop_maps(source, [("001", None)], {(("001", None), "L"): place})
     theirs = sides["L"].maps["hipp"][0]

@@ -18,6 +18,7 @@ from nibabel.cifti2 import BrainModelAxis, Cifti2Image, ScalarAxis
 
 from hipsta_bids.errors import InputError, NothingToDoError, UsageError
 from hipsta_bids.group.cohort.external import find_maps, map_patterns, read_maps
+from hipsta_bids.inputs.maps import scan
 from hipsta_bids.io import files
 from hipsta_bids.io.gifti import read_map, read_mesh
 
@@ -43,7 +44,7 @@ def write_subject(root, subject, version, values, hemi="L", **which):
 
 def find_and_read(root, pattern, *, surfaces=(), known=(), wanted=anybody):
     (request,) = map_patterns([("hipp", pattern)], surfaces, ())
-    found = find_maps(request, root, known, wanted)
+    found = find_maps(request, root, known, wanted, scan(request.pattern, root))
     visits = sorted(found.visits, key=lambda visit: (visit[0], visit[1] or ""))
     return *read_maps(found, visits, GRID, with_sheets=True)[:2], visits
 
@@ -77,7 +78,7 @@ def test_curvature_has_one_sign_on_both_sides(tmp_path, version):
         write_subject(tmp_path, "01", version, sign * values, hemi, measure="curvature")
     pattern = PATTERNS[version].replace("thickness", "curvature")
     (request,) = map_patterns([("bend", pattern)], (), ())
-    found = find_maps(request, tmp_path, (), anybody)
+    found = find_maps(request, tmp_path, (), anybody, scan(request.pattern, tmp_path))
     sides, _, notes = read_maps(found, [("01", None)], GRID, with_sheets=True)
     for side in sides.values():
         np.testing.assert_allclose(side.maps["bend"][0, :, 0], values, rtol=1e-6)

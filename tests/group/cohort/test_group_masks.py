@@ -55,9 +55,9 @@ def test_repaired_columns_are_missing_and_counted_by_group(study):
     assert "CN " in note
 
 
-def test_points_of_a_table(study, tmp_path):
+def test_points_of_a_table(study, tmp_path, capsys):
     path = tmp_path / "points.tsv"
-    rows = [["sub-01", "L", "1", "2"], ["n/a", "L", "3", "n/a"], ["sub-02", "R", "n/a", "n/a"]]
+    rows = [["1", "lh", "1", "2"], ["n/a", "L", "3", "n/a"], ["sub-02", "R", "n/a", "n/a"]]
     files.write_tsv(path, ["participant_id", "hemi", "x", "y"], rows)
     _, masked, notes = run(study, "table", "--mask", path)
     n = masked.set_index(["node_x", "node_y"])["n"]
@@ -66,9 +66,8 @@ def test_points_of_a_table(study, tmp_path):
     assert 3 not in n.index.get_level_values(0) or n.loc[3].isin([0]).all()
     assert len(notes) == 1
     files.write_tsv(path, ["participant_id", "x", "y"], [["sub-99", "1", "1"]])
-    assert run(study, "nobody", "--mask", path)[0] == ExitCode.OK
-    record = (study[1] / "group" / "nobody" / "analysis.json").read_text()
-    assert "matches no hemisphere here: sub-99" in record
+    assert run(study, "nobody", "--mask", path)[0] == ExitCode.BAD_DATA
+    assert "matches no hemisphere here: sub-99; correct the labels" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -233,9 +233,10 @@ def test_all_tables_of_users_share_the_list(tmp_path, word):
     path = tmp_path / "t.tsv"
     path.write_text(f"participant_id\tsession_id\themi\trating\nsub-1\t{word}\t{word}\texclude\n")
     name = place_of(tmp_path, "1", "L", session="2").name
-    assert Choices(path, path).reason_to_leave_out(name, "0" * 64)[0] == "listed"
+    visits = [("1", "2")]
+    assert Choices(path, path, visits).reason_to_leave_out(name, "0" * 64)[0] == "listed"
     path.write_text(f"participant_id\trating\tnote\nsub-1\t{word}\tx\n")
-    assert Choices(None, path).counts([(name, None)])["unrated"] == 1
+    assert Choices(None, path, visits).counts([(name, None)])["unrated"] == 1
     path.write_text(f"x\ty\tregion\n1\t1\t{word}\n1\t2\tCA1\n")
     assert read_regions(path, (2, 2)).member.sum() == 1
     path.write_text(

@@ -229,6 +229,13 @@ def test_every_visit_is_scored_and_norms_take_first_ones(norms, tmp_path, capsys
     assert gains["aged"] == pytest.approx(gains["same"] + 20 / 31, abs=0.15)
 
 
+def test_a_new_site_that_may_be_a_known_one_is_refused(people, norms, capsys, tmp_path):
+    rows = [["a" if cell == "A" else cell for cell in row] for row in read_participants(people[0])]
+    write_participants(tmp_path, rows, TABLE)
+    call = [tmp_path, people[1], "group", "--norms", norms, *CONTROLS]
+    refused(capsys, call, "norms: column site: a may be A; write it so")
+
+
 def test_sites_need_controls(people, norms, capsys, tmp_path):
     call = [*people, "group", "--norms", norms]
     refused(capsys, call, "no norms of site 'D', only A, B", "needs 25 controls (--controls")

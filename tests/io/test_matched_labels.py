@@ -3,7 +3,7 @@
 import pytest
 
 from hipsta_bids.errors import InputError
-from hipsta_bids.group.cohort.labels import match_labels
+from hipsta_bids.io.labels import match_labels
 
 DATA = [f"sub-{i:02d}" for i in range(1, 25)]
 
