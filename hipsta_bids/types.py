@@ -130,9 +130,13 @@ class LabelVolume:
     """Index, in the file, of the first voxel of this part of it."""
     file_shape: tuple[int, int, int] | None = None
     """Shape of the file; None without a file or if nothing was cropped."""
+    shares: Mapping[int, NDArray[np.float32]] = field(default_factory=dict)
+    """(I, J, K) by tissue: which share of each voxel it fills, 0 to 1; empty if unknown."""
 
     def __post_init__(self) -> None:
         shape = np.shape(self.tissue)
+        if wrong := [kind for kind, share in self.shares.items() if share.shape != shape]:
+            raise ValueError(f"LabelVolume.shares: shape of tissue {wrong[0]} differs from {shape}")
         if self.edited_mask is not None and self.edited_mask.inside.shape != shape:
             raise ValueError(
                 f"LabelVolume.edited_mask: shape differs from the shape of tissue, {shape}"

@@ -15,6 +15,7 @@ from scipy.spatial import cKDTree
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry import completion, digital
 from hipsta_bids.geometry.ends import EndPlanes, find_end_planes
+from hipsta_bids.geometry.shares import Shares, sheet_share
 from hipsta_bids.protocols.load import for_region
 from hipsta_bids.protocols.protocol import MEDIAL_END, Tissue, lateral_rank
 from hipsta_bids.settings import BodySettings
@@ -77,6 +78,8 @@ class Body:
     """(N, 3) indices of the largest thin gap in the labels that was not filled."""
     mask_change: MaskChange | None = None
     """What an edited mask changed; None without a mask."""
+    share: Shares | None = None
+    """(I, J, K) share of the sheet in each voxel; None without probabilities."""
 
     @cached_property
     def lateral(self) -> Float:
@@ -151,6 +154,7 @@ def extract_body(volume: LabelVolume, settings: BodySettings, *, second: bool = 
     With ``second``, doubtful cavities are taken for the other kind. Merging and the molecular-layer
     rule: Diers et al. 2023, section 2.1.
     """
+    labels = volume
     tissue, layer_voxels = _merge_layer(volume, settings)
     if not tissue.any():
         raise GeometryError(
@@ -204,6 +208,7 @@ def extract_body(volume: LabelVolume, settings: BodySettings, *, second: bool = 
         handed_over=handed_over,
         gap=gap,
         mask_change=change,
+        share=sheet_share(labels, tissue > 0, for_region(labels.protocol, region).sheet),
     )
 
 

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,7 @@ from hipsta_bids.geometry import digital
 from hipsta_bids.geometry.body import Body
 from hipsta_bids.geometry.completion import Index
 from hipsta_bids.geometry.outlines import SLIT_HALF_WIDTH, TOUCH_DISTANCE
+from hipsta_bids.geometry.shares import softness
 from hipsta_bids.geometry.slices import has_thick_slices, points_of_ends, sample_slices
 from hipsta_bids.settings import CheckSettings, GridSettings, SliceSettings
 from hipsta_bids.types import Bool, End, Float, LabelVolume
@@ -26,6 +28,10 @@ MOTION_REACH = 3.0
 MOTION_SD = 0.4
 #: A change of size or shape weighs against it this share of what it explains.
 MOTION_PRIOR = 0.02
+#: Share of the smoothing of binary labels where voxels have true shares.
+SHARE_SMOOTHING = 0.35
+#: SD of the window in which it is judged whether they have, mm.
+SOFT_WINDOW = 1.0
 
 _MAX_REPEATS = 1.3
 """Median number of equal slices in a row, along two axes, of labels that were resampled: 1 in
@@ -138,7 +144,7 @@ def resample_body(body: Body, hemi: str, settings: GridSettings, slices: SliceSe
         values = sample_slices(body, points, slices)
     else:
         points = continued_nodes(grid, body, body.ends.half_slice).reshape(-1, 3)
-        values = _sample_mask(body, points)
+        values = _sample(body, points, body.tissue > 0 if body.share is None else body.share)
         between = _between_turns(body, points)
         separated = (between & (values > 0.5)).reshape(grid.shape)  # noqa: PLR2004 -- in the mask
         values[between] = 0
@@ -146,6 +152,12 @@ def resample_body(body: Body, hemi: str, settings: GridSettings, slices: SliceSe
     cavities = cavities[body.tissue[tuple(cavities.T)] > 0]
     sigma = max(settings.smoothing * in_plane_voxel(body.affine), settings.min_smoothing)
     smooth = _smooth(values.reshape(grid.shape), sigma / settings.spacing)
+    if body.share is not None:
+        # Less where shares already say where the wall is; as much as ever where they are 0 or 1.
+        sharp = _smooth(values.reshape(grid.shape), SHARE_SMOOTHING * sigma / settings.spacing)
+        reach = SOFT_WINDOW / np.linalg.norm(body.affine[:3, :3], axis=0)
+        weight = _sample(body, points, softness(body.share, reach)).reshape(grid.shape)
+        smooth += weight * (sharp - smooth)
     return Field(
         grid=grid,
         beyond=round(settings.beyond / grid.step),
@@ -246,12 +258,16 @@ def _nodes_in(voxels: Index, body: Body, points: Float, shape: tuple[int, int, i
     return np.asarray(hit.reshape(shape))
 
 
-def _sample_mask(body: Body, points: Float) -> NDArray[np.float32]:
-    """Linear interpolation of the body's mask at (N, 3) points, RAS mm."""
-    voxels = body.to_voxels(points)
-    mask = (body.tissue > 0).astype(np.float32)
+def _sample(body: Body, points: Float, values: NDArray[Any]) -> NDArray[np.float32]:
+    """Linear interpolation of values (I, J, K) of the body's voxels at (N, 3) points, RAS mm."""
     return np.asarray(
-        ndimage.map_coordinates(mask, voxels.T, order=1, output=np.float32, mode="nearest")
+        ndimage.map_coordinates(
+            values.astype(np.float32),
+            body.to_voxels(points).T,
+            order=1,
+            output=np.float32,
+            mode="nearest",
+        )
     )
 
 

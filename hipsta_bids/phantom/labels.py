@@ -99,8 +99,11 @@ def draw(
     hemi: str,
     pose: Float | None,
     supersample: int | tuple[int, int, int],
-) -> NDArray[np.intp]:
-    """Label every voxel of a grid; the affine maps index to RAS mm."""
+) -> tuple[NDArray[np.intp], dict[int, NDArray[np.float32]]]:
+    """Label every voxel of a grid; the affine maps index to RAS mm.
+
+    Returns also the share of each voxel that each code fills, with one point per voxel none.
+    """
     counts = np.broadcast_to(np.asarray(supersample, dtype=int), 3)
     if (counts < 1).any():
         raise bad(f"supersample must be 1 or more, not {supersample}")
@@ -109,6 +112,7 @@ def draw(
     codes = np.concatenate(
         [table[_regions(body, part, affine, hemi, pose)] for part in _chunks(index, 1)]
     ).reshape(shape)
+    shares: dict[int, NDArray[np.float32]] = {}
     if (counts > 1).any():
         # In voxels, the points (M, 3) that vote for the label of one that touches another label.
         steps = [(np.arange(count) + 0.5) / count - 0.5 for count in counts]
@@ -116,15 +120,19 @@ def draw(
         low, high = (f(codes, 3, mode="nearest") for f in (minimum_filter, maximum_filter))
         mixed = np.argwhere(low != high).astype(np.float64)
         votes = [
-            _majority(
+            _votes(
                 table[_regions(body, (part[:, None] + offsets).reshape(-1, 3), affine, hemi, pose)],
                 per_voxel=len(offsets),
                 kinds=len(protocol.labels) + 1,
             )
             for part in _chunks(mixed, len(offsets))
         ]
-        codes[tuple(mixed.astype(int).T)] = np.concatenate(votes)
-    return codes
+        by_code, at = np.concatenate(votes), tuple(mixed.astype(int).T)
+        for code in np.flatnonzero(np.bincount(codes.ravel())):
+            shares[int(code)] = (codes == code).astype(np.float32)
+            shares[int(code)][at] = by_code[:, code] / len(offsets)
+        codes[at] = by_code.argmax(axis=1)  # ties take the lowest
+    return codes, shares
 
 
 def subfield_at(u: Float) -> NDArray[np.uint8]:
@@ -258,12 +266,11 @@ def _regions(
     return region
 
 
-def _majority(labels: NDArray[np.intp], *, per_voxel: int, kinds: int) -> NDArray[np.intp]:
-    """Most frequent label (N,) of each run of ``per_voxel`` labels; ties take the lowest."""
+def _votes(labels: NDArray[np.intp], *, per_voxel: int, kinds: int) -> NDArray[np.intp]:
+    """Count labels (N, kinds) in each run of ``per_voxel`` labels."""
     voxels = len(labels) // per_voxel
     keys = np.repeat(np.arange(voxels), per_voxel) * kinds + labels
-    counts = np.bincount(keys, minlength=voxels * kinds).reshape(voxels, kinds)
-    return np.asarray(counts.argmax(axis=1))
+    return np.bincount(keys, minlength=voxels * kinds).reshape(voxels, kinds)
 
 
 def _chunks(rows: Float, points_each: int) -> Iterator[Float]:

@@ -233,7 +233,7 @@ class Phantom:
         grid_rotation
             (3, 3) rotation of the voxel grid.
         supersample
-            Points per voxel and axis that vote for its label.
+            Points per voxel and axis that vote for its label, and say which share each tissue has.
         border
             mm of background on every side.
         """
@@ -244,13 +244,21 @@ class Phantom:
             rotation=grid_rotation,
             border=border,
         )
-        labels = draw(
+        labels, shares = draw(
             self.body, shape, affine, protocol, hemi=hemi, pose=pose, supersample=supersample
         )
         meanings = [(0, 0), *((label.tissue, label.part) for label in protocol.labels)]
         tissue, part = np.array(meanings, dtype=np.uint8).T
+        by_tissue: dict[int, NDArray[np.float32]] = {}
+        for label, share in shares.items():
+            kind = int(tissue[label])
+            by_tissue[kind] = by_tissue.get(kind, np.float32(0)) + share
         return LabelVolume(
-            tissue=tissue[labels], part=part[labels], affine=affine, protocol=protocol
+            tissue=tissue[labels],
+            part=part[labels],
+            affine=affine,
+            protocol=protocol,
+            shares=by_tissue,
         )
 
     def truth(

@@ -1,0 +1,61 @@
+"""The share of the sheet in each voxel, where labels come with probabilities.
+
+Labels decide topology, ends, subfields and repairs. Shares move the wall, by at most a voxel: the
+surface at one half of the voxels' shares is the wall that binary labels know to half a voxel only.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from hipsta_bids.geometry import digital
+from hipsta_bids.protocols.protocol import Tissue
+from hipsta_bids.types import Bool, Float, LabelVolume
+
+Shares = NDArray[np.float32]
+
+
+def sheet_share(volume: LabelVolume, body: Bool, sheet: tuple[int, ...]) -> Shares | None:
+    """Return the share (I, J, K) of the sheet in each voxel; ``None`` without probabilities.
+
+    ``body`` (I, J, K) is the mended sheet, ``sheet`` lists the tissues of which it is made. Where a
+    voxel of the body has another label, as of the molecular layer, the label's share counts there
+    and in the voxels nearest to it; filled voxels are full, voxels that were taken out are empty.
+    """
+    if not volume.shares:
+        return None
+    labeled = np.isin(volume.tissue, sheet)
+    taken = labeled & ~body
+    around = digital.box_around(digital.positions(body | taken))
+    edges = np.linalg.norm(volume.affine[:3, :3], axis=0)
+    nearest = ndimage.distance_transform_edt(
+        ~(body | taken)[around], sampling=edges, return_distances=False, return_indices=True
+    )
+    kind = volume.tissue[around][tuple(nearest)]
+    part = np.zeros(kind.shape, dtype=np.float32)
+    for tissue, share in volume.shares.items():
+        if tissue != Tissue.BACKGROUND:
+            part += share[around] * (True if tissue in sheet else kind == tissue)
+    inside = body[around]
+    part[inside & ~np.isin(kind, [t for t in volume.shares if t != Tissue.BACKGROUND])] = 1
+    part[taken[around][tuple(nearest)]] = 0
+    deep = ndimage.binary_erosion(inside, structure=digital.CUBE)
+    near = ndimage.binary_dilation(inside, structure=digital.CUBE)
+    result = np.zeros(body.shape, dtype=np.float32)
+    result[around] = np.where(deep, 1, np.where(near, np.clip(part, 0, 1), 0))
+    return result
+
+
+def softness(share: Shares, reach: Float) -> Shares:
+    """Return how much the voxels near the wall know beyond binary labels, (I, J, K), 0 to 1.
+
+    It is the sum of p (1 - p) in a Gaussian window of SD ``reach``, voxels, over the sum that the
+    wall's true shares have. A voxel's share of a half-space is the distribution function of its
+    projection on the normal, whose width depends little on the direction: per area of wall, the sum
+    is a sixth of a voxel's edge along the normal.
+    """
+    slopes = np.gradient(ndimage.gaussian_filter(share, 0.5))
+    wall = np.sqrt(sum(slope * slope for slope in slopes)) / 6
+    window = (ndimage.gaussian_filter(part, reach) for part in (share * (1 - share), wall))
+    observed, expected = window
+    return np.asarray(np.clip(observed / np.maximum(expected, 1e-6), 0, 1), dtype=np.float32)
