@@ -14,7 +14,7 @@ from hipsta_bids.geometry import digital
 from hipsta_bids.geometry.body import Body
 from hipsta_bids.geometry.completion import Index
 from hipsta_bids.geometry.outlines import SLIT_HALF_WIDTH, TOUCH_DISTANCE
-from hipsta_bids.geometry.shares import softness
+from hipsta_bids.geometry.shares import SHARE_SMOOTHING, SOFT_WINDOW, softness
 from hipsta_bids.geometry.slices import has_thick_slices, points_of_ends, sample_slices
 from hipsta_bids.settings import CheckSettings, GridSettings, SliceSettings
 from hipsta_bids.types import Bool, End, Float, LabelVolume
@@ -28,10 +28,6 @@ MOTION_REACH = 3.0
 MOTION_SD = 0.4
 #: A change of size or shape weighs against it this share of what it explains.
 MOTION_PRIOR = 0.02
-#: Share of the smoothing of binary labels where voxels have true shares.
-SHARE_SMOOTHING = 0.35
-#: SD of the window in which it is judged whether they have, mm.
-SOFT_WINDOW = 1.0
 
 _MAX_REPEATS = 1.3
 """Median number of equal slices in a row, along two axes, of labels that were resampled: 1 in

@@ -12,6 +12,11 @@ from hipsta_bids.geometry import digital
 from hipsta_bids.protocols.protocol import Tissue
 from hipsta_bids.types import Bool, Float, LabelVolume
 
+#: Where voxels have shares, the smoothing of binary labels is less by this factor.
+SHARE_SMOOTHING = 0.35
+#: SD of the window in which it is judged whether they have, mm.
+SOFT_WINDOW = 1.0
+
 Shares = NDArray[np.float32]
 
 
