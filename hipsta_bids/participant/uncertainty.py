@@ -19,12 +19,14 @@ from numpy.typing import NDArray
 from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.ndimage import (
     affine_transform,
+    map_coordinates,
     maximum_filter,
     maximum_filter1d,
     minimum_filter,
 )
 from scipy.spatial.distance import pdist, squareform
 from scipy.spatial.transform import Rotation
+from scipy.special import ndtr, ndtri
 
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.body import extract_body
@@ -38,6 +40,7 @@ from hipsta_bids.io.volumes import moved
 from hipsta_bids.participant.measure import measure_hemisphere, unfold
 from hipsta_bids.protocols import EXPERIMENTAL
 from hipsta_bids.protocols.load import for_region
+from hipsta_bids.protocols.protocol import Tissue
 from hipsta_bids.settings import CheckSettings, Settings, UncertaintySettings
 from hipsta_bids.types import EditedMask, Finding, Float, GivenEnd, HemisphereMaps, LabelVolume
 
@@ -205,7 +208,7 @@ def perturb(
     by_voxel = settings.jitter / np.sqrt(3.0)  # SD of a uniform distribution
     smooth = np.sqrt(np.maximum((settings.relabeling / voxel) ** 2 - by_voxel**2, 0.0))
     share = smooth / np.sqrt(len(settings.correlation))
-    for axis in range(3):
+    for axis in range(0 if volume.shares else 3):
         places[axis] += by_voxel * _smooth_noise(shape, np.ones(3), generator)[near]
         for length in settings.correlation:
             noise = _smooth_noise(shape, length / voxel, generator)[near]
@@ -213,15 +216,53 @@ def perturb(
     sampled = np.zeros(np.prod(shape), dtype=np.int64)
     sampled[near] = _likeliest(codes, places)
     sampled = sampled.reshape(shape)
+    tissue, shares = (sampled % _PART).astype(np.uint8), {}
+    if volume.shares:
+        tissue, shares = _drawn_shares(volume, (shape, near, places), voxel, settings, generator)
     mask = volume.edited_mask
     return LabelVolume(
-        tissue=(sampled % _PART).astype(np.uint8),
+        tissue=tissue,
         part=(sampled % _MASK // _PART).astype(np.uint8),
+        shares=shares,
         affine=affine,
         protocol=volume.protocol,
         edited_mask=None if mask is None else EditedMask(inside=sampled >= _MASK, voxel=mask.voxel),
         given_ends=_moved_ends(volume, ends, settings, generator),
     )
+
+
+def _drawn_shares(
+    volume: LabelVolume,
+    grid: tuple[tuple[int, int, int], NDArray[np.intp], Float],
+    voxel: Float,
+    settings: UncertaintySettings,
+    generator: np.random.Generator,
+) -> tuple[NDArray[np.uint8], dict[int, NDArray[np.float32]]]:
+    """Draw tissues, and shares, from the probabilities of a volume; (I, J, K) of another grid.
+
+    A tissue with the probability p is there if a normal number is below the quantile of p. The
+    numbers are correlated over the lengths of the settings, so that whole walls move. Both sides
+    of a wall are drawn, each with the variance 2, which leaves 1 for the wall. ``grid`` has its
+    shape, the voxels that may get a label (N,), and their places (3, N) in the volume's voxels.
+    """
+    shape, near, places = grid
+    kinds = [kind for kind in volume.shares if kind != Tissue.BACKGROUND]
+    sampled = np.array(
+        [map_coordinates(volume.shares[kind], places, order=1, output=np.float32) for kind in kinds]
+    )
+    values = np.vstack([np.clip(1 - sampled.sum(axis=0), 0, 1), sampled])
+    for row in values:
+        noise = sum(_smooth_noise(shape, n / voxel, generator)[near] for n in settings.correlation)
+        row[:] = ndtr(ndtri(row) - np.sqrt(2 / len(settings.correlation)) * noise)
+    values /= values.sum(axis=0)
+    tissue = np.zeros(np.prod(shape), dtype=np.uint8)
+    tissue[near] = np.array([Tissue.BACKGROUND, *kinds])[values.argmax(axis=0)]
+    shares = {}
+    for kind, row in zip(kinds, values[1:], strict=True):
+        shares[kind] = np.zeros(np.prod(shape), dtype=np.float32)
+        shares[kind][near] = row
+        shares[kind] = shares[kind].reshape(shape)
+    return tissue.reshape(shape), shares
 
 
 def _moved_ends(
@@ -257,6 +298,7 @@ def _cropped(volume: LabelVolume) -> LabelVolume:
         tissue=volume.tissue[around],
         part=volume.part[around],
         affine=moved(volume.affine, low),
+        shares={kind: share[around] for kind, share in volume.shares.items()},
         edited_mask=None if mask is None else replace(mask, inside=mask.inside[around]),
     )
 
