@@ -75,7 +75,7 @@ def outline_slice(
     distance = np.where(np.abs(distance) < sigma * fine, exact, distance)
     if share is not None:
         at = _fine_pixels(share.shape, settings.upsampling)
-        known = softness(share, np.full(2, SOFT_WINDOW / pixel))
+        known = np.minimum(softness(share, np.full(2, SOFT_WINDOW / pixel)), 1)
         weight = ndimage.map_coordinates(known, at, order=1, mode="nearest")
         distance += weight * (_from_share(share, fine, settings) - distance)
     ranks = ranks_of(tissue, settings.upsampling)

@@ -52,10 +52,11 @@ def sheet_share(volume: LabelVolume, body: Bool, sheet: tuple[int, ...]) -> Shar
 
 
 def softness(share: Shares, reach: Float) -> Shares:
-    """Return how much the voxels near the wall know beyond binary labels, (I, J, K), 0 to 1.
+    """Return how soft the wall is near each voxel: 0 for binary labels, 1 for shares.
 
-    It is the sum of p (1 - p) in a Gaussian window of SD ``reach``, voxels, over the sum that the
-    wall's true shares have. A voxel's share of a half-space is the distribution function of its
+    ``share`` has 2 or 3 axes. Above 1, probabilities are wider than the ramp that voxels make of a
+    wall. It is the sum of p (1 - p) in a Gaussian window of SD ``reach``, voxels, over the sum that
+    the wall's true shares have. A voxel's share of a half-space is the distribution function of its
     projection on the normal, whose width depends little on the direction: per area of wall, the sum
     is a sixth of a voxel's edge along the normal.
     """
@@ -63,4 +64,4 @@ def softness(share: Shares, reach: Float) -> Shares:
     wall = np.sqrt(sum(slope * slope for slope in slopes)) / 6
     window = (ndimage.gaussian_filter(part, reach) for part in (share * (1 - share), wall))
     observed, expected = window
-    return np.asarray(np.clip(observed / np.maximum(expected, 1e-6), 0, 1), dtype=np.float32)
+    return np.asarray(observed / np.maximum(expected, 1e-6), dtype=np.float32)

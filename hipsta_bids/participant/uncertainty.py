@@ -26,7 +26,6 @@ from scipy.ndimage import (
 )
 from scipy.spatial.distance import pdist, squareform
 from scipy.spatial.transform import Rotation
-from scipy.special import ndtr, ndtri
 
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.body import extract_body
@@ -35,6 +34,7 @@ from hipsta_bids.geometry.checks import check_thickness, raise_flags
 from hipsta_bids.geometry.digital import box, to_ras
 from hipsta_bids.geometry.ends import EndPlanes
 from hipsta_bids.geometry.measures import pool_sd
+from hipsta_bids.geometry.shares import SOFT_WINDOW, softness
 from hipsta_bids.geometry.sheet_checks import RIVAL_OFF
 from hipsta_bids.io.volumes import moved
 from hipsta_bids.participant.measure import measure_hemisphere, unfold
@@ -48,6 +48,8 @@ _Codes = NDArray[np.int64]
 
 #: Least grid spacing of copies, mm: what all copies share cancels out, and time matters.
 COPY_SPACING = 0.46
+#: Least SD of walls whose probabilities leave no doubt, mm.
+LEAST_DOUBT = 0.04
 #: Copies without which no SD is told, and which make a mode.
 LEAST = 2
 POOLED = 3
@@ -208,7 +210,10 @@ def perturb(
     by_voxel = settings.jitter / np.sqrt(3.0)  # SD of a uniform distribution
     smooth = np.sqrt(np.maximum((settings.relabeling / voxel) ** 2 - by_voxel**2, 0.0))
     share = smooth / np.sqrt(len(settings.correlation))
-    for axis in range(0 if volume.shares else 3):
+    if volume.shares:
+        share = _doubt(volume, places) / voxel[:, None] / np.sqrt(len(settings.correlation))
+        by_voxel = 0.0
+    for axis in range(3):
         places[axis] += by_voxel * _smooth_noise(shape, np.ones(3), generator)[near]
         for length in settings.correlation:
             noise = _smooth_noise(shape, length / voxel, generator)[near]
@@ -216,14 +221,11 @@ def perturb(
     sampled = np.zeros(np.prod(shape), dtype=np.int64)
     sampled[near] = _likeliest(codes, places)
     sampled = sampled.reshape(shape)
-    tissue, shares = (sampled % _PART).astype(np.uint8), {}
-    if volume.shares:
-        tissue, shares = _drawn_shares(volume, (shape, near, places), voxel, settings, generator)
     mask = volume.edited_mask
     return LabelVolume(
-        tissue=tissue,
+        tissue=(sampled % _PART).astype(np.uint8),
         part=(sampled % _MASK // _PART).astype(np.uint8),
-        shares=shares,
+        shares=_move_shares(volume, shape, near, places),
         affine=affine,
         protocol=volume.protocol,
         edited_mask=None if mask is None else EditedMask(inside=sampled >= _MASK, voxel=mask.voxel),
@@ -231,38 +233,31 @@ def perturb(
     )
 
 
-def _drawn_shares(
-    volume: LabelVolume,
-    grid: tuple[tuple[int, int, int], NDArray[np.intp], Float],
-    voxel: Float,
-    settings: UncertaintySettings,
-    generator: np.random.Generator,
-) -> tuple[NDArray[np.uint8], dict[int, NDArray[np.float32]]]:
-    """Draw tissues, and shares, from the probabilities of a volume; (I, J, K) of another grid.
+def _doubt(volume: LabelVolume, places: Float) -> Float:
+    """Read how far walls may lie elsewhere, by their probabilities: SD (N,), mm, at places (3, N).
 
-    A tissue with the probability p is there if a normal number is below the quantile of p. The
-    numbers are correlated over the lengths of the settings, so that whole walls move. Both sides
-    of a wall are drawn, each with the variance 2, which leaves 1 for the wall. ``grid`` has its
-    shape, the voxels that may get a label (N,), and their places (3, N) in the volume's voxels.
+    Beyond the ramp that voxels make of a wall, probabilities of a wall at a normal distance have
+    p (1 - p) in proportion to its SD: the integral across the wall is SD / sqrt(pi).
     """
-    shape, near, places = grid
-    kinds = [kind for kind in volume.shares if kind != Tissue.BACKGROUND]
-    sampled = np.array(
-        [map_coordinates(volume.shares[kind], places, order=1, output=np.float32) for kind in kinds]
-    )
-    values = np.vstack([np.clip(1 - sampled.sum(axis=0), 0, 1), sampled])
-    for row in values:
-        noise = sum(_smooth_noise(shape, n / voxel, generator)[near] for n in settings.correlation)
-        row[:] = ndtr(ndtri(row) - np.sqrt(2 / len(settings.correlation)) * noise)
-    values /= values.sum(axis=0)
-    tissue = np.zeros(np.prod(shape), dtype=np.uint8)
-    tissue[near] = np.array([Tissue.BACKGROUND, *kinds])[values.argmax(axis=0)]
+    edges = np.linalg.norm(volume.affine[:3, :3], axis=0)
+    sheet = [k for k in volume.shares if k in volume.protocol.sheet]
+    share = np.clip(sum(volume.shares[kind] for kind in sheet), 0, 1)
+    ratio = softness(share, SOFT_WINDOW / edges)
+    ramp = np.cbrt(edges.prod()) * np.sqrt(np.pi) / 6
+    wide = map_coordinates(ratio, places, order=1, mode="nearest")
+    return np.sqrt(ramp**2 * np.maximum(wide**2 - 1, 0) + LEAST_DOUBT**2)
+
+
+def _move_shares(
+    volume: LabelVolume, shape: tuple[int, int, int], near: NDArray[np.intp], places: Float
+) -> dict[int, NDArray[np.float32]]:
+    """Sample shares at places (3, N), in voxels, for some voxels (N,) of another grid."""
     shares = {}
-    for kind, row in zip(kinds, values[1:], strict=True):
-        shares[kind] = np.zeros(np.prod(shape), dtype=np.float32)
-        shares[kind][near] = row
-        shares[kind] = shares[kind].reshape(shape)
-    return tissue.reshape(shape), shares
+    for kind, share in volume.shares.items():
+        moved_share = np.full(np.prod(shape), kind == Tissue.BACKGROUND, dtype=np.float32)
+        moved_share[near] = map_coordinates(share, places, order=1, mode="nearest")
+        shares[kind] = moved_share.reshape(shape)
+    return shares
 
 
 def _moved_ends(
