@@ -270,7 +270,7 @@ def _sample_mask(mask: LabelImage, affine: Float, shape: tuple[int, ...], path: 
         values = np.unique(np.append(values, 0))
     value_text = ", ".join(f"{value:g}" for value in values[:_LISTED_VALUES].tolist())
     value_text += ", ..." if len(values) > _LISTED_VALUES else ""
-    if len(values) > 2 or not np.isfinite(values).all() or (len(values) == 2 and 0 not in values):  # noqa: PLR2004 (two)
+    if len(values) > 2 or (len(values) == 2 and 0 not in values):  # noqa: PLR2004 (two)
         raise InputError(
             f"{path}: a mask has the value 0 and one other, this has {value_text}; save edited "
             "labels as desc-edited_dseg instead",
