@@ -130,6 +130,8 @@ class LabelVolume:
     """Index, in the file, of the first voxel of this part of it."""
     file_shape: tuple[int, int, int] | None = None
     """Shape of the file; None without a file or if nothing was cropped."""
+    notes: tuple[str, ...] = ()
+    """What a reader should know about the files."""
 
     def __post_init__(self) -> None:
         shape = np.shape(self.tissue)
