@@ -89,6 +89,12 @@ def records(table: pd.DataFrame) -> list[dict[str, Any]]:
     return [dict(zip(map(str, table.columns), row, strict=True)) for row in table.to_numpy(object)]
 
 
+def short_contrast(contrast: str) -> str:
+    """Write ``group[A] - group[B]``, as users do, like the default model, as ``A-B``."""
+    short = _MODELS.sub("", contrast)
+    return re.sub(r"\w+\[([^\]]*)\]", r"\1", short).replace(" - ", "-")
+
+
 def direction(results: GroupResults, contrast: str, hemi: str, sign: float) -> str:
     """Describe what a contrast above or below zero means."""
     comparison = results.record.get("comparison") or {}
@@ -96,9 +102,7 @@ def direction(results: GroupResults, contrast: str, hemi: str, sign: float) -> s
         return "larger on the left" if sign > 0 else "larger on the right"
     if contrast == "mean" and comparison.get("pair"):
         return "with an increase" if sign > 0 else "with a decrease"
-    # Contrasts as users write them, and as the default model names them: of change in time, too.
-    short = _MODELS.sub("", contrast)
-    short = re.sub(r"\w+\[([^\]]*)\]", r"\1", short).replace(" - ", "-")
+    short = short_contrast(contrast)
     for first in results.levels:
         for second in results.levels:
             if re.fullmatch(rf"(?:.* in )?{re.escape(first)}-{re.escape(second)}", short):

@@ -41,6 +41,8 @@ COMPARISON_COLUMNS: Mapping[str, str] = COLUMNS | _MEANINGS["comparison"]
 JOINT_COLUMNS: Mapping[str, str] = COLUMNS | _MEANINGS["joint"]
 #: The same of a correlation of maps.
 CORRELATION_COLUMNS: Mapping[str, str] = _MEANINGS["correlation"]
+#: The same of published numbers beside own numbers.
+REPLICATE_COLUMNS: Mapping[str, str] = _MEANINGS["replicate"]
 
 
 def result_tables(
