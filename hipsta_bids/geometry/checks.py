@@ -21,6 +21,7 @@ from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry import digital
 from hipsta_bids.geometry.body import Body
 from hipsta_bids.geometry.grid import Field, cut_across, in_plane_voxel
+from hipsta_bids.geometry.label_checks import border_sides
 from hipsta_bids.geometry.measures import column_area, measure_thickness
 from hipsta_bids.geometry.mesh import mean_wall_thickness
 from hipsta_bids.geometry.slices import points_of_ends
@@ -176,8 +177,9 @@ def check_image(body: Body) -> list[Finding]:
             reason="image-border",
             value=float(np.count_nonzero(outer)),
             limit=0,
-            text=f"{np.count_nonzero(outer)} voxels of the body lie at the border of the image",
-            remedy="check that the image holds all of it",
+            text=f"{np.count_nonzero(outer)} voxels of the body lie at the "
+            f"{border_sides(body.inside, body.affine)} border of the image",
+            remedy="use a larger or uncropped image if it cuts them",
             points=points[outer],
         ),
     ]
