@@ -37,6 +37,8 @@ _NEGLIGIBLE = 0.005
 
 #: A cut this near, mm, to both the subiculum and CA2 or CA3 severs but turns that touch.
 CONTACT_REACH = 1.2
+#: Probabilities that contradict this share of the body's voxels, away from its border, are flagged.
+UNLIKE_SHARE = 0.02
 #: Voxels are long if their longest edge is more than this many times the shortest.
 LONG_VOXEL_RATIO = 1.5
 #: Head or tail labels farther inside the body than this are out of place, mm.
@@ -182,7 +184,22 @@ def check_image(body: Body) -> list[Finding]:
             remedy="use a larger or uncropped image if it cuts them",
             points=points[outer],
         ),
+        *([_check_probabilities(body, body.soft.unlike)] if body.soft else []),
     ]
+
+
+def _check_probabilities(body: Body, unlike: digital.Index) -> Finding:
+    """Flag probabilities that contradict the labels (N, 3) away from their border."""
+    share = len(unlike) / max(np.count_nonzero(body.inside), 1)
+    return Finding(
+        reason="probabilities-unlike",
+        value=share,
+        limit=UNLIKE_SHARE,
+        text=f"probabilities contradict labels more than a voxel from the sheet's border, as many"
+        f" voxels as {share:.1%} of the body; labels were followed",
+        remedy="check that both are of one run",
+        points=digital.to_ras(unlike, body.affine),
+    )
 
 
 def _voxel_across(body: Body) -> float:

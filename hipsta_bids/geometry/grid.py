@@ -140,7 +140,7 @@ def resample_body(body: Body, hemi: str, settings: GridSettings, slices: SliceSe
         values = sample_slices(body, points, slices)
     else:
         points = continued_nodes(grid, body, body.ends.half_slice).reshape(-1, 3)
-        values = _sample(body, points, body.tissue > 0 if body.share is None else body.share)
+        values = _sample(body, points, body.soft.values if body.soft else body.tissue > 0)
         between = _between_turns(body, points)
         separated = (between & (values > 0.5)).reshape(grid.shape)  # noqa: PLR2004 -- in the mask
         values[between] = 0
@@ -148,11 +148,11 @@ def resample_body(body: Body, hemi: str, settings: GridSettings, slices: SliceSe
     cavities = cavities[body.tissue[tuple(cavities.T)] > 0]
     sigma = max(settings.smoothing * in_plane_voxel(body.affine), settings.min_smoothing)
     smooth = _smooth(values.reshape(grid.shape), sigma / settings.spacing)
-    if body.share is not None:
+    if body.soft:
         # Less where shares already say where the wall is; as much as ever where they are 0 or 1.
         sharp = _smooth(values.reshape(grid.shape), SHARE_SMOOTHING * sigma / settings.spacing)
         reach = SOFT_WINDOW / np.linalg.norm(body.affine[:3, :3], axis=0)
-        known = np.minimum(softness(body.share, reach), 1)
+        known = np.minimum(softness(body.soft.values, reach), 1)
         weight = _sample(body, points, known).reshape(grid.shape)
         smooth += weight * (sharp - smooth)
     return Field(

@@ -4,6 +4,8 @@ Labels decide topology, ends, subfields and repairs. Shares move the wall, by at
 surface at one half of the voxels' shares is the wall that binary labels know to half a voxel only.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
@@ -19,9 +21,20 @@ SOFT_WINDOW = 1.0
 
 Shares = NDArray[np.float32]
 
+_HALF = 0.5  # of a voxel: the wall
 
-def sheet_share(volume: LabelVolume, body: Bool, sheet: tuple[int, ...]) -> Shares | None:
-    """Return the share (I, J, K) of the sheet in each voxel; ``None`` without probabilities.
+
+class SheetShare(NamedTuple):
+    """The sheet in each voxel, by probabilities."""
+
+    values: Shares
+    """(I, J, K) share of the sheet; 0 and 1 farther than a voxel from the border of the labels."""
+    unlike: digital.Index
+    """(N, 3) voxels farther away in which probabilities contradict the labels."""
+
+
+def sheet_share(volume: LabelVolume, body: Bool, sheet: tuple[int, ...]) -> SheetShare | None:
+    """Compute the share of the sheet in each voxel; ``None`` without probabilities.
 
     ``body`` (I, J, K) is the mended sheet, ``sheet`` lists the tissues of which it is made. Where a
     voxel of the body has another label, as of the molecular layer, the label's share counts there
@@ -46,9 +59,10 @@ def sheet_share(volume: LabelVolume, body: Bool, sheet: tuple[int, ...]) -> Shar
     part[taken[around][tuple(nearest)]] = 0
     deep = ndimage.binary_erosion(inside, structure=digital.CUBE)
     near = ndimage.binary_dilation(inside, structure=digital.CUBE)
-    result = np.zeros(body.shape, dtype=np.float32)
-    result[around] = np.where(deep, 1, np.where(near, np.clip(part, 0, 1), 0))
-    return result
+    unlike = digital.positions(np.where(deep, part < _HALF, (part > _HALF) & ~near))
+    values = np.zeros(body.shape, dtype=np.float32)
+    values[around] = np.where(deep, 1, np.where(near, np.clip(part, 0, 1), 0))
+    return SheetShare(values, unlike + digital.low_corner(around))
 
 
 def softness(share: Shares, reach: Float) -> Shares:

@@ -215,8 +215,10 @@ def sample_slices(body: Body, points: Float, settings: SliceSettings) -> Stack:
         if not is_labeled:
             _extrapolate(tissue[::step], (depth < HIDDEN_DEPTH)[::step], pixel, settings)
     share = None
-    if body.share is not None:  # what was extrapolated has the labels' walls
-        share = np.where(tissue == labeled_tissue, body.share[part], tissue > 0).astype(np.float32)
+    if body.soft:  # what was extrapolated has the labels' walls
+        share = np.where(tissue == labeled_tissue, body.soft.values[part], tissue > 0).astype(
+            np.float32
+        )
     stack = _stacked(tissue, pixel, settings, share)
     voxels = body.to_voxels(points) - digital.low_corner(part)
     pixels = ((voxels[:, 1:] + 0.5) * settings.upsampling - 0.5).astype(np.float32).T
@@ -241,9 +243,10 @@ def _in_own_order(body: Body) -> Body:
     affine = body.affine.copy()
     affine[:3, 3] += affine[:3, :3] @ np.where(steps < 0, np.array(body.tissue.shape) - 1, 0)
     affine[:3, :3] = (affine[:3, :3] * steps)[:, order]
-    names: tuple[str, ...] = ("tissue", "hippocampal", "interior", "inside")
-    names += ("share",) if body.share is not None else ()
+    names = ("tissue", "hippocampal", "interior", "inside")
     volumes = {name: getattr(body, name).transpose(order)[flips] for name in names}
+    if body.soft:
+        volumes["soft"] = body.soft._replace(values=body.soft.values.transpose(order)[flips])
     return replace(body, **volumes, affine=affine)
 
 
