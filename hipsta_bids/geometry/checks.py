@@ -195,8 +195,8 @@ def _check_probabilities(body: Body, unlike: digital.Index) -> Finding:
         reason="probabilities-unlike",
         value=share,
         limit=UNLIKE_SHARE,
-        text=f"probabilities contradict labels more than a voxel from the sheet's border, as many"
-        f" voxels as {share:.1%} of the body; labels were followed",
+        text=f"probabilities contradict labels more than a voxel inside or outside the sheet"
+        f" ({share:.1%} of the body's voxels)",
         remedy="check that both are of one run",
         points=digital.to_ras(unlike, body.affine),
     )

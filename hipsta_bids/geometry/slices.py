@@ -216,9 +216,7 @@ def sample_slices(body: Body, points: Float, settings: SliceSettings) -> Stack:
             _extrapolate(tissue[::step], (depth < HIDDEN_DEPTH)[::step], pixel, settings)
     share = None
     if body.soft:  # what was extrapolated has the labels' walls
-        share = np.where(tissue == labeled_tissue, body.soft.values[part], tissue > 0).astype(
-            np.float32
-        )
+        share = np.where(tissue == labeled_tissue, body.soft.values[part], np.float32(tissue > 0))
     stack = _stacked(tissue, pixel, settings, share)
     voxels = body.to_voxels(points) - digital.low_corner(part)
     pixels = ((voxels[:, 1:] + 0.5) * settings.upsampling - 0.5).astype(np.float32).T

@@ -233,7 +233,7 @@ class Phantom:
         grid_rotation
             (3, 3) rotation of the voxel grid.
         supersample
-            Points per voxel and axis that vote for its label, and say which share each tissue has.
+            Points per voxel and axis that vote for its label, and give the share of each tissue.
         border
             mm of background on every side.
         """
