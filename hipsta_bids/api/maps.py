@@ -203,7 +203,8 @@ class Measurement:
             write_shared(root)
         common = {"version": __version__, "settings_hash": digest, "region": name.region}
         about = {"scheme": name.seg, "scheme_title": self.protocol.title, "input_hash": None}
-        record = common | about | {"inputs": [], "edited": [], "notes": ["measured in Python"]}
+        record: dict[str, Any] = common | about
+        record |= {"inputs": [], "edited": [], "notes": ["measured in Python"]}
         record |= {"provenance": {"probabilities": "memory"}} if self.soft else {}
         place = ResultPlace(root=root, name=name)
         outputs.write_results(place, self.hemisphere, self.protocol, record, write_meshes=False)

@@ -29,6 +29,7 @@ def phantom_parser() -> Parser:
     add("--head", "N", type=int)
     add("--thickness", "MM", default=1.8)
     add("--voxel-size", "MM", nargs=3, type=float, default=[0.4, 0.4, 0.4])
+    add("--probabilities")
     add("--seed", default=0)
     return parser
 
@@ -213,7 +214,13 @@ def write_phantoms(arguments: Sequence[str]) -> ExitCode:
 
     options.region = options.region or ("CA1-anterior" if options.head is None else "head")
     plan = from_namespace(CohortPlan, options)
-    write_cohort(options.out, plan, layout=options.layout, voxel_size=tuple(options.voxel_size))
+    write_cohort(
+        options.out,
+        plan,
+        layout=options.layout,
+        voxel_size=tuple(options.voxel_size),
+        probabilities=options.probabilities,
+    )
     echo(f"synthetic dataset of {plan.n_subjects} subjects: {options.out}")
     return ExitCode.OK
 
@@ -225,6 +232,7 @@ def run_surrogate(arguments: Sequence[str]) -> ExitCode:
     defaults = participant.build_parser().parse_args(
         [str(parsed.bids_dir), str(parsed.output_dir), participant.LEVELS[0]]
     )
+    defaults.probabilities = "never"
     options = argparse.Namespace(**vars(defaults) | vars(parsed))
     participant.check_folders(options)
     from hipsta_bids.settings import load_settings  # noqa: PLC0415  (start-up time)

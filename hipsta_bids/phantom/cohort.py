@@ -252,11 +252,15 @@ def write_cohort(
     *,
     layout: str = "freesurfer",
     voxel_size: tuple[float, float, float] = (0.4, 0.4, 0.4),
+    probabilities: bool = False,
 ) -> None:
     """Write a cohort as a BIDS dataset with segmentations, participants and all truth.
 
     ``voxel_size`` is in mm along left, inferior and anterior, the axes of the images.
+    ``probabilities`` are as of `hipsta_bids.phantom.write_dataset`.
     """
+    if probabilities and plan.head is not None:
+        raise UsageError("phantom: a head has no probabilities; omit one")
     dataset.refuse_taken(out)
     subjects = make_cohort(plan)
     hemispheres = [item for subject in subjects for item in subject.hemispheres]
@@ -265,6 +269,7 @@ def write_cohort(
         hemispheres,
         layouts=(layout,),
         voxel_size=voxel_size,
+        probabilities=probabilities,
         columns=_columns(plan),
         rows={
             one.label: (one.group, f"{one.age:.1f}", one.sex, f"{one.icv:.1f}", one.site)
