@@ -388,21 +388,21 @@ def measure(
     )
 
 
-def _with_probabilities(volume: LabelVolume, given: Any) -> LabelVolume:  # noqa: ANN401  (as above)
+def _with_probabilities(volume: LabelVolume, source: Any) -> LabelVolume:  # noqa: ANN401  (as above)
     """Add probabilities of the sheet, or of codes, to labels."""
     sheet = (*volume.protocol.sheet, *volume.protocol.layer)
     tissues = {0: Tissue.BACKGROUND} | {x.code: x.tissue for x in volume.protocol.labels}
-    if isinstance(given, Mapping):
-        for code in given:
+    if isinstance(source, Mapping):
+        for code in source:
             check_choice("probabilities: code", code, tissues)
         lacking = {tissue for tissue in sheet if (volume.tissue == tissue).any()}
-        if lacking := lacking.difference(tissues[code] for code in given):
+        if lacking := lacking.difference(tissues[code] for code in source):
             names = ", ".join(sorted(tissue.name for tissue in lacking))
             raise InputError(f"no probabilities of {names}; add them", reason="bad-probabilities")
-        by_tissue = [(tissues[code], f" of code {code}", values) for code, values in given.items()]
+        by_tissue = [(tissues[code], f" of code {code}", values) for code, values in source.items()]
     else:
         # All of the sheet, whichever of its tissues has the name.
-        by_tissue = [(sheet[0], "", given)]
+        by_tissue = [(sheet[0], "", source)]
         by_tissue += [(tissue, "", np.zeros(_shape(volume))) for tissue in sheet[1:]]
     layers: list[Layer] = []
     for tissue, name, values in by_tissue:
