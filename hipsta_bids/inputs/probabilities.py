@@ -54,8 +54,8 @@ def attach_probabilities(
         notes.append(f"{text}; --probabilities never uses labels alone")
     lacking = [new for new, old in zip(attached, items, strict=True) if new.notes != old.notes]
     if lacking:
-        first = f"sub-{lacking[0].subject} {lacking[0].hemi}, {lacking[0].notes[-1]}"
-        notes.append(f"labels alone in {len(lacking)} hemispheres: {first}")
+        first = f"sub-{lacking[0].subject} {lacking[0].hemi}: {lacking[0].notes[-1]}"
+        notes.append(f"labels alone: {len(lacking)} of {len(items)} hemispheres; {first}")
     return tuple(attached), tuple(notes)
 
 

@@ -133,7 +133,7 @@ def recorded(job: Job) -> Outcome | None:
 
 def finished(job: Job) -> Outcome | None:
     """Return the outcome of a hemisphere that an earlier run has done with the same inputs."""
-    outcome = None if job.force else recorded(job)
+    outcome = None if job.force or job.item.problem else recorded(job)
     if outcome is None or outcome.decision == Decision.FAILED:
         return None
     try:

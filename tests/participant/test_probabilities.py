@@ -271,7 +271,7 @@ def test_incomplete(data, volume):
     found = find_inputs(InputRequest(bids_dir=data, probabilities="auto"))
     note = "probabilities not used: no file of CA1-head (code 237)"
     assert found.items[0].notes == (note,)
-    assert f"labels alone in 1 hemispheres: sub-1 L, {note}" in found.notes
+    assert f"labels alone: 1 of 1 hemispheres; sub-1 L: {note}" in found.notes
     # What does not occur needs no file; two files of one label are one too many.
     write(data, volume)
     assert found.items[0].protocol.layer == (Tissue.MOLECULAR_LAYER,)
@@ -356,6 +356,8 @@ def test_command(data, volume, tmp_path, capsys):
     assert len(same) > 10
     for path in same:
         assert path.read_bytes() == (out / path.relative_to(never)).read_bytes(), path.name
+    # Labels alone are no answer to a folder that was named.
+    assert run(data, out, "--probabilities", tmp_path) == ExitCode.BAD_DATA
     write(data, volume, lambda share: 255 * share)
     assert run(data, out) == ExitCode.BAD_DATA
     (row,) = files.read_tsv(out / "status.tsv")
