@@ -214,13 +214,7 @@ def write_phantoms(arguments: Sequence[str]) -> ExitCode:
 
     options.region = options.region or ("CA1-anterior" if options.head is None else "head")
     plan = from_namespace(CohortPlan, options)
-    write_cohort(
-        options.out,
-        plan,
-        layout=options.layout,
-        voxel_size=tuple(options.voxel_size),
-        probabilities=options.probabilities,
-    )
+    write_cohort(options.out, plan, layout=options.layout, voxel_size=tuple(options.voxel_size))
     echo(f"synthetic dataset of {plan.n_subjects} subjects: {options.out}")
     return ExitCode.OK
 
