@@ -132,6 +132,8 @@ class LabelVolume:
     """Shape of the file; None without a file or if nothing was cropped."""
     shares: Mapping[int, NDArray[np.float32]] = field(default_factory=dict)
     """(I, J, K) by tissue: which share of each voxel it fills, 0 to 1; empty if unknown."""
+    notes: tuple[str, ...] = ()
+    """What a reader should know about the files."""
 
     def __post_init__(self) -> None:
         shape = np.shape(self.tissue)

@@ -216,6 +216,7 @@ _MODEL = {
     "excluded": ("excluded.tsv", "who is not in it, and why", True),
     "quality": ("quality.tsv", "decisions and ratings by group, with a test", False),
     "covariates": ("covariates.tsv", "the table that was fitted", True),
+    "demographics": ("demographics.tsv", "age, sex and covariates by group, with tests", True),
     "design": ("design.tsv", "the same as a design matrix", False),
     "statistical_maps": ("hemi-*_statmap.tsv", "statistics at each point", False),
     "all_maps": ("maps.parquet", "all maps, original and registered", False),

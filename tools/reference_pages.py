@@ -12,6 +12,7 @@ from hipsta_bids.cli.commands import (
     figure_parser,
     meta_parser,
     phantom_parser,
+    replicate_parser,
     resample_parser,
     surrogate_parser,
 )
@@ -30,7 +31,8 @@ from hipsta_bids.derivatives.results import LAYERS, NODES, POSITION, STATE
 from hipsta_bids.errors import EXIT_MEANINGS
 from hipsta_bids.geometry.catalog import MAPS, PER_SUBFIELD, SECTIONS, SUMMARY, Column
 from hipsta_bids.group.design.settings import GroupSettings
-from hipsta_bids.group.output.tables import COLUMNS, JOINT_COLUMNS
+from hipsta_bids.group.output.tables import COLUMNS, JOINT_COLUMNS, REPLICATE_COLUMNS
+from hipsta_bids.group.questions.replicate import PUBLISHED
 from hipsta_bids.reports.page import read_table
 from hipsta_bids.settings import Settings
 
@@ -135,9 +137,10 @@ beside it gives place and numbers. This page lists the reasons by the action tha
 
 OPTIONS_TEXT = """\
 `hipsta-bids BIDS_DIR OUTPUT_DIR participant` measures; `hipsta-bids BIDS_DIR OUTPUT_DIR group`
-analyzes. The commands `demo`, `demo-data`, `phantom`, `surrogate`, `meta`, `compare`, `correlate`,
-`resample`, `settings` and `protocols` print their options with `--help`, as both levels do;
-`--version` prints the version. Options accept underscores instead of hyphens (`--n_procs`)."""
+analyzes. The commands `demo`, `demo-data`, `phantom`, `surrogate`, `meta`, `compare`, `replicate`,
+`correlate`, `resample`, `settings` and `protocols` print their options with `--help`, as both
+levels do; `--version` prints the version. Options accept underscores instead of hyphens
+(`--n_procs`)."""
 
 _SHARED_TEXT = "properties of all images with these suffixes"
 
@@ -308,6 +311,7 @@ def options_page() -> str:
         ("hipsta-bids surrogate", surrogate_parser()),
         ("hipsta-bids meta", meta_parser()),
         ("hipsta-bids compare", compare_parser()),
+        ("hipsta-bids replicate", replicate_parser()),
         ("hipsta-bids figure", figure_parser()),
         ("hipsta-bids correlate", correlate_parser()),
         ("hipsta-bids resample", resample_parser()),
@@ -361,6 +365,12 @@ def _page(parts: Iterable[str]) -> str:
     return "\n\n".join([NOTE, *(part for part in parts if part)]) + "\n"
 
 
+def replicate_sidecar() -> str:
+    """Describe the columns of the published numbers, and of own numbers beside them."""
+    columns = {name: {"Description": text} for name, text in REPLICATE_COLUMNS.items()}
+    return json.dumps(columns, indent=2) + "\n"
+
+
 #: Every page, by its file below docs/.
 PAGES: Mapping[str, Callable[[], str]] = {
     "outputs.md": outputs_page,
@@ -368,4 +378,6 @@ PAGES: Mapping[str, Callable[[], str]] = {
     "settings-all.md": all_settings_page,
     "reasons.md": reasons_page,
     "command-line.md": options_page,
+    "replicate.tsv": lambda: PUBLISHED.read_text("utf-8"),
+    "replicate.json": replicate_sidecar,
 }

@@ -22,13 +22,14 @@ from hipsta_bids.derivatives.names import HemisphereName, output_name, write_sha
 from hipsta_bids.derivatives.results import POSITION, STATE, ResultPlace
 from hipsta_bids.errors import ArgumentError, InputError, in_python
 from hipsta_bids.geometry.catalog import MAPS, SUMMARY
+from hipsta_bids.geometry.label_checks import naming_causes
 from hipsta_bids.geometry.sheet import is_left_handed, layer_depth
 from hipsta_bids.group.cohort.read import node_coordinates
 from hipsta_bids.inputs.labels import MARGIN, label_volume
 from hipsta_bids.inputs.shares import Layer, add_shares, read_layers
 from hipsta_bids.io import files
 from hipsta_bids.io.gifti import sheet_triangles, write_surface
-from hipsta_bids.io.volumes import LabelImage, moved, read_labels
+from hipsta_bids.io.volumes import LabelImage, moved, read_labels, without_nan
 from hipsta_bids.io.xarrays import Variable, make_dataset
 from hipsta_bids.participant.measure import measure_hemisphere
 from hipsta_bids.protocols import body_ends
@@ -64,6 +65,8 @@ class Measurement:
     settings: Settings
     hemisphere: HemisphereMaps
     """All that was measured, as the stages of the method hand it on."""
+    notes: tuple[str, ...] = ()
+    """What is doubtful about the image of the labels."""
     soft: bool = False
     """Whether probabilities of the labels placed the walls."""
 
@@ -204,7 +207,7 @@ class Measurement:
         common = {"version": __version__, "settings_hash": digest, "region": name.region}
         about = {"scheme": name.seg, "scheme_title": self.protocol.title, "input_hash": None}
         record: dict[str, Any] = common | about
-        record |= {"inputs": [], "edited": [], "notes": ["measured in Python"]}
+        record |= {"inputs": [], "edited": [], "notes": ["measured in Python", *self.notes]}
         record |= {"provenance": {"probabilities": "memory"}} if self.soft else {}
         place = ResultPlace(root=root, name=name)
         outputs.write_results(place, self.hemisphere, self.protocol, record, write_meshes=False)
@@ -379,11 +382,14 @@ def measure(
     )
     if probabilities is not None:
         volume = _with_probabilities(volume, probabilities)
+    with naming_causes(volume):
+        hemisphere = measure_hemisphere(volume, side, settings, lambda _: nullcontext())
     return Measurement(
         side=side,
         protocol=for_region(volume.protocol, region),
         settings=settings,
-        hemisphere=measure_hemisphere(volume, side, settings, lambda _: nullcontext()),
+        hemisphere=hemisphere,
+        notes=volume.notes,
         soft=bool(volume.shares),
     )
 
@@ -455,5 +461,6 @@ def _read_volume(
     matrix = np.asarray(affine if image_affine is None else image_affine, dtype=np.float64)
     if matrix.shape != (4, 4) or not abs(np.linalg.det(matrix[:3, :3])) > 0:
         raise ValueError("affine has to be an invertible matrix (4, 4), voxel indices to RAS mm")
-    image = LabelImage(data=data, start=(0, 0, 0), shape=data.shape, affine=matrix)
+    data, has_nan = without_nan(data)
+    image = LabelImage(data, (0, 0, 0), data.shape, matrix, has_nan)
     return label_volume(image, protocol, side, region)

@@ -68,6 +68,15 @@ def compare_parser() -> Parser:
     return parser
 
 
+def replicate_parser() -> Parser:
+    """Describe ``hipsta-bids replicate``."""
+    parser, add = parser_of("replicate")
+    add("analysis", "FOLDER", type=Path)
+    add("out", "OUT", type=Path)
+    add("--groups", "CU MCI DAT")
+    return parser
+
+
 def resample_parser() -> Parser:
     """Describe ``hipsta-bids resample``."""
     parser, add = parser_of("resample")
@@ -296,6 +305,16 @@ def run_compare(arguments: Sequence[str]) -> ExitCode:
         echo(f"note: {note}")
     echo(f"results: {options.out}")
     echo(f"report: {options.out}.html")
+    return ExitCode.OK
+
+
+def run_replicate(arguments: Sequence[str]) -> ExitCode:
+    """Put the published numbers beside the numbers of an analysis."""
+    options = replicate_parser().parse_intermixed_args(arguments)
+    from hipsta_bids.group.questions.replicate import replicate  # noqa: PLC0415  (heavy)
+
+    echo_table(replicate(options.analysis, options.out, options.groups))
+    echo(f"results: {options.out / 'replicate.tsv'}")
     return ExitCode.OK
 
 

@@ -201,8 +201,7 @@ def summary_line(outcome: "Outcome") -> str:
         parts.append(f"edited {' and '.join(outcome.job.item.edited)}")
     if outcome.skipped:
         parts.append("unchanged, skipped")
-    if outcome.renewal:
-        parts.append(outcome.renewal)
+    parts += outcome.notes
     if outcome.repairs:
         parts.append(f"{outcome.repairs} repair{'s' if outcome.repairs > 1 else ''}")
     if outcome.reason:

@@ -35,6 +35,7 @@ COMMANDS = {
     "surrogate": ("run_surrogate", "IN OUT", "measure thickness in single slices to check maps"),
     "meta": ("run_meta_analysis", "SITE... OUT", "combine summaries of sites (group level)"),
     "compare": ("run_compare", "FOLDER... OUT", "compare finished analyses (group level)"),
+    "replicate": ("run_replicate", "FOLDER OUT", "compare an analysis with Diers et al. (2023)"),
     "figure": ("draw_figure", "WHAT OUT", "draw a figure for a paper from results"),
     "resample": ("run_resample", "MAP... OUT", "move maps to HippUnfold's surfaces, or from there"),
     "export": ("run_export", "OUT_DIR DIR", "write surfaces for FreeSurfer, or as VTK or PLY"),

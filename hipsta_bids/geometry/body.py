@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry import completion, digital
 from hipsta_bids.geometry.ends import EndPlanes, find_end_planes
-from hipsta_bids.geometry.shares import Shares, sheet_share
+from hipsta_bids.geometry.shares import SheetShare, sheet_share
 from hipsta_bids.protocols.load import for_region
 from hipsta_bids.protocols.protocol import MEDIAL_END, Tissue, lateral_rank
 from hipsta_bids.settings import BodySettings
@@ -78,8 +78,8 @@ class Body:
     """(N, 3) indices of the largest thin gap in the labels that was not filled."""
     mask_change: MaskChange | None = None
     """What an edited mask changed; None without a mask."""
-    share: Shares | None = None
-    """(I, J, K) share of the sheet in each voxel; None without probabilities."""
+    soft: SheetShare | None = None
+    """Share of the sheet in each voxel; None without probabilities."""
 
     @cached_property
     def lateral(self) -> Float:
@@ -208,7 +208,7 @@ def extract_body(volume: LabelVolume, settings: BodySettings, *, second: bool = 
         handed_over=handed_over,
         gap=gap,
         mask_change=change,
-        share=sheet_share(labels, tissue > 0, for_region(labels.protocol, region).sheet),
+        soft=sheet_share(labels, tissue > 0, for_region(labels.protocol, region).sheet),
     )
 
 

@@ -21,6 +21,7 @@ from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry import digital
 from hipsta_bids.geometry.body import Body
 from hipsta_bids.geometry.grid import Field, cut_across, in_plane_voxel
+from hipsta_bids.geometry.label_checks import border_sides
 from hipsta_bids.geometry.measures import column_area, measure_thickness
 from hipsta_bids.geometry.mesh import mean_wall_thickness
 from hipsta_bids.geometry.slices import points_of_ends
@@ -36,6 +37,8 @@ _NEGLIGIBLE = 0.005
 
 #: A cut this near, mm, to both the subiculum and CA2 or CA3 severs but turns that touch.
 CONTACT_REACH = 1.2
+#: Probabilities that contradict this share of the body's voxels, away from its border, are flagged.
+UNLIKE_SHARE = 0.02
 #: Voxels are long if their longest edge is more than this many times the shortest.
 LONG_VOXEL_RATIO = 1.5
 #: Head or tail labels farther inside the body than this are out of place, mm.
@@ -176,11 +179,27 @@ def check_image(body: Body) -> list[Finding]:
             reason="image-border",
             value=float(np.count_nonzero(outer)),
             limit=0,
-            text=f"{np.count_nonzero(outer)} voxels of the body lie at the border of the image",
-            remedy="check that the image holds all of it",
+            text=f"{np.count_nonzero(outer)} voxels of the body lie at the "
+            f"{border_sides(body.inside, body.affine)} border of the image",
+            remedy="use a larger or uncropped image if it cuts them",
             points=points[outer],
         ),
+        *([_check_probabilities(body, body.soft.unlike)] if body.soft else []),
     ]
+
+
+def _check_probabilities(body: Body, unlike: digital.Index) -> Finding:
+    """Flag probabilities that contradict the labels (N, 3) away from their border."""
+    share = len(unlike) / max(np.count_nonzero(body.inside), 1)
+    return Finding(
+        reason="probabilities-unlike",
+        value=share,
+        limit=UNLIKE_SHARE,
+        text=f"probabilities contradict labels more than a voxel from the sheet's border, as many"
+        f" voxels as {share:.1%} of the body; labels were followed",
+        remedy="check that both are of one run",
+        points=digital.to_ras(unlike, body.affine),
+    )
 
 
 def _voxel_across(body: Body) -> float:

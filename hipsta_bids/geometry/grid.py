@@ -14,7 +14,7 @@ from hipsta_bids.geometry import digital
 from hipsta_bids.geometry.body import Body
 from hipsta_bids.geometry.completion import Index
 from hipsta_bids.geometry.outlines import SLIT_HALF_WIDTH, TOUCH_DISTANCE
-from hipsta_bids.geometry.shares import softness
+from hipsta_bids.geometry.shares import SHARE_SMOOTHING, SOFT_WINDOW, softness
 from hipsta_bids.geometry.slices import has_thick_slices, points_of_ends, sample_slices
 from hipsta_bids.settings import CheckSettings, GridSettings, SliceSettings
 from hipsta_bids.types import Bool, End, Float, LabelVolume
@@ -28,10 +28,6 @@ MOTION_REACH = 3.0
 MOTION_SD = 0.4
 #: A change of size or shape weighs against it this share of what it explains.
 MOTION_PRIOR = 0.02
-#: Share of the smoothing of binary labels where voxels have true shares.
-SHARE_SMOOTHING = 0.35
-#: SD of the window in which it is judged whether they have, mm.
-SOFT_WINDOW = 1.0
 
 _MAX_REPEATS = 1.3
 """Median number of equal slices in a row, along two axes, of labels that were resampled: 1 in
@@ -144,7 +140,7 @@ def resample_body(body: Body, hemi: str, settings: GridSettings, slices: SliceSe
         values = sample_slices(body, points, slices)
     else:
         points = continued_nodes(grid, body, body.ends.half_slice).reshape(-1, 3)
-        values = _sample(body, points, body.tissue > 0 if body.share is None else body.share)
+        values = _sample(body, points, body.soft.values if body.soft else body.tissue > 0)
         between = _between_turns(body, points)
         separated = (between & (values > 0.5)).reshape(grid.shape)  # noqa: PLR2004 -- in the mask
         values[between] = 0
@@ -152,11 +148,12 @@ def resample_body(body: Body, hemi: str, settings: GridSettings, slices: SliceSe
     cavities = cavities[body.tissue[tuple(cavities.T)] > 0]
     sigma = max(settings.smoothing * in_plane_voxel(body.affine), settings.min_smoothing)
     smooth = _smooth(values.reshape(grid.shape), sigma / settings.spacing)
-    if body.share is not None:
+    if body.soft:
         # Less where shares already say where the wall is; as much as ever where they are 0 or 1.
         sharp = _smooth(values.reshape(grid.shape), SHARE_SMOOTHING * sigma / settings.spacing)
         reach = SOFT_WINDOW / np.linalg.norm(body.affine[:3, :3], axis=0)
-        weight = _sample(body, points, softness(body.share, reach)).reshape(grid.shape)
+        known = np.minimum(softness(body.soft.values, reach), 1)
+        weight = _sample(body, points, known).reshape(grid.shape)
         smooth += weight * (sharp - smooth)
     return Field(
         grid=grid,

@@ -5,6 +5,8 @@ round the dentate gyrus in opposite directions on the left and on the right, see
 the hippocampus is thicker at its head and bows laterally.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import NamedTuple
 
 import numpy as np
@@ -17,7 +19,7 @@ from hipsta_bids.geometry.ends import hippocampal_voxels, long_axis
 from hipsta_bids.geometry.grid import check_voxel
 from hipsta_bids.protocols.protocol import CORE, LATERAL_END, MEDIAL_END, Part, Tissue
 from hipsta_bids.settings import CheckSettings
-from hipsta_bids.types import Finding, Float, LabelVolume
+from hipsta_bids.types import Bool, Finding, Float, LabelVolume
 
 #: Volumes of one side that nobody has, mm3: less or more. Whole hippocampi of adults have about
 #: 2,500 to 5,000 mm3 (Nobis et al. 2019, doi:10.1016/j.nicl.2019.101904), bodies alone a third of
@@ -29,6 +31,10 @@ _VOLUMES: dict[str, tuple[tuple[Tissue, ...], float, float]] = {
     "dentate gyrus and CA4": (CORE, 0, 3000),
     "hippocampus": (tuple(Tissue(n) for n in range(1, Tissue.HIPPOCAMPUS + 1)), 60, 10000),
 }
+#: Directions of RAS, from negative to positive.
+_BORDERS = (("left", "right"), ("posterior", "anterior"), ("inferior", "superior"))
+#: Reasons of refusals that no cut through the labels explains.
+_UNCUT = frozenset({"sheet-too-thin", "left-right-swapped", "axis-flipped", "visit-unlike"})
 #: Subfields with fewer voxels do not show how the sheet winds.
 _LEAST_VOXELS = 50
 #: Which part of the long axis shows it, as shares: in head and tail the subfields lie otherwise.
@@ -81,6 +87,32 @@ def check_label_image(volume: LabelVolume, hemi: str, settings: CheckSettings) -
     return [*_check_volumes(volume), *_check_axes(volume, hemi)]
 
 
+@contextmanager
+def naming_causes(volume: LabelVolume) -> Iterator[None]:
+    """Name, in a refusal within the block, an impossible volume or the border of the image."""
+    try:
+        yield
+    except GeometryError as error:
+        whole = _check_volumes(volume)[-1:]
+        causes = [f"{found.text} ({found.remedy}); " for found in whole if found.raised]
+        sides = border_sides(hippocampal_voxels(volume), volume.affine)
+        if sides and error.reason not in _UNCUT:
+            remedy = "use a larger or uncropped image if it cuts them"
+            causes.append(f"the labels touch the {sides} border of the image ({remedy}); ")
+        raise GeometryError("".join([*causes, str(error)]), reason=error.reason) from error
+
+
+def border_sides(inside: Bool, affine: Float) -> str:
+    """Name the sides of an image on which voxels (I, J, K) are in its outermost layer."""
+    sides = []
+    for axis, step in enumerate(affine[:3, :3].T):
+        main = np.abs(step).argmax()
+        names = _BORDERS[main] if step[main] > 0 else _BORDERS[main][::-1]
+        layers = np.moveaxis(inside, axis, 0)[[0, -1]]
+        sides += [name for name, layer in zip(names, layers, strict=True) if layer.any()]
+    return " and ".join(sides)
+
+
 def _check_tissues(volume: LabelVolume) -> None:
     """Refuse an image in which an end or the middle of the protocol's sheet has no label at all."""
     sheet = volume.protocol.sheet
@@ -109,7 +141,7 @@ def _check_volumes(volume: LabelVolume) -> list[Finding]:
             value=max(size / most, least / size),
             limit=1.0,
             text=f"the {name} labels have {size:.0f} mm3, {least:g} to {most:g} mm3 are possible",
-            remedy="check the voxel size, and the protocol",
+            remedy="check the voxel size and its unit, and the protocol",
             share=1.0,
         )
         for (name, (_, least, most)), size in zip(_VOLUMES.items(), sizes.values(), strict=True)

@@ -10,6 +10,7 @@ from scipy.sparse import csgraph
 from scipy.special import ndtri
 
 from hipsta_bids.geometry.digital import piece_sizes
+from hipsta_bids.geometry.shares import SHARE_SMOOTHING, SOFT_WINDOW, softness
 from hipsta_bids.protocols.protocol import Tissue, lateral_rank
 from hipsta_bids.settings import SliceSettings
 from hipsta_bids.types import Bool, Float, Int
@@ -50,10 +51,12 @@ def outline_slice(
     pixel: float,
     settings: SliceSettings,
     beside: Sequence[NDArray[np.uint8]] = (),
+    share: Stack | None = None,
 ) -> Stack:
     """Signed distance, mm, from the ribbon's outline in a slice with pixels of ``pixel`` mm.
 
-    Where the ribbon is broken, the slices ``beside`` it show that.
+    Where the ribbon is broken, the slices ``beside`` it show that. The outline is where the
+    ``share`` (I, J) of the ribbon in the pixels is a half, if it is known.
 
     It is sampled at finer pixels, positive inside, and clipped at the setting ``reach``. Across a
     straight edge, a mask smoothed by a Gaussian is the normal distribution function of the distance
@@ -70,9 +73,35 @@ def outline_slice(
     distance = _signed_distance(smooth > 0.5, fine)  # noqa: PLR2004 -- the outline
     exact = sigma * fine * ndtri(np.clip(smooth, 1e-6, 1 - 1e-6))
     distance = np.where(np.abs(distance) < sigma * fine, exact, distance)
+    if share is not None:
+        at = _fine_pixels(share.shape, settings.upsampling)
+        known = np.minimum(softness(share, np.full(2, SOFT_WINDOW / pixel)), 1)
+        weight = ndimage.map_coordinates(known, at, order=1, mode="nearest")
+        distance += weight * (_from_share(share, fine, settings) - distance)
     ranks = ranks_of(tissue, settings.upsampling)
     distance = _join(distance, ranks, beside, fine, settings)
     return np.asarray(np.clip(distance, -DISTANCE_REACH, DISTANCE_REACH), dtype=np.float32)
+
+
+def _from_share(share: Stack, fine: float, settings: SliceSettings) -> Float:
+    """Signed distance, mm, from where the share (I, J) in pixels is a half; fine pixels.
+
+    Beside the outline it is the excess over a half by the slope, whatever the width of the ramp: a
+    wall that leans in a thick slice has a wide one.
+    """
+    at = _fine_pixels(share.shape, settings.upsampling)
+    smooth = ndimage.map_coordinates(share, at, order=1, mode="nearest")
+    smooth = ndimage.gaussian_filter(smooth, SHARE_SMOOTHING * settings.upsampling)
+    distance = _signed_distance(smooth > 0.5, fine)  # noqa: PLR2004 -- the outline
+    slope = np.hypot(*np.gradient(smooth)) / fine
+    exact = (smooth - 0.5) / np.maximum(slope, 1e-6)
+    return np.where(np.abs(distance) < fine, np.clip(exact, -fine, fine), distance)
+
+
+def _fine_pixels(shape: tuple[int, ...], upsampling: int) -> Float:
+    """Places (2, I', J') of the fine pixels, in pixels."""
+    at = [(np.arange(n * upsampling) + 0.5) / upsampling - 0.5 for n in shape]
+    return np.stack(np.meshgrid(*at, indexing="ij"))
 
 
 def part_distance(

@@ -4,6 +4,8 @@ Labels decide topology, ends, subfields and repairs. Shares move the wall, by at
 surface at one half of the voxels' shares is the wall that binary labels know to half a voxel only.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
@@ -12,11 +14,27 @@ from hipsta_bids.geometry import digital
 from hipsta_bids.protocols.protocol import Tissue
 from hipsta_bids.types import Bool, Float, LabelVolume
 
+#: Where voxels have shares, the smoothing of binary labels is less by this factor.
+SHARE_SMOOTHING = 0.35
+#: SD of the window in which it is judged whether they have, mm.
+SOFT_WINDOW = 1.0
+
 Shares = NDArray[np.float32]
 
+_HALF = 0.5  # of a voxel: the wall
 
-def sheet_share(volume: LabelVolume, body: Bool, sheet: tuple[int, ...]) -> Shares | None:
-    """Return the share (I, J, K) of the sheet in each voxel; ``None`` without probabilities.
+
+class SheetShare(NamedTuple):
+    """The sheet in each voxel, by probabilities."""
+
+    values: Shares
+    """(I, J, K) share of the sheet; 0 and 1 farther than a voxel from the border of the labels."""
+    unlike: digital.Index
+    """(N, 3) voxels farther away in which probabilities contradict the labels."""
+
+
+def sheet_share(volume: LabelVolume, body: Bool, sheet: tuple[int, ...]) -> SheetShare | None:
+    """Compute the share of the sheet in each voxel; ``None`` without probabilities.
 
     ``body`` (I, J, K) is the mended sheet, ``sheet`` lists the tissues of which it is made. Where a
     voxel of the body has another label, as of the molecular layer, the label's share counts there
@@ -41,16 +59,18 @@ def sheet_share(volume: LabelVolume, body: Bool, sheet: tuple[int, ...]) -> Shar
     part[taken[around][tuple(nearest)]] = 0
     deep = ndimage.binary_erosion(inside, structure=digital.CUBE)
     near = ndimage.binary_dilation(inside, structure=digital.CUBE)
-    result = np.zeros(body.shape, dtype=np.float32)
-    result[around] = np.where(deep, 1, np.where(near, np.clip(part, 0, 1), 0))
-    return result
+    unlike = digital.positions(np.where(deep, part < _HALF, (part > _HALF) & ~near))
+    values = np.zeros(body.shape, dtype=np.float32)
+    values[around] = np.where(deep, 1, np.where(near, np.clip(part, 0, 1), 0))
+    return SheetShare(values, unlike + digital.low_corner(around))
 
 
 def softness(share: Shares, reach: Float) -> Shares:
-    """Return how much the voxels near the wall know beyond binary labels, (I, J, K), 0 to 1.
+    """Return how soft the wall is near each voxel: 0 for binary labels, 1 for shares.
 
-    It is the sum of p (1 - p) in a Gaussian window of SD ``reach``, voxels, over the sum that the
-    wall's true shares have. A voxel's share of a half-space is the distribution function of its
+    ``share`` has 2 or 3 axes. Above 1, probabilities are wider than the ramp that voxels make of a
+    wall. It is the sum of p (1 - p) in a Gaussian window of SD ``reach``, voxels, over the sum that
+    the wall's true shares have. A voxel's share of a half-space is the distribution function of its
     projection on the normal, whose width depends little on the direction: per area of wall, the sum
     is a sixth of a voxel's edge along the normal.
     """
@@ -58,4 +78,4 @@ def softness(share: Shares, reach: Float) -> Shares:
     wall = np.sqrt(sum(slope * slope for slope in slopes)) / 6
     window = (ndimage.gaussian_filter(part, reach) for part in (share * (1 - share), wall))
     observed, expected = window
-    return np.asarray(np.clip(observed / np.maximum(expected, 1e-6), 0, 1), dtype=np.float32)
+    return np.asarray(observed / np.maximum(expected, 1e-6), dtype=np.float32)

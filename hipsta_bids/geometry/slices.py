@@ -210,10 +210,16 @@ def sample_slices(body: Body, points: Float, settings: SliceSettings) -> Stack:
     labeled = _labeled_ends(body)
     part = _bounds(body, outlines.DISTANCE_REACH / pixel, labeled)
     tissue = body.tissue[part].copy()
+    labeled_tissue = body.tissue[part]
     for step, depth, is_labeled in zip((1, -1), _depths(body, part), labeled, strict=True):
         if not is_labeled:
             _extrapolate(tissue[::step], (depth < HIDDEN_DEPTH)[::step], pixel, settings)
-    stack = _stacked(tissue, pixel, settings)
+    share = None
+    if body.soft:  # what was extrapolated has the labels' walls
+        share = np.where(tissue == labeled_tissue, body.soft.values[part], tissue > 0).astype(
+            np.float32
+        )
+    stack = _stacked(tissue, pixel, settings, share)
     voxels = body.to_voxels(points) - digital.low_corner(part)
     pixels = ((voxels[:, 1:] + 0.5) * settings.upsampling - 0.5).astype(np.float32).T
     distance = stack.blend(voxels[:, 0].astype(np.float32), pixels)
@@ -239,16 +245,27 @@ def _in_own_order(body: Body) -> Body:
     affine[:3, :3] = (affine[:3, :3] * steps)[:, order]
     names = ("tissue", "hippocampal", "interior", "inside")
     volumes = {name: getattr(body, name).transpose(order)[flips] for name in names}
+    if body.soft:
+        volumes["soft"] = body.soft._replace(values=body.soft.values.transpose(order)[flips])
     return replace(body, **volumes, affine=affine)
 
 
-def _stacked(tissue: NDArray[np.uint8], pixel: float, settings: SliceSettings) -> _SliceStack:
+def _stacked(
+    tissue: NDArray[np.uint8], pixel: float, settings: SliceSettings, share: Stack | None = None
+) -> _SliceStack:
     """Outline and align slices; a single one is taken twice."""
     if len(tissue) == 1:
         tissue = np.concatenate([tissue, tissue])
+        share = None if share is None else np.concatenate([share, share])
     images = np.stack(
         [
-            outlines.outline_slice(image, pixel, settings, list(tissue[max(n - 1, 0) : n + 2]))
+            outlines.outline_slice(
+                image,
+                pixel,
+                settings,
+                list(tissue[max(n - 1, 0) : n + 2]),
+                None if share is None else share[n],
+            )
             for n, image in enumerate(tissue)
         ]
     )

@@ -77,7 +77,7 @@ def read_label_volume(item: HemisphereInput, region: str = "body") -> LabelVolum
     image = read_labels(path, MARGIN)
     if not image.data.size:
         raise _empty(path)
-    codes = _integers(image.data, path)
+    codes = _integers(image.data, path, has_nan=image.has_nan)
     if item.bilateral:
         codes = _one_hemisphere(codes, item.protocol, item.hemi, path)
     tissue, part = _translate(codes, item.protocol, path)
@@ -95,11 +95,12 @@ def read_label_volume(item: HemisphereInput, region: str = "body") -> LabelVolum
         volume = read_shares(volume, item.probabilities, edited=labels is not None)
     if mask is None and not item.ends:
         return volume
-    edited = None
+    edited, notes = None, volume.notes
     if mask:
         around = read_labels(mask.path, 1.0)
         edited = _sample_mask(around, volume.affine, volume.tissue.shape, mask.path)
-    return replace(volume, edited_mask=edited, given_ends=item.ends)
+        notes += _notes(around, mask.path)
+    return replace(volume, edited_mask=edited, given_ends=item.ends, notes=notes)
 
 
 def label_volume(
@@ -115,7 +116,7 @@ def label_volume(
     Where codes of the side that the protocol shifts occur, the other side is excluded. ``path`` is
     what messages call the image.
     """
-    whole = _integers(image.data, path)
+    whole = _integers(image.data, path, has_nan=image.has_nan)
     if protocol.offset and (whole > protocol.offset).any():
         whole = _one_hemisphere(whole, protocol, hemi, path)
     tissue, part = _translate(whole, protocol, path)
@@ -152,7 +153,14 @@ def _cropped(
         protocol=protocol,
         start=(first, second, third),
         file_shape=image.shape,
+        notes=_notes(image, path),
     )
+
+
+def _notes(image: LabelImage, path: Path) -> tuple[str, ...]:
+    """Write what is doubtful about an image, with its name."""
+    nan = ("NaN was read as background (0)",) if image.has_nan else ()
+    return tuple(f"{path.name}: {note}" for note in (*image.notes, *nan))
 
 
 def _beside(added_path: Path, path: Path, image: LabelImage, *, edited: bool) -> NDArray[Any]:
@@ -200,7 +208,8 @@ def _check_same_place(hippocampal: Bool, affine: Float, item: HemisphereInput, p
 
 def label_values(path: Path) -> frozenset[int]:
     """List the distinct codes of a segmentation, without the background."""
-    values = _integers(np.array(label_codes(path)), path)
+    codes = np.array(label_codes(path))
+    values = _integers(codes[~np.isnan(codes)], path, has_nan=bool(np.isnan(codes).any()))
     if not values.size:
         raise _empty(path)
     return frozenset(values.tolist())
@@ -213,7 +222,7 @@ def _empty(path: Path) -> InputError:
     )
 
 
-def _integers(data: NDArray[Any], path: Path) -> NDArray[np.integer[Any]]:
+def _integers(data: NDArray[Any], path: Path, *, has_nan: bool = False) -> NDArray[np.integer[Any]]:
     """Convert labels to integers, if they are whole numbers but for rounding."""
     if np.issubdtype(data.dtype, np.integer):
         return data
@@ -222,8 +231,9 @@ def _integers(data: NDArray[Any], path: Path) -> NDArray[np.integer[Any]]:
         and (np.abs(data - np.rint(data)) < _ROUNDING).all()
     )
     if not whole:
+        nan = ", and some are NaN" if has_nan else ""
         raise InputError(
-            f"{path}: labels are not whole numbers; was it resampled with interpolation? "
+            f"{path}: labels are not whole numbers{nan}; was it resampled with interpolation? "
             "Use nearest neighbor",
             reason="non-integer-labels",
         )
@@ -265,7 +275,7 @@ def _sample_mask(mask: LabelImage, affine: Float, shape: tuple[int, ...], path: 
         values = np.unique(np.append(values, 0))
     value_text = ", ".join(f"{value:g}" for value in values[:_LISTED_VALUES].tolist())
     value_text += ", ..." if len(values) > _LISTED_VALUES else ""
-    if len(values) > 2 or not np.isfinite(values).all() or (len(values) == 2 and 0 not in values):  # noqa: PLR2004 (two)
+    if len(values) > 2 or (len(values) == 2 and 0 not in values):  # noqa: PLR2004 (two)
         raise InputError(
             f"{path}: a mask has the value 0 and one other, this has {value_text}; save edited "
             "labels as desc-edited_dseg instead",

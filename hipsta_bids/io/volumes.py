@@ -18,6 +18,7 @@ from nibabel.openers import ImageOpener
 from nibabel.spatialimages import HeaderDataError
 from nibabel.wrapstruct import WrapStructError
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from hipsta_bids.errors import InputError, MissingFileError
 from hipsta_bids.geometry.digital import Box, box, to_ras
@@ -33,6 +34,20 @@ MAP_VOXEL_SIZES = (0.05, 30.0)
 
 #: Difference between two statements of a voxel's edges in one header, as a share.
 _SAME_SIZE = 0.01
+
+#: Displacement of labels by the qform against the sform that a note names, mm, ...
+_SAME_POSITION = 0.1
+
+#: ... beside the rounding of quaternions, rad: up to 0.0013 where programs compute in single
+#: precision, since a half turn loses half of the digits.
+_ROUNDED_QFORM = 0.002
+
+#: Units of headers that are not millimeters, in mm; and voxel edges that tell them, mm.
+_UNITS = {"meters": 1000.0, "centimeters": 10.0, "micrometers": 0.001}
+_USUAL_SIZES = (0.1, 4.0)
+
+#: Those that NIfTI can state, by the code of ``xyzt_units``.
+_STATED_UNITS = {1: "meters", 3: "micrometers"}
 
 #: All that nibabel and its decompressors raise on damaged files.
 _READ_ERRORS = (
@@ -117,6 +132,10 @@ class LabelImage:
     """Of the whole image."""
     affine: Float
     """(4, 4), voxel index in the whole image to RAS mm."""
+    has_nan: bool = False
+    """Whether voxels were NaN; they are zero here."""
+    notes: tuple[str, ...] = ()
+    """What is doubtful about the header."""
 
     @property
     def box(self) -> Box:
@@ -139,6 +158,7 @@ def moved(affine: Float, start: tuple[int, int, int]) -> Float:
 def read_labels(path: Path, margin: float = 0.0, part: Box | None = None) -> LabelImage:
     """Read the voxels that are not zero in an image of labels or a mask, or a given part.
 
+    NaN, which some programs write as background, becomes zero.
     Shape and type are checked before any voxel is read, and no more than a slab is read at once:
     the size that a header declares does not decide how much memory is needed. Voxels up to
     ``margin`` (mm, along the image's axes) are kept around voxels that are not zero; ``part`` is
@@ -162,12 +182,25 @@ def read_labels(path: Path, margin: float = 0.0, part: Box | None = None) -> Lab
             )
         _check_fits(image, path, size, "the part with labels")
         data = first[part] if first is not None else _voxels(image, shape, part)
+        notes = tuple(_header_notes(image, affine, part))
+    data, has_nan = without_nan(data)
+    if data.dtype.kind == "f" and np.isinf(data).any():
+        raise InputError(
+            f"{path}: some labels are infinite; write whole numbers", reason="non-integer-labels"
+        )
     start = (part[0].start, part[1].start, part[2].start)
-    return LabelImage(data=data, start=start, shape=shape, affine=affine)
+    return LabelImage(data, start, shape, affine, has_nan, notes)
+
+
+def without_nan(data: NDArray[Any]) -> tuple[NDArray[Any], bool]:
+    """Return labels with zero for NaN, and whether there was any."""
+    if data.dtype.kind != "f" or not (missing := np.isnan(data)).any():
+        return data, False
+    return np.where(missing, data.dtype.type(0), data), True
 
 
 def label_codes(path: Path) -> list[float]:
-    """List the distinct values of an image of labels other than zero, in order."""
+    """List the distinct values of an image of labels other than zero, in order; NaN is last."""
     with _opened(path) as image:
         shape = _label_shape(image, path)
         codes = [np.unique(slab[slab != 0]) for _, slab in _slabs(image, shape)]
@@ -242,7 +275,7 @@ def _labeled_part(
     hits = [np.zeros(count, dtype=bool) for count in shape]
     slab = None
     for start, slab in _slabs(image, shape):
-        inside = slab != 0
+        inside = (slab < 0) | (slab > 0)  # NaN is background
         hits[0] |= inside.any(axis=(1, 2))
         hits[1] |= inside.any(axis=(0, 2))
         hits[2][start : start + slab.shape[2]] = inside.any(axis=(0, 1))
@@ -398,14 +431,27 @@ def _checked_affine(image: Any, path: Path, limits: tuple[float, float]) -> Floa
             reason="bad-affine",
         )
     if sizes.min() < limits[0] or sizes.max() > limits[1]:
+        low, high = _USUAL_SIZES
+        fits = [
+            n for n, mm in _UNITS.items() if low <= mm * sizes.min() and mm * sizes.max() <= high
+        ]
+        unit = _stated_unit(image) or " or ".join(fits)
         raise InputError(
-            f"{path}: voxels of {_times(sizes)} mm are outside of "
-            f"{limits[0]} to {limits[1]} mm; check the header's units",
+            f"{path}: voxels of {_times(sizes)} mm are outside of {limits[0]} to {limits[1]} mm; "
+            + (f"the header may be in {unit}, write it in mm" if unit else "check the unit"),
             reason="bad-voxel-size",
         )
     if isinstance(image, nib.Nifti1Pair):
+        qform = _qform(image)
+        if qform is not None and np.linalg.det(qform[:3, :3]) * np.linalg.det(linear) < 0:
+            raise InputError(
+                f"{path}: sform and qform are mirror images of each other, left and right are "
+                "unknown; correct the wrong one",
+                reason="bad-affine",
+            )
         spacing = np.asarray(image.header.get_zooms()[:_SPACE], dtype=np.float64)
-        stated = spacing.min() > 0 and np.any(spacing != 1)  # some programs leave it as it was
+        # Some programs without a qform leave it as it was.
+        stated = spacing.min() > 0 and (qform is not None or np.any(spacing != 1))
         if stated and np.abs(sizes / spacing - 1).max() > _SAME_SIZE:
             raise InputError(
                 f"{path}: voxels are {_times(sizes)} mm by the sform, but {_times(spacing)} "
@@ -413,6 +459,40 @@ def _checked_affine(image: Any, path: Path, limits: tuple[float, float]) -> Floa
                 reason="bad-affine",
             )
     return affine
+
+
+def _qform(image: Any) -> Float | None:  # noqa: ANN401 (untyped)
+    """Return the qform of a NIfTI image, (4, 4); None if there is none, or no valid one."""
+    with contextlib.suppress(ValueError, HeaderDataError):
+        qform: Float | None = image.header.get_qform(coded=True)[0]
+        return qform
+    return None
+
+
+def _stated_unit(image: Any) -> str | None:  # noqa: ANN401 (untyped)
+    """Return the unit that a header of NIfTI states, unless it is millimeters."""
+    is_nifti = isinstance(image, nib.Nifti1Pair)
+    return _STATED_UNITS.get(int(image.header["xyzt_units"]) % 8) if is_nifti else None
+
+
+def _header_notes(image: Any, affine: Float, part: Box) -> Iterator[str]:  # noqa: ANN401 (untyped)
+    """Note another unit than mm, and a qform that displaces or turns a part of the image."""
+    unit = _stated_unit(image)
+    if unit:
+        yield f"the header states {unit} (xyzt_units), but was read in mm; correct the unit"
+    qform = _qform(image) if isinstance(image, nib.Nifti1Pair) else None
+    if qform is None:
+        return
+    corners = np.stack(np.meshgrid(*((side.start, side.stop) for side in part)), axis=-1)
+    points = to_ras(corners, affine)
+    moves = np.linalg.norm(to_ras(corners, qform) - points, axis=-1)
+    rounding = _ROUNDED_QFORM * np.linalg.norm(points - affine[:3, 3], axis=-1)
+    if np.any(moves > _SAME_POSITION + rounding):
+        turn = Rotation.from_matrix(qform[:3, :3] @ np.linalg.inv(affine[:3, :3])).magnitude()
+        yield (
+            f"sform and qform place the labels {moves.max():.1f} mm and {np.degrees(turn):.1f} "
+            "degrees apart; the sform was used, other programs may differ"
+        )
 
 
 def _times(sizes: Float) -> str:

@@ -83,8 +83,8 @@ class Outcome:
     """Set if it failed for a foreseen reason."""
     trace: str | None = None
     """Set if it failed by a bug."""
-    renewal: str | None = None
-    """Set if it was measured before on a sheet of other visits."""
+    notes: tuple[str, ...] = ()
+    """What was noted beside the choice of the labels."""
     skipped: bool = False
     """An earlier run had done it."""
     input_hash: str | None = None
@@ -314,15 +314,17 @@ def warm_up() -> None:
 
 def check_item(item: HemisphereInput, settings: Settings) -> list[str]:
     """Read and check the labels of a hemisphere without measuring it; list the problems."""
-    from hipsta_bids.geometry.label_checks import check_label_image  # noqa: PLC0415  (heavy)
+    from hipsta_bids.geometry.label_checks import check_label_image, naming_causes  # noqa: PLC0415  (heavy)
     from hipsta_bids.inputs.labels import read_label_volume  # noqa: PLC0415  (heavy)
 
     try:
         volume = read_label_volume(item, settings.body.region)
-        findings = check_label_image(volume, item.hemi, settings.checks)
+        with naming_causes(volume):
+            findings = check_label_image(volume, item.hemi, settings.checks)
     except HipstaError as error:
         return [f"will be refused: {error}"]
-    return [f"will be flagged: {f.text}: {f.remedy}" for f in findings if f.raised]
+    flags = [f"will be flagged: {f.text}: {f.remedy}" for f in findings if f.raised]
+    return [*flags, *(f"will be noted: {note}" for note in volume.notes)]
 
 
 def run_job(job: Job) -> Outcome:
@@ -343,7 +345,8 @@ Measure = Callable[[LabelVolume, str, Settings, CostClock], HemisphereMaps]
 
 def measure_job(job: Job, measure: Measure | None = None) -> Outcome:
     """Measure a hemisphere, by default on a sheet of its own, and write its results."""
-    from hipsta_bids.inputs.labels import read_label_volume  # noqa: PLC0415  (workers only)
+    from hipsta_bids.geometry.label_checks import naming_causes  # noqa: PLC0415  (workers only)
+    from hipsta_bids.inputs.labels import read_label_volume  # noqa: PLC0415  (likewise)
     from hipsta_bids.io.volumes import limit_memory  # noqa: PLC0415  (likewise)
     from hipsta_bids.participant.measure import find_body, measure_hemisphere  # noqa: PLC0415
 
@@ -358,7 +361,9 @@ def measure_job(job: Job, measure: Measure | None = None) -> Outcome:
             volume = read_label_volume(job.item, job.settings.body.region)
             edges = np.linalg.norm(volume.affine[:3, :3], axis=0)
             record["provenance"]["voxel_size"] = " x ".join(f"{edge:.3g}" for edge in edges)
-        maps = (measure or measure_hemisphere)(volume, job.item.hemi, job.settings, clock)
+        record["notes"] = [*record["notes"], *volume.notes]
+        with naming_causes(volume):
+            maps = (measure or measure_hemisphere)(volume, job.item.hemi, job.settings, clock)
         mapped: list[Mapped] = []
         regions = None
         if job.item.maps or job.item.regions:
@@ -400,6 +405,7 @@ def measure_job(job: Job, measure: Measure | None = None) -> Outcome:
         reason=reason,
         message=message,
         repairs=len(maps.repairs),
+        notes=_added_notes(job, record),
         input_hash=hashed,
         thickness=maps.summary.get("thickness_mean"),
         **clock.spent(),
@@ -461,9 +467,15 @@ def fail(
         message=str(error),
         error=None if trace else error,
         trace=trace,
+        notes=_added_notes(job, record),
         input_hash=record.get("input_hash"),
         **spent,
     )
+
+
+def _added_notes(job: Job, record: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return the notes of a record that a job did not have before the labels were read."""
+    return tuple(record["notes"][len(job.item.notes) :])
 
 
 def _explain(error: Exception, root: Path) -> HipstaError:

@@ -56,7 +56,7 @@ def log_outcome(outcome: Outcome) -> None:
     if outcome.skipped:
         _LOGGER.info("%s: unchanged, skipped (%s)", title, outcome.decision)
         return
-    for note in outcome.job.item.notes:
+    for note in dict.fromkeys((*outcome.job.item.notes, *outcome.notes)):
         _LOGGER.info("%s: note: %s", title, note)
     for edit in outcome.job.item.edits:
         _LOGGER.info("%s: edited %s: %s", title, edit.kind, edit.path)

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.ndimage import (
     affine_transform,
+    map_coordinates,
     maximum_filter,
     maximum_filter1d,
     minimum_filter,
@@ -33,11 +34,13 @@ from hipsta_bids.geometry.checks import check_thickness, raise_flags
 from hipsta_bids.geometry.digital import box, to_ras
 from hipsta_bids.geometry.ends import EndPlanes
 from hipsta_bids.geometry.measures import pool_sd
+from hipsta_bids.geometry.shares import SOFT_WINDOW, softness
 from hipsta_bids.geometry.sheet_checks import RIVAL_OFF
 from hipsta_bids.io.volumes import moved
 from hipsta_bids.participant.measure import measure_hemisphere, unfold
 from hipsta_bids.protocols import EXPERIMENTAL
 from hipsta_bids.protocols.load import for_region
+from hipsta_bids.protocols.protocol import Tissue
 from hipsta_bids.settings import CheckSettings, Settings, UncertaintySettings
 from hipsta_bids.types import EditedMask, Finding, Float, GivenEnd, HemisphereMaps, LabelVolume
 
@@ -45,6 +48,8 @@ _Codes = NDArray[np.int64]
 
 #: Least grid spacing of copies, mm: what all copies share cancels out, and time matters.
 COPY_SPACING = 0.46
+#: Least SD of walls whose probabilities leave no doubt, mm.
+LEAST_DOUBT = 0.04
 #: Copies without which no SD is told, and which make a mode.
 LEAST = 2
 POOLED = 3
@@ -205,6 +210,9 @@ def perturb(
     by_voxel = settings.jitter / np.sqrt(3.0)  # SD of a uniform distribution
     smooth = np.sqrt(np.maximum((settings.relabeling / voxel) ** 2 - by_voxel**2, 0.0))
     share = smooth / np.sqrt(len(settings.correlation))
+    if volume.shares:
+        share = _doubt(volume, places) / voxel[:, None] / np.sqrt(len(settings.correlation))
+        by_voxel = 0.0
     for axis in range(3):
         places[axis] += by_voxel * _smooth_noise(shape, np.ones(3), generator)[near]
         for length in settings.correlation:
@@ -217,11 +225,39 @@ def perturb(
     return LabelVolume(
         tissue=(sampled % _PART).astype(np.uint8),
         part=(sampled % _MASK // _PART).astype(np.uint8),
+        shares=_move_shares(volume, shape, near, places),
         affine=affine,
         protocol=volume.protocol,
         edited_mask=None if mask is None else EditedMask(inside=sampled >= _MASK, voxel=mask.voxel),
         given_ends=_moved_ends(volume, ends, settings, generator),
     )
+
+
+def _doubt(volume: LabelVolume, places: Float) -> Float:
+    """Read how far walls may lie elsewhere, by their probabilities: SD (N,), mm, at places (3, N).
+
+    Beyond the ramp that voxels make of a wall, probabilities of a wall at a normal distance have
+    p (1 - p) in proportion to its SD: the integral across the wall is SD / sqrt(pi).
+    """
+    edges = np.linalg.norm(volume.affine[:3, :3], axis=0)
+    sheet = [k for k in volume.shares if k in volume.protocol.sheet]
+    share = np.clip(sum(volume.shares[kind] for kind in sheet), 0, 1)
+    ratio = softness(share, SOFT_WINDOW / edges)
+    ramp = np.cbrt(edges.prod()) * np.sqrt(np.pi) / 6
+    wide = map_coordinates(ratio, places, order=1, mode="nearest")
+    return np.sqrt(ramp**2 * np.maximum(wide**2 - 1, 0) + LEAST_DOUBT**2)
+
+
+def _move_shares(
+    volume: LabelVolume, shape: tuple[int, int, int], near: NDArray[np.intp], places: Float
+) -> dict[int, NDArray[np.float32]]:
+    """Sample shares at places (3, N), in voxels, for some voxels (N,) of another grid."""
+    shares = {}
+    for kind, share in volume.shares.items():
+        moved_share = np.full(np.prod(shape), kind == Tissue.BACKGROUND, dtype=np.float32)
+        moved_share[near] = map_coordinates(share, places, order=1, mode="nearest")
+        shares[kind] = moved_share.reshape(shape)
+    return shares
 
 
 def _moved_ends(
@@ -257,6 +293,7 @@ def _cropped(volume: LabelVolume) -> LabelVolume:
         tissue=volume.tissue[around],
         part=volume.part[around],
         affine=moved(volume.affine, low),
+        shares={kind: share[around] for kind, share in volume.shares.items()},
         edited_mask=None if mask is None else replace(mask, inside=mask.inside[around]),
     )
 

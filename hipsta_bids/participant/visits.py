@@ -102,9 +102,10 @@ def _measure_visits(jobs: tuple[Job, ...]) -> list[Outcome]:
     outcomes = []
     for job in jobs:
         renewal = _renewal(job)
-        notes = (*job.item.notes, *shared_notes, *([renewal] if renewal else []))
+        notes = (*job.item.notes, *shared_notes, *renewal)
         noted = replace(job, item=replace(job.item, notes=notes))
-        outcome = replace(one_job.measure_job(noted, measure(job)), renewal=renewal)
+        outcome = one_job.measure_job(noted, measure(job))
+        outcome = replace(outcome, notes=(*outcome.notes, *renewal))
         outcomes.append(_with_cost(outcome, spent, len(jobs)))
     if frame is not None and measured:
         _write_common(place, frame, on_sheet, measured)
@@ -183,13 +184,13 @@ def _with_cost(outcome: Outcome, spent: dict[str, Any], count: int) -> Outcome:
     )
 
 
-def _renewal(job: Job) -> str | None:
-    """Return a note if the sheet was made of other visits before."""
+def _renewal(job: Job) -> tuple[str, ...]:
+    """Note that the sheet was made of other visits before, if it was."""
     before: list[str] = []
     with suppress(InputError):
         before = [str(visit.get("session")) for visit in read_record(job.result).get("visits", ())]
     sessions = [str(visit.session) for visit in job.visits]
     if not before or set(before) == set(sessions):
-        return None
+        return ()
     names = [", ".join(dict.fromkeys(group)) for group in (sessions, before)]
-    return f"measured again on a sheet of the sessions {names[0]} (before: {names[1]})"
+    return (f"measured again on a sheet of the sessions {names[0]} (before: {names[1]})",)

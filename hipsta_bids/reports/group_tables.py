@@ -24,6 +24,13 @@ _VISIBLE_ROWS = 12  # of summary measures in what was found; more are folded
 _MOST_ROWS = 200  # of lists, so that pages stay small
 #: Summary measures of the thickness of the whole sheet.
 _THICKNESS = ("thickness_mean", "thickness_nodes")
+#: Tests of demographics by their names in tables.
+_TESTS = {
+    "t": "Welch's t test",
+    "F": "one-way analysis of variance",
+    "chi2": "Pearson's chi-squared test",
+    "fisher": "Fisher's exact test",
+}
 
 
 #: Columns that are never numbers.
@@ -32,6 +39,7 @@ _TEXT = (
     *("file", "model", "control", "case", "base", "added", "classifier", "region"),
     *("analysis", "other", "seg", "groups", "formula", "correction"),
     *("participant_id", "session_id", "reason", "message", "site", "kind", "version", "template"),
+    *("variable", "level"),
 )
 
 
@@ -89,6 +97,12 @@ def records(table: pd.DataFrame) -> list[dict[str, Any]]:
     return [dict(zip(map(str, table.columns), row, strict=True)) for row in table.to_numpy(object)]
 
 
+def short_contrast(contrast: str) -> str:
+    """Write ``group[A] - group[B]``, as users do, like the default model, as ``A-B``."""
+    short = _MODELS.sub("", contrast)
+    return re.sub(r"\w+\[([^\]]*)\]", r"\1", short).replace(" - ", "-")
+
+
 def direction(results: GroupResults, contrast: str, hemi: str, sign: float) -> str:
     """Describe what a contrast above or below zero means."""
     comparison = results.record.get("comparison") or {}
@@ -96,9 +110,7 @@ def direction(results: GroupResults, contrast: str, hemi: str, sign: float) -> s
         return "larger on the left" if sign > 0 else "larger on the right"
     if contrast == "mean" and comparison.get("pair"):
         return "with an increase" if sign > 0 else "with a decrease"
-    # Contrasts as users write them, and as the default model names them: of change in time, too.
-    short = _MODELS.sub("", contrast)
-    short = re.sub(r"\w+\[([^\]]*)\]", r"\1", short).replace(" - ", "-")
+    short = short_contrast(contrast)
     for first in results.levels:
         for second in results.levels:
             if re.fullmatch(rf"(?:.* in )?{re.escape(first)}-{re.escape(second)}", short):
@@ -372,26 +384,21 @@ def peaks(results: GroupResults) -> Mapping[str, Any] | None:
 
 def participants(results: GroupResults) -> Mapping[str, Any]:
     """Describe who is in the model, by group, and list who is not, with reasons."""
-    people = results.table("covariates")
-    groups = results.record.get("groups") or {}
-    visits = len(people)
-    if len(people):
-        people = people[~people[cells.IDS[0]].duplicated()]
-    column = groups.get("column")
-    levels = [level for level in results.levels if column in people]
-    members = [people[people[column].astype(str) == level] for level in levels] or [people]
+    people, table = results.table("covariates"), results.table("demographics")
     excluded = results.table("excluded")
     reasons = excluded["reason"].value_counts().items() if len(excluded) else ()
+    variables = table.groupby("variable", sort=False) if len(table) else ()
     return {
-        "n": len(people),
-        "visits": visits,
+        "n": people[cells.IDS[0]].nunique() if len(people) else 0,
+        "visits": len(people),
         "hemispheres": results.record.get("hemispheres") or {},
-        "levels": levels or ["all"],
-        "counts": [len(part) for part in members],
+        "levels": list(table["group"].unique()) if len(table) else [],
         "rows": [
-            (name, [_described(part[name], people[name]) for part in members])
-            for name in _variables(results, people, column)
+            (name, [_described(part) for _, part in rows.groupby("group", sort=False)], p)
+            for name, rows in variables
+            for p in [rows["p"].iloc[0]]
         ],
+        "tests": ", ".join(demographic_tests(table)),
         "ratings": results.record.get("ratings") or {},
         "reasons": list(reasons),
         "excluded": records(excluded.fillna("").head(_MOST_ROWS)),
@@ -399,20 +406,24 @@ def participants(results: GroupResults) -> Mapping[str, Any]:
     }
 
 
-def _variables(results: GroupResults, people: pd.DataFrame, column: str | None) -> list[str]:
-    """Columns that the formula names, but for the groups."""
-    formula = str(results.record.get("formula", ""))
-    words = set(re.findall(r"[^\W\d]\w*", formula)) | set(re.findall("`([^`]+)`", formula))
-    names = [name for name in people.columns if name in words and name not in {*cells.IDS, column}]
-    return [str(name) for name in names]
+def demographic_tests(table: pd.DataFrame) -> list[str]:
+    """List the tests of ``demographics.tsv`` in words, each with its variables."""
+    tested = table[table["p"].notna()].drop_duplicates("variable") if len(table) else table
+    tests = tested.groupby("test", sort=False)["variable"] if len(tested) else ()
+    return [f"{_TESTS[str(test)]} ({', '.join(variables)})" for test, variables in tests]
 
 
-def _described(values: pd.Series, column: pd.Series) -> str:
-    """Mean and standard deviation of numbers, counts of words."""
-    if pd.api.types.is_numeric_dtype(column) and not pd.api.types.is_bool_dtype(column):
-        return f"{cells.number_text(values.mean())} ({cells.number_text(values.std())})"
-    counts = values.dropna().astype(str).value_counts().sort_index()
-    return ", ".join(f"{level} {n}" for level, n in counts.items())
+def _described(rows: pd.DataFrame) -> list[str]:
+    """List the lines about a variable of a group: mean and SD, or counts; missing values."""
+    first, lines = records(rows)[0], [str(rows["n"].iloc[0])]
+    if rows["level"].notna().all():
+        columns = rows["level"], rows["count"], rows["percent"]
+        lines = [
+            f"{level} {n:.0f} ({share:.0f}%)" for level, n, share in zip(*columns, strict=True)
+        ]
+    elif np.isfinite(first["missing"]):
+        lines = [f"{cells.number_text(first['mean'])} ({cells.number_text(first['sd'])})"]
+    return [*lines, *[f"{first['missing']:.0f} missing"] * bool(first["missing"] > 0)]
 
 
 def summaries(results: GroupResults) -> Mapping[str, Any] | None:

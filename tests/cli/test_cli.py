@@ -16,6 +16,7 @@ from hipsta_bids.cli.commands import (
     correlate_parser,
     meta_parser,
     phantom_parser,
+    replicate_parser,
     resample_parser,
     surrogate_parser,
 )
@@ -230,6 +231,7 @@ def test_spellings_of_other_bids_apps(alias, field, value):
         ("phantom", phantom_parser),
         ("meta", meta_parser),
         ("compare", compare_parser),
+        ("replicate", replicate_parser),
         ("resample", resample_parser),
         ("correlate", correlate_parser),
     ],

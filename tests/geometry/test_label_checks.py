@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from hipsta_bids.cli import main
 from hipsta_bids.errors import ExitCode, GeometryError
-from hipsta_bids.geometry.label_checks import check_label_image
+from hipsta_bids.geometry.label_checks import check_label_image, naming_causes
 from hipsta_bids.inputs.labels import read_label_volume
 from hipsta_bids.phantom import (
     KINDS,
@@ -122,6 +122,50 @@ def test_coarse_voxels_are_refused_first(body):
 def test_volumes_that_nobody_has_are_flagged(body, scale, possible):
     """As of a header in other units: the phantom has 700 mm3."""
     assert (verdict(moved(body, scale * np.eye(3))) == set()) is possible
+
+
+def cut(volume, sides):
+    """Crop an image on sides of its labels, by index."""
+    index = np.argwhere(volume.tissue > 0)
+    low, high = index.min(axis=0), index.max(axis=0) + 1
+    box = tuple(
+        slice(low[k] + sides.get((k, 0), -1), high[k] - sides.get((k, 1), -1)) for k in range(3)
+    )
+    affine = volume.affine.copy()
+    affine[:3, 3] += affine[:3, :3] @ [side.start for side in box]
+    return replace(volume, tissue=volume.tissue[box], part=volume.part[box], affine=affine)
+
+
+@pytest.mark.parametrize(
+    ("sides", "signs", "names"),
+    [
+        ({}, (1, 1, 1), ""),
+        ({(0, 0): 0}, (1, 1, 1), "left"),
+        ({(0, 1): 0}, (1, 1, 1), "right"),
+        ({(0, 1): 0}, (-1, 1, 1), "left"),
+        ({(2, 0): 4}, (1, 1, -1), "superior"),
+        ({(1, 1): 4, (2, 0): 2}, (1, 1, 1), "anterior and inferior"),
+    ],
+)
+def test_a_refusal_names_the_border_that_may_cut_the_labels(body, sides, signs, names):
+    assert nib.aff2axcodes(body.affine) == ("R", "A", "S")
+    volume = moved(cut(body, sides), np.diag(signs))
+    lacking = replace(volume, tissue=np.where(volume.tissue == Tissue.CA1, 0, volume.tissue))
+    with pytest.raises(GeometryError, match="needed by the") as caught, naming_causes(volume):
+        check_label_image(lacking, "L", CHECKS)
+    assert caught.value.reason == "tissue-missing"
+    start = f"the labels touch the {names} border of the image (use" if names else "no label of CA1"
+    assert str(caught.value).startswith(start)
+
+
+def test_a_refusal_names_an_impossible_volume(body):
+    """As of a header in other units; coarse voxels are no consequence of a cut."""
+    volume = moved(cut(body, {(0, 0): 0}), 5 * np.eye(3))
+    with pytest.raises(GeometryError, match="are too coarse") as caught, naming_causes(volume):
+        check_label_image(volume, "L", CHECKS)
+    assert str(caught.value).startswith("the hippocampus labels have ")
+    assert "check the voxel size and its unit" in str(caught.value)
+    assert "border" not in str(caught.value)
 
 
 def test_large_volumes_are_flagged():

@@ -42,7 +42,7 @@ def test_missing_values_of_all_kinds_are_left_out_and_told_in_one_line(study, ca
         (1, "age"): "?",
         (2, "age"): "n.a.",
         (6, "sex"): "-9",
-        (7, "group"): "None",
+        (7, "group"): "NULL",
         (20, "group"): "NA",
         (21, "group"): "-",
         (22, "site"): "NaN",
@@ -58,7 +58,7 @@ def test_missing_values_of_all_kinds_are_left_out_and_told_in_one_line(study, ca
     (line,) = [line for line in said.splitlines() if "read as missing" in line]
     assert line == (
         "note: read as missing: age '-9999' (1), age '?' (1), age 'n.a.' (1), group '-' (1), group"
-        " 'NA' (1), group 'None' (1), sex '-9' (1), sex 'unknown' (3) and 2 more; if one is a"
+        " 'NA' (1), group 'NULL' (1), sex '-9' (1), sex 'unknown' (3) and 2 more; if one is a"
         " level, list it in Levels of the table's sidecar"
     )
     notes = files.read_json(study.out / "group" / "t" / "analysis.json")["notes"]
@@ -97,7 +97,7 @@ def test_columns_that_are_there_twice_are_refused(study, capsys, columns, words)
 def test_participants_who_are_not_in_the_table_are_named_so(study, capsys):
     rows = read_participants(study.data)
     rows[3][2] = "n/a"
-    rows[5][0] = "sub-6"
+    rows[5][0] = "sub-x6"
     write_participants(study.data, [*rows[:28], rows[29]])
     said, design, excluded = run(study, capsys)
     assert len(design) == 27

@@ -2,6 +2,7 @@ import gzip
 import os
 import subprocess
 import sys
+from contextlib import nullcontext
 from contextvars import ContextVar
 from dataclasses import replace
 
@@ -9,6 +10,7 @@ import nibabel as nib
 import numpy as np
 import pytest
 from input_cases import AFFINE, save
+from scipy.spatial.transform import Rotation
 
 from hipsta_bids.errors import InputError, ProtocolError
 from hipsta_bids.inputs.labels import MARGIN, label_values, read_label_volume
@@ -227,10 +229,10 @@ def corrupt(path):
     path.write_bytes(path.read_bytes()[:-40] + b"\xff" * 40)
 
 
-def with_nan(path):
-    data = make_labels(np.float32)
-    data[0, 0, 0] = np.nan
-    save(path, data)
+def with_values(path, *, scale=1.0, beside=np.nan):
+    data = make_labels(np.float32) * np.float32(scale)
+    data[31, 28, 20] = beside
+    return save(path, data)
 
 
 #: How to make one bad file of each kind.
@@ -252,7 +254,8 @@ BROKEN = {
     "4d.nii": lambda path: save(path, np.stack([make_labels()] * 2, axis=-1)),
     "2d.nii": lambda path: save(path, make_labels()[20]),
     "interpolated.nii": lambda path: save(path, make_labels(np.float32) * np.float32(0.75)),
-    "nan.nii": with_nan,
+    "nan.nii": lambda path: with_values(path, scale=0.75),
+    "infinite.nii": lambda path: with_values(path, beside=np.inf),
     "huge.nii": lambda path: save(path, make_labels(np.float64, code=1e12)),
     "complex.nii": lambda path: save(path, make_labels(np.complex64)),
     "empty.nii.gz": lambda path: save(path, np.zeros(SHAPE, np.int16)),
@@ -267,7 +270,8 @@ BROKEN = {
         ("4d.nii", "not-3d", "60 x 50 x 40 x 2"),
         ("2d.nii", "not-3d", "50 x 40"),
         ("interpolated.nii", "non-integer-labels", "nearest neighbor"),
-        ("nan.nii", "non-integer-labels", "not whole numbers"),
+        ("nan.nii", "non-integer-labels", "not whole numbers, and some are NaN"),
+        ("infinite.nii", "non-integer-labels", "some labels are infinite"),
         ("huge.nii", "non-integer-labels", "not whole numbers"),
         ("complex.nii", "non-integer-labels", "not whole numbers"),
         ("empty.nii.gz", "empty-labels", "all labels are zero"),
@@ -281,6 +285,24 @@ def test_a_bad_file_is_refused_in_one_line(tmp_path, name, reason, message):
     assert caught.value.reason == reason
     assert str(caught.value).startswith(str(path))
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("slab", [volumes._SLAB, 1])
+def test_nan_is_background(tmp_path, monkeypatch, slab):
+    monkeypatch.setattr(volumes, "_SLAB", slab)
+    data = make_labels(np.float32)
+    expected = read_label_volume(make_item(save(tmp_path / "zero.nii", data)))
+    path = save(tmp_path / "nan.nii", np.where(data == 0, np.float32(np.nan), data))
+    volume = read_label_volume(make_item(path))
+    np.testing.assert_array_equal(volume.tissue, expected.tissue)
+    assert (volume.start, expected.notes) == (expected.start, ())
+    assert volume.notes == ("nan.nii: NaN was read as background (0)",)
+    assert label_values(path) == {1, 2}
+    with pytest.raises(InputError, match="and some are NaN"):
+        label_values(with_values(tmp_path / "other.nii", scale=0.75))
+    with pytest.raises(InputError) as caught:
+        read_label_volume(make_item(save(path, np.full(SHAPE, np.nan))))
+    assert caught.value.reason == "empty-labels"
 
 
 def test_nifti_2_and_big_endian_files_are_read(tmp_path):
@@ -319,7 +341,10 @@ def flat_affine(affine):
         (flat_affine, "bad-affine", "singular"),
         (lambda affine: affine * 0, "bad-affine", "singular"),
         (lambda affine: affine @ np.diag([20, 1, 1, 1]), "bad-voxel-size", "10 x 0.5 x 0.5 mm"),
-        (lambda affine: affine @ np.diag([1, 1, 0.05, 1]), "bad-voxel-size", "x 0.025 mm"),
+        (lambda affine: affine @ np.diag([1, 1, 0.05, 1]), "bad-voxel-size", "mm; check the unit"),
+        (lambda affine: affine * 0.001, "bad-voxel-size", "may be in meters, write it in mm"),
+        (lambda affine: affine * 0.08, "bad-voxel-size", "may be in centimeters"),
+        (lambda affine: affine * 1000, "bad-voxel-size", "may be in micrometers"),
     ],
 )
 def test_impossible_affines_are_refused(tmp_path, change, reason, message):
@@ -340,6 +365,93 @@ def test_two_sizes_of_voxels_in_one_header_are_refused(tmp_path):
     with pytest.raises(InputError, match=r"0.5 mm by the sform, but 0.5 x 0.5 x 0.6 mm") as caught:
         read_label_volume(make_item(path))
     assert caught.value.reason == "bad-affine"
+
+
+def with_forms(path, qform, sform=AFFINE, unit="mm"):
+    """Write an image with a qform and a sform of their own."""
+    image = nib.Nifti1Image(make_labels(), sform)
+    image.set_sform(sform, code=1)
+    image.set_qform(qform, code=1)
+    image.header.set_xyzt_units(unit)
+    nib.save(image, path)
+    return make_item(path)
+
+
+def turned(degrees):
+    """Turn the image about its first voxel, up to 28 mm from labels and margin."""
+    turn = AFFINE.copy()
+    turn[:3, :3] = Rotation.from_euler("z", degrees, degrees=True).as_matrix() @ AFFINE[:3, :3]
+    return turn
+
+
+@pytest.mark.parametrize(
+    ("qform", "note"),
+    [
+        (AFFINE, None),
+        (nib.affines.from_matvec(np.eye(3), [0.05, 0, 0]) @ AFFINE, None),
+        (nib.affines.from_matvec(np.eye(3), [2.3, 0, 0]) @ AFFINE, "2.3 mm and 0.0 degrees"),
+        (turned(2), "1.0 mm and 2.0 degrees"),
+        (turned(180), "55.2 mm and 180.0 degrees"),
+    ],
+)
+def test_a_qform_elsewhere_than_the_sform_is_noted(tmp_path, qform, note):
+    volume = read_label_volume(with_forms(tmp_path / "a.nii", qform))
+    np.testing.assert_allclose(volume.affine[:3, :3], AFFINE[:3, :3], atol=1e-6)
+    assert len(volume.notes) == (note is not None)
+    start = f"a.nii: sform and qform place the labels {note}"
+    assert note is None or volume.notes[0].startswith(start)
+
+
+def test_shear_of_the_sform_is_noted(tmp_path):
+    sheared = AFFINE @ np.array([[1, 0.05, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    (note,) = read_label_volume(with_forms(tmp_path / "a.nii", sheared, sheared)).notes
+    assert "0.7 mm and 0.0 degrees apart" in note
+
+
+def test_the_qform_of_half_a_turn_is_rounded(tmp_path):
+    """Quaternions near half a turn are rounded to 0.0005 rad, a tenth of a mm at these labels."""
+    random = np.random.default_rng(2)
+    errors = []
+    for number in range(40):
+        small = Rotation.from_rotvec(random.normal(size=3) * 10 ** random.uniform(-5, -2))
+        linear = small.as_matrix() @ np.diag([-0.5, -0.5, 0.5])
+        affine = nib.affines.from_matvec(linear, random.uniform(-100, 100, 3))
+        item = with_forms(tmp_path / f"{number}.nii", affine, affine)
+        header = nib.load(item.files[0]).header
+        errors.append(np.abs(header.get_qform() - header.get_sform())[:3, :3].max() / 0.5)
+        assert read_label_volume(item).notes == ()
+    assert max(errors) > 1e-4
+
+
+def test_a_mirrored_qform_is_refused(tmp_path):
+    with pytest.raises(InputError, match="mirror images of each other") as caught:
+        read_label_volume(with_forms(tmp_path / "a.nii", np.diag([-1, 1, 1, 1]) @ AFFINE))
+    assert caught.value.reason == "bad-affine"
+
+
+@pytest.mark.parametrize(("code", "is_refused"), [(1, True), (0, False)])
+def test_sizes_of_one_are_stated_if_there_is_a_qform(tmp_path, code, is_refused):
+    image = nib.Nifti1Image(make_labels(), AFFINE)
+    image.set_qform(AFFINE, code=code)
+    image.header["pixdim"][1:4] = 1
+    nib.save(image, tmp_path / "a.nii")
+    item = make_item(tmp_path / "a.nii")
+    with pytest.raises(InputError, match="1 x 1 x 1 mm by pixdim") if is_refused else nullcontext():
+        assert read_label_volume(item).notes == ()
+
+
+def test_a_qform_without_a_rotation_is_not_used(tmp_path):
+    image = nib.Nifti1Image(make_labels(), AFFINE)
+    image.set_qform(AFFINE, code=1)
+    image.header["quatern_b"] = image.header["quatern_c"] = 0.9
+    nib.save(image, tmp_path / "a.nii")
+    assert read_label_volume(make_item(tmp_path / "a.nii")).notes == ()
+
+
+@pytest.mark.parametrize(("unit", "name"), [("meter", "meters"), ("micron", "micrometers")])
+def test_another_unit_than_mm_is_noted(tmp_path, unit, name):
+    (note,) = read_label_volume(with_forms(tmp_path / "a.nii", AFFINE, unit=unit)).notes
+    assert note.startswith(f"a.nii: the header states {name} (xyzt_units), but was read in mm")
 
 
 def test_nifti_without_orientation_is_refused(tmp_path):

@@ -99,7 +99,8 @@ def test_a_mask_may_be_larger_or_smaller_than_the_labels(labels):
             "edited-mask-not-binary",
             "this has 0, 1, 2, 3",
         ),
-        (np.where(block() > 0, np.nan, 0.0), "edited-mask-not-binary", "nan"),
+        (np.where(block() > 0, np.nan, 0.0), "edited-mask-empty", "is empty"),
+        (np.where(block() > 0, np.inf, 0.0), "non-integer-labels", "infinite"),
         (block() + np.int16(1), "edited-mask-not-binary", "this has 1, 2"),
         (np.zeros(SHAPE, np.uint8), "edited-mask-empty", "is empty"),
         (np.zeros((4, 4, 4, 2), np.uint8), "not-3d", "one 3-D volume"),
@@ -111,6 +112,13 @@ def test_masks_that_cannot_be_meant(labels, data, reason, message):
     assert caught.value.reason == reason
     assert "m.nii.gz" in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_nan_around_a_mask_is_background_and_noted(labels):
+    path = save(labels.with_name("m.nii.gz"), np.where(block() > 0, np.float32(1), np.nan))
+    volume = read_label_volume(make_item(labels, edits=[("mask", path)]))
+    np.testing.assert_array_equal(place(volume.edited_mask.inside), np.argwhere(block()))
+    assert volume.notes == ("m.nii.gz: NaN was read as background (0)",)
 
 
 def test_a_mask_that_is_no_image(labels):

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 from stand_ins import THICKNESS, make_input, stand_in_job, thread_job
 
+from hipsta_bids.cli.console import summary_line
 from hipsta_bids.derivatives.dataset import COLUMNS, read_status
 from hipsta_bids.derivatives.names import OUTPUTS, SHARED
 from hipsta_bids.errors import ExitCode, InputError, OutputError, SettingsError
@@ -91,6 +92,18 @@ def test_quality_record_says_what_came_in(tmp_path):
     (row,) = read_status(tmp_path / "out")
     assert record["input_hash"] == row["input_hash"]
     assert record["settings_hash"] == row["settings_hash"]
+
+
+@pytest.mark.usefixtures("workers")
+def test_notes_on_the_labels_reach_terminal_log_and_record(tmp_path):
+    out = tmp_path / "out"
+    result = run([make_input(tmp_path / "in", act="noted")], out)
+    (outcome,) = result.outcomes
+    assert summary_line(outcome).endswith(" s  in.nii: odd header")
+    assert result.log.read_text().count("note: in.nii: odd header") == 1
+    record = json.loads(outcome.job.result.path("qc").read_text())
+    assert record["notes"] == ["in.nii: odd header"]
+    assert record["decision"] == "use"
 
 
 def test_log_has_a_line_per_stage(tmp_path):

@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
+import pandas as pd
 
 from hipsta_bids import __version__
 from hipsta_bids.group.cohort.crop import REACH
@@ -21,7 +22,7 @@ from hipsta_bids.group.stats.clusters import TFCE_EXTENT, TFCE_HEIGHT
 from hipsta_bids.group.stats.exchangeability import exchange_text, spans_constant
 from hipsta_bids.group.stats.mmrm import VisitRows
 from hipsta_bids.protocols import EXPERIMENTAL
-from hipsta_bids.reports.group_tables import opposite_changes
+from hipsta_bids.reports.group_tables import demographic_tests, opposite_changes
 from hipsta_bids.types import PARTICIPANT
 
 #: Level at which slopes are said to differ.
@@ -55,10 +56,13 @@ def methods_text(
     cropped: Sequence[str] = (),
     region: str = "body",
     ratings: Mapping[str, int] | None = None,
+    demographics: pd.DataFrame,
 ) -> str:
     """Return methods and results, as a paper prints them."""
     cite = Citations()
     paragraphs = [_sample(cohort, analysis, n_out, cite, surfaces)]
+    if tests := escaped(joined(demographic_tests(demographics))):
+        paragraphs[0] += f" Demographics of the groups were compared by {tests}."
     if ratings is not None:
         counts = ", ".join(f"{n} {rating}" for rating, n in ratings.items())
         paragraphs[0] += (

@@ -39,8 +39,12 @@ META_COLUMNS: Mapping[str, str] = COLUMNS | _MEANINGS["meta"]
 COMPARISON_COLUMNS: Mapping[str, str] = COLUMNS | _MEANINGS["comparison"]
 #: The same of measures that are tested together.
 JOINT_COLUMNS: Mapping[str, str] = COLUMNS | _MEANINGS["joint"]
+#: The same of participants by group.
+DEMOGRAPHIC_COLUMNS: Mapping[str, str] = COLUMNS | _MEANINGS["demographics"]
 #: The same of a correlation of maps.
 CORRELATION_COLUMNS: Mapping[str, str] = _MEANINGS["correlation"]
+#: The same of published numbers beside own numbers.
+REPLICATE_COLUMNS: Mapping[str, str] = _MEANINGS["replicate"]
 
 
 def result_tables(

@@ -21,6 +21,7 @@ from hipsta_bids.group.cohort.collect import Exclusion
 from hipsta_bids.group.cohort.data import SHEET, Cohort
 from hipsta_bids.group.design.settings import GroupSettings
 from hipsta_bids.group.output import results, tables
+from hipsta_bids.group.output.demographics import demographics_of
 from hipsta_bids.group.output.figures import draw_figures
 from hipsta_bids.group.output.methods import methods_text
 from hipsta_bids.group.output.shapes import AverageShape
@@ -99,6 +100,8 @@ def write_results(
     write_exclusions(folder, exclusions)
     rows_of_model = analysis.compared.table.iloc[analysis.design.rows]
     write_table(folder, "covariates", rows_of_model, described=False)
+    people = demographics_of(cohort, analysis, settings)
+    write_table(folder, "demographics", people, meaning=tables.DEMOGRAPHIC_COLUMNS)
     write_table(folder, "design", tables.design_table(analysis), described=False)
     registered = analysis.registered
     if (registered or len(cohorts) > 1) and _parquet_possible():
@@ -130,6 +133,7 @@ def write_results(
         cropped=cropped,
         region=region,
         ratings=ratings,
+        demographics=people,
     )
     files.write_text(folder / "methods.md", text)
 

@@ -19,7 +19,7 @@ from hipsta_bids.group.questions.compare import run_group
 from hipsta_bids.group.questions.study import GroupOptions, GroupResult
 from hipsta_bids.io import files
 from hipsta_bids.reports.comparison import write_comparison_report
-from hipsta_bids.reports.group_tables import read_group
+from hipsta_bids.reports.group_tables import GroupResults, read_group
 
 _PAIRS = ("control", "case", "hemi", "added")
 
@@ -60,20 +60,25 @@ def _of_each(results: Mapping[str, GroupResult], kind: str) -> tuple[str, ...]:
     return tuple(f"{seg}: {line}" for seg, one in results.items() for line in getattr(one, kind))
 
 
+def open_analysis(folder: Path) -> GroupResults:
+    """Read the record of a finished analysis, or refuse a folder without one."""
+    if not (folder / "analysis.json").is_file():
+        raise MissingFileError(
+            f"{folder}: no analysis of the group level; give a folder OUT_DIR/group/MODEL"
+        )
+    return read_group(folder)
+
+
 def read_entries(analyses: Sequence[tuple[str | None, Path]]) -> list[Entry]:
     """Read finished analyses by name; ``FOLDER:MAP`` is one map of an analysis."""
     entries = list[Entry]()
     for name, path in analyses:
         text, colon, measure = str(path).rpartition(":")
         folder, choice = (path, None) if not colon or path.is_dir() else (Path(text), measure)
-        if not (folder / "analysis.json").is_file():
-            raise MissingFileError(
-                f"{folder}: no analysis of the group level; give a folder OUT_DIR/group/MODEL"
-            )
+        results = open_analysis(folder)
         title = name or folder.resolve().name
         if title in [entry.name for entry in entries]:
             raise UsageError(f"compare: two analyses are called {title}; name them, a={path} b=...")
-        results = read_group(folder)
         maps = results.table("maps")
         names = sorted(maps["measure"].unique()) if len(maps) else []
         if choice and choice not in names:

@@ -24,9 +24,10 @@ from hipsta_bids.group.design.formula import ascii_letters, check_names, listed,
 from hipsta_bids.group.design.settings import GroupSettings
 from hipsta_bids.group.output import write
 from hipsta_bids.group.output.citations import REFERENCES
+from hipsta_bids.group.output.demographics import demographics_table
 from hipsta_bids.group.output.results import templates_of
 from hipsta_bids.group.output.saved import templates_from_json
-from hipsta_bids.group.output.tables import registration_tables
+from hipsta_bids.group.output.tables import DEMOGRAPHIC_COLUMNS, registration_tables
 from hipsta_bids.group.output.template import template_file
 from hipsta_bids.group.questions import analysis
 from hipsta_bids.group.stats.arrays import Bool
@@ -224,6 +225,9 @@ class Study:
                 write.write_table(folder, title, table)
             write.write_exclusions(folder, excluded)
             write.write_table(folder, "covariates", visits, described=False)
+            formulas = [record.get("formula") or "1"]
+            table = demographics_table(visits, self.settings, formulas)
+            write.write_table(folder, "demographics", table, meaning=DEMOGRAPHIC_COLUMNS)
             all_notes.extend(fill(folder))
             return {"participants": people, "rows": len(visits), **record}
 
