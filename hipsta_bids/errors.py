@@ -119,7 +119,9 @@ class ModelError(HipstaError):
 
 
 #: Arguments of Python functions, by the options that messages name.
-_ARGUMENTS = {f"--{name}": f"{name}=" for name in ("correction", "formula", "settings")}
+_ARGUMENTS = {
+    f"--{name}": f"{name}=" for name in ("correction", "formula", "probabilities", "settings")
+}
 _ARGUMENTS |= {"--scheme": "protocol=", "--contrast": "contrasts=", "--blocks": "blocks (setting)"}
 
 

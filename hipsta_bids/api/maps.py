@@ -26,14 +26,15 @@ from hipsta_bids.geometry.label_checks import naming_causes
 from hipsta_bids.geometry.sheet import is_left_handed, layer_depth
 from hipsta_bids.group.cohort.read import node_coordinates
 from hipsta_bids.inputs.labels import MARGIN, label_volume
+from hipsta_bids.inputs.shares import Layer, add_shares, read_layers
 from hipsta_bids.io import files
 from hipsta_bids.io.gifti import sheet_triangles, write_surface
-from hipsta_bids.io.volumes import LabelImage, read_labels, without_nan
+from hipsta_bids.io.volumes import LabelImage, moved, read_labels, without_nan
 from hipsta_bids.io.xarrays import Variable, make_dataset
 from hipsta_bids.participant.measure import measure_hemisphere
 from hipsta_bids.protocols import body_ends
 from hipsta_bids.protocols.load import for_region, load_protocol
-from hipsta_bids.protocols.protocol import Protocol
+from hipsta_bids.protocols.protocol import Protocol, Tissue
 from hipsta_bids.reports.cells import card, with_unit, wrapped
 from hipsta_bids.reports.results import SIDES, SheetTable
 from hipsta_bids.settings import Settings, SheetSettings, load_settings
@@ -66,6 +67,8 @@ class Measurement:
     """All that was measured, as the stages of the method hand it on."""
     notes: tuple[str, ...] = ()
     """What is doubtful about the image of the labels."""
+    soft: bool = False
+    """Whether probabilities of the labels placed the walls."""
 
     def __repr__(self) -> str:
         name = f"{SIDES[self.side]}, {self.protocol.name}, {self.settings.body.region}"
@@ -203,8 +206,9 @@ class Measurement:
             write_shared(root)
         common = {"version": __version__, "settings_hash": digest, "region": name.region}
         about = {"scheme": name.seg, "scheme_title": self.protocol.title, "input_hash": None}
-        notes = ["measured in Python", *self.notes]
-        record = common | about | {"inputs": [], "edited": [], "notes": notes}
+        record: dict[str, Any] = common | about
+        record |= {"inputs": [], "edited": [], "notes": ["measured in Python", *self.notes]}
+        record |= {"provenance": {"probabilities": "memory"}} if self.soft else {}
         place = ResultPlace(root=root, name=name)
         outputs.write_results(place, self.hemisphere, self.protocol, record, write_meshes=False)
         _, reason, message = outputs.verdict(self.hemisphere)
@@ -296,6 +300,7 @@ def measure(
     protocol: str | Path | Protocol | None = None,
     *,
     affine: ArrayLike | None = None,
+    probabilities: Any = None,  # noqa: ANN401  (as above)
     region: str = "body",
     settings: Settings | str | Path | None = None,
 ) -> Measurement:
@@ -314,6 +319,10 @@ def measure(
         ``"hippunfold"``, or a TOML file. A wrong one may give a plausible, wrong map.
     affine : array, optional
         (4, 4), voxel index to RAS mm; for arrays only.
+    probabilities : optional
+        Probability, 0 to 1, of the sheet with its molecular layer, which places the walls: an array
+        (I, J, K) on the grid of the labels, a path or an image of nibabel. Or a mapping from codes,
+        among them each code of the sheet and its layer, to these.
     region : {"body", "extended", "entorhinal", "headbody", "whole"}
         What to measure; the second and third need labels of the cortex beside it, the last two,
         which are experimental, labels of subfields in the head.
@@ -332,7 +341,7 @@ def measure(
     FileNotFoundError
         If a file of labels, protocol or settings does not exist.
     InputError, ProtocolError
-        If the labels cannot be read, or do not fit the protocol.
+        If labels or probabilities cannot be read, or do not match the protocol or each other.
     GeometryError
         With the reason why this hemisphere cannot be measured.
 
@@ -371,6 +380,8 @@ def measure(
         if isinstance(labels, LabelVolume)
         else _read_volume(labels, side, _as_protocol(protocol), affine, region)
     )
+    if probabilities is not None:
+        volume = _with_probabilities(volume, probabilities)
     with naming_causes(volume):
         hemisphere = measure_hemisphere(volume, side, settings, lambda _: nullcontext())
     return Measurement(
@@ -379,7 +390,44 @@ def measure(
         settings=settings,
         hemisphere=hemisphere,
         notes=volume.notes,
+        soft=bool(volume.shares),
     )
+
+
+def _with_probabilities(volume: LabelVolume, source: Any) -> LabelVolume:  # noqa: ANN401  (as above)
+    """Add probabilities of the sheet, or of codes, to labels."""
+    sheet = (*volume.protocol.sheet, *volume.protocol.layer)
+    tissues = {0: Tissue.BACKGROUND} | {x.code: x.tissue for x in volume.protocol.labels}
+    if isinstance(source, Mapping):
+        for code in source:
+            check_choice("probabilities: code", code, tissues)
+        lacking = {tissue for tissue in sheet if (volume.tissue == tissue).any()}
+        if lacking := lacking.difference(tissues[code] for code in source):
+            names = ", ".join(sorted(tissue.name for tissue in lacking))
+            raise InputError(f"no probabilities of {names}; add them", reason="bad-probabilities")
+        by_tissue = [(tissues[code], f" of code {code}", values) for code, values in source.items()]
+    else:
+        # All of the sheet, whichever of its tissues has the name.
+        by_tissue = [(sheet[0], "", source)]
+        by_tissue += [(tissue, "", np.zeros(_shape(volume))) for tissue in sheet[1:]]
+    layers: list[Layer] = []
+    for tissue, name, values in by_tissue:
+        if isinstance(values, str | Path):
+            layers += read_layers(Path(values), [tissue], volume)
+            continue
+        data = np.asanyarray(getattr(values, "dataobj", values), dtype=np.float32)
+        affine = getattr(values, "affine", None)
+        if affine is None and data.shape != _shape(volume):
+            problem = f"{name} have shape {data.shape}, the labels {_shape(volume)}"
+            raise ArgumentError("probabilities", problem.strip())
+        start = -volume.start[0], -volume.start[1], -volume.start[2]
+        affine = moved(volume.affine, start) if affine is None else affine
+        layers.append(Layer(f"probabilities{name}", tissue, data, affine))
+    return add_shares(volume, layers, "probabilities")
+
+
+def _shape(volume: LabelVolume) -> tuple[int, ...]:
+    return volume.file_shape or volume.tissue.shape
 
 
 def _as_protocol(protocol: str | Path | Protocol | None) -> Protocol:

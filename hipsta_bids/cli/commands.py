@@ -29,6 +29,7 @@ def phantom_parser() -> Parser:
     add("--head", "N", type=int)
     add("--thickness", "MM", default=1.8)
     add("--voxel-size", "MM", nargs=3, type=float, default=[0.4, 0.4, 0.4])
+    add("--probabilities")
     add("--seed", default=0)
     return parser
 
@@ -234,6 +235,7 @@ def run_surrogate(arguments: Sequence[str]) -> ExitCode:
     defaults = participant.build_parser().parse_args(
         [str(parsed.bids_dir), str(parsed.output_dir), participant.LEVELS[0]]
     )
+    defaults.probabilities = "never"
     options = argparse.Namespace(**vars(defaults) | vars(parsed))
     participant.check_folders(options)
     from hipsta_bids.settings import load_settings  # noqa: PLC0415  (start-up time)

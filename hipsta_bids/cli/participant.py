@@ -113,6 +113,7 @@ def _add_processing(parser: Parser) -> None:
     add("--method", "NAME", choices=("default", "published"))
     add("--x-coordinate", "NAME", choices=("midsurface", "volume"))
     add("--ends", "FILE.tsv")
+    add("--probabilities", "auto|never|DIR", type=_probabilities, default="auto")
     add("--longitudinal", "", nargs="?", const="auto", choices=["auto", "shared"])
     add("--write-meshes")
     add("--uncertainty", "K", type=_copies, default=0)
@@ -166,6 +167,10 @@ def _copies(text: str) -> int:
     if not text.isascii() or not text.isdigit() or int(text) == 1:
         raise argparse.ArgumentTypeError(f"{text!r} is not a number of copies; use 0, or 2 or more")
     return int(text)
+
+
+def _probabilities(text: str) -> str | Path:
+    return text if text in {"auto", "never"} else Path(text)
 
 
 def _shard(text: str) -> Shard:

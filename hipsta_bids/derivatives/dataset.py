@@ -346,15 +346,23 @@ def numbered(text: str, works: Mapping[str, str]) -> tuple[str, list[str]]:
 
 
 def citation_text(
-    settings: Settings, protocols: Sequence[Protocol], *, pybids: bool = False
+    settings: Settings,
+    protocols: Sequence[Protocol],
+    *,
+    pybids: bool = False,
+    probabilities: bool = False,
 ) -> str:
-    """Compose the methods section, with all settings and the references; PyBIDS only if used."""
+    """Compose the methods section, with all settings and the references.
+
+    PyBIDS and probabilities of labels are in it only if they are used.
+    """
     about, body, sheet = TEXTS["methods"], settings.body, settings.sheet
     titles = "; ".join(f"{one.title} [@seg-{one.name}]" for one in protocols) or "none"
     text = about["text"].format(
         version=__version__,
         titles=titles,
         pybids=about["pybids"] if pybids else "",
+        probabilities=about["probabilities"] if probabilities else "",
         layer=_layer_rule(body, protocols),
         region=about["region"][body.region].format(faces=about["faces"]),
         end_rule=about["end_rule"][body.end_rule],

@@ -389,5 +389,9 @@ def _by_name(sidecar: Output, text_of: Callable[[Output], str]) -> str:
 
 def sources(record: Mapping[str, Any]) -> list[str]:
     """List the inputs of a quality record, with edits and other visits, as BIDS addresses."""
-    entries = [entry for key in ("inputs", "edited", "visits") for entry in record.get(key) or ()]
+    entries = [
+        entry
+        for key in ("inputs", "edited", "probabilities", "visits")
+        for entry in record.get(key) or ()
+    ]
     return list(dict.fromkeys(str(entry["file"]) for entry in entries))

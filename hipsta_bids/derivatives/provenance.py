@@ -31,7 +31,9 @@ def export_provenance(out_dir: Path, folder: Path) -> list[Path]:
         software[maker] = {"Id": maker, "Label": dataset.NAME, "Version": version}
         activity = _activity(place, record) | {"AssociatedWith": maker}
         activities.append(activity)
-        for entry in [*(record.get("inputs") or ()), *(record.get("edited") or ())]:
+        for entry in (
+            e for key in ("inputs", "edited", "probabilities") for e in record.get(key) or ()
+        ):
             uri = str(entry["file"])
             entity = {"Id": uri, "Label": uri.rpartition("/")[2]}
             digest = {"Digest": {"sha256": entry["sha256"]}} if "sha256" in entry else {}

@@ -85,7 +85,7 @@ def _order(result: ResultPlace) -> tuple[str, ...]:
 def read_record(result: ResultPlace) -> dict[str, Any]:
     """Read the quality record."""
     record = files.read_json(result.path("qc"))
-    for name in ("inputs", "edited", "visits"):
+    for name in ("inputs", "edited", "probabilities", "visits"):
         entries = record.get(name) or []
         if not isinstance(entries, list) or not all(isinstance(one, dict) for one in entries):
             raise InputError(f"{result.path('qc')}: bad {name}; {_REDO}", reason="bad-json")

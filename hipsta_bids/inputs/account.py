@@ -91,6 +91,9 @@ def input_table(
         main, *parts = item.files
         reasons = [(main, status, str(item.problem or item.explanation))]
         reasons += [(path, status, "head, body and tail of the same labels") for path in parts]
+        if item.probabilities:
+            text = f"probabilities of the same labels, files: {len(item.probabilities.files)}"
+            reasons.append((item.probabilities.files[0][0], status, text))
         reasons += [(item.path_of(name), tree.NOT_USED, why) for name, why in item.passed_over]
         of_item = [row(path, item, *reason) for path, *reason in reasons]
         of_item[0] = item.origin | of_item[0]

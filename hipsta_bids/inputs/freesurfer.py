@@ -92,6 +92,13 @@ def parse_analysis(
     )
 
 
+def posterior_run(analysis: str) -> str:
+    """Write the analysis of labels (``-T1-T2.v22``) as names of posteriors do (``v22_T2``)."""
+    run = parse_analysis(analysis)
+    scans = run.scans[1:] if run.scans[:1] == ("T1",) else run.scans
+    return "_".join([f"v{run.version}", *(["-".join(scans)] if scans else [])])
+
+
 def choose_run(
     files: Sequence[LabelFile], context: Context, hemi: str
 ) -> Iterator[scan.HemisphereInput]:

@@ -11,6 +11,7 @@ from scipy import ndimage
 from hipsta_bids.errors import InputError, ProtocolError
 from hipsta_bids.geometry.grid import in_plane_voxel
 from hipsta_bids.inputs.scan import HemisphereInput
+from hipsta_bids.inputs.shares import read_shares
 from hipsta_bids.io.volumes import LabelImage, box_with_margin, label_codes, moved, read_labels
 from hipsta_bids.protocols.load import for_region, load_protocol, protocol_names
 from hipsta_bids.protocols.protocol import OUTSIDE, Part, Protocol, Tissue, translate
@@ -40,7 +41,8 @@ def read_label_volume(item: HemisphereInput, region: str = "body") -> LabelVolum
     """Read one hemisphere's segmentation.
 
     The volume is cropped to the hippocampal labels, and the cortical ones of the region, plus 5 mm
-    on each side, as far as the image extends. The affine is the image's own, moved by the crop:
+    on each side, as far as the image extends; with the shares of voxels, if it has probabilities.
+    The affine is the image's own, moved by the crop:
     scanner RAS for MGZ, sform before qform for NIfTI. A NIfTI without either has no known left and
     right, and is refused. Labels and mask edited by hand have their own files, on any grid.
 
@@ -63,7 +65,8 @@ def read_label_volume(item: HemisphereInput, region: str = "body") -> LabelVolum
     InputError
         ``unreadable-image``, ``not-3d``, ``bad-affine``, ``bad-voxel-size``,
         ``non-integer-labels``, ``empty-labels``, ``grid-mismatch``, or, of edited files,
-        ``edited-elsewhere``, ``edited-mask-not-binary`` or ``edited-mask-empty``.
+        ``edited-elsewhere``, ``edited-mask-not-binary`` or ``edited-mask-empty``; of
+        probabilities, ``bad-probabilities``.
     ProtocolError
         ``unknown-labels`` or ``wrong-scheme``; ``no-cortex-labels`` if the protocol has none.
     """
@@ -88,6 +91,8 @@ def read_label_volume(item: HemisphereInput, region: str = "body") -> LabelVolum
     if labels:
         needed = _wanted(volume.tissue, item.protocol, region)
         _check_same_place(needed, volume.affine, item, path)
+    if item.probabilities:
+        volume = read_shares(volume, item.probabilities, edited=labels is not None)
     if mask is None and not item.ends:
         return volume
     edited, notes = None, volume.notes

@@ -81,6 +81,13 @@ class Layout:
     """What the user has to know where there are several protocols."""
     volumes: str = ""
     """Name of the table of volumes beside a file."""
+    probabilities: str = ""
+    """Pattern of names of probabilities. It takes groups of the name of labels, ``side``, and
+    FreeSurfer's ``run``; a group ``label`` is the label's code or name."""
+    near: Sequence[str] = (".",)
+    """Folders in which they may be, relative to the folder of the labels."""
+    weights: bool = False
+    """Their values are weights, which their sum makes probabilities."""
 
     def reads(self, name: str, source: scan.Source) -> dict[str, str | None] | None:
         """Return the entities of a file's name, if it is one of this program's."""

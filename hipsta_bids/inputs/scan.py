@@ -14,7 +14,7 @@ from hipsta_bids.derivatives.dataset import NAME, PROVENANCE, generated_by, read
 from hipsta_bids.errors import HipstaError, InputError
 from hipsta_bids.inputs import tree
 from hipsta_bids.io.files import MISSING
-from hipsta_bids.protocols.protocol import Protocol
+from hipsta_bids.protocols.protocol import Protocol, Tissue
 from hipsta_bids.types import GivenEnd, Hemisphere
 
 # What is asked for, and what was found: the values that the search for inputs works with.
@@ -56,6 +56,8 @@ class InputRequest:
     bids_database_dir: Path | None = None
     participants_map: Path | None = None
     """Table with the participant and session of each folder."""
+    probabilities: str | Path = "never"
+    """``auto`` (beside the labels), ``never``, or the folder that has all probabilities."""
 
     @property
     def uses_pybids(self) -> bool:
@@ -88,6 +90,21 @@ class Edit:
     path: Path
     source: str
     """Name of the dataset that it is in."""
+    source_path: Path
+
+
+@dataclass(frozen=True, kw_only=True)
+class Probabilities:
+    """Files with the share of each voxel that a label fills."""
+
+    kind: str
+    """``probseg``, as BIDS names the files, or the program that names them so."""
+    files: tuple[tuple[Path, tuple[Tissue, ...]], ...]
+    """Each file, with the tissue of each of its volumes."""
+    weights: bool = False
+    """Whether the values are weights, which their sum makes probabilities."""
+    source: str
+    """Name of the dataset."""
     source_path: Path
 
 
@@ -149,6 +166,8 @@ class HemisphereInput(Hemisphere):
     """Ends of the body that a person has placed."""
     maps: tuple[MapSource, ...] = ()
     """Other volumes to be sampled on the sheet."""
+    probabilities: Probabilities | None = None
+    """Probabilities of the labels, if they are used."""
     regions: Path | None = None
     """Table of regions drawn on the sheet."""
 
@@ -174,7 +193,8 @@ class HemisphereInput(Hemisphere):
     def origin(self) -> dict[str, str]:
         """Origin of the labels, as far as is known before they are read."""
         return {**dict.fromkeys(PROVENANCE, MISSING), **self.provenance} | {
-            "edited": "+".join(self.edited) or MISSING
+            "edited": "+".join(self.edited) or MISSING,
+            "probabilities": self.probabilities.kind if self.probabilities else MISSING,
         }
 
     @property

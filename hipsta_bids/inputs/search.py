@@ -30,6 +30,7 @@ from hipsta_bids.inputs.ashs import choose_atlas
 from hipsta_bids.inputs.edits import EditedFile, attach_edits, each_once, edits_of_visit, list_edits
 from hipsta_bids.inputs.generic import forget_tables, without_side
 from hipsta_bids.inputs.layouts import LAYOUTS, atlas_finder, find, volume_table
+from hipsta_bids.inputs.probabilities import attach_probabilities
 from hipsta_bids.inputs.scan import HEMIS, HemisphereInput, InputRequest, Source
 from hipsta_bids.inputs.selection import Context, Selection, make_selection
 from hipsta_bids.io.files import entities
@@ -137,9 +138,11 @@ def find_inputs(request: InputRequest) -> Findings:
             error.add_note(f"not used: {entry.path}: {entry.reason}")
         raise error
     _check_analysis(results.items, request)
-    items, notes = attach_edits(
-        _without_clashes(results.items, sources), each_once(results.edited), selection
+    unedited, used_notes = attach_probabilities(
+        _without_clashes(results.items, sources), request.probabilities
     )
+    items, notes = attach_edits(unedited, each_once(results.edited), selection)
+    notes += used_notes
     subjects = {item.subject for item in items}
     renamed = [
         f"{f.path.name} as sub-{f.subject}{f'_ses-{f.session}' if f.session else ''}"

@@ -133,7 +133,7 @@ def recorded(job: Job) -> Outcome | None:
 
 def finished(job: Job) -> Outcome | None:
     """Return the outcome of a hemisphere that an earlier run has done with the same inputs."""
-    outcome = None if job.force else recorded(job)
+    outcome = None if job.force or job.item.problem else recorded(job)
     if outcome is None or outcome.decision == Decision.FAILED:
         return None
     try:
@@ -171,6 +171,7 @@ def base_record(job: Job) -> dict[str, Any]:
             for path, why in item.passed_over
         ],
         "notes": item.notes,
+        **({"probabilities": list(_probabilities(item, sources))} if item.probabilities else {}),
         **({"given_ends": given_ends} if given_ends else {}),
         **({"as_published": published} if published else {}),
     }
@@ -207,6 +208,10 @@ def hash_inputs(job: Job, record: Mapping[str, Any]) -> tuple[str, dict[str, Any
         *signal_hash(item),
     ]
     entries = {"inputs": inputs, "edited": edited}
+    if item.probabilities:
+        entries["probabilities"] = list(_probabilities(item, dict(job.sources), hashed=True))
+        reading.append([entry["sha256"] for entry in entries["probabilities"]])
+        reading.append([list(map(int, tissues)) for _, tissues in item.probabilities.files])
     if job.visits:
         entries["visits"] = list(_hash_visits(job))
         reading.append([entry["sha256"] for entry in entries["visits"]])
@@ -215,11 +220,21 @@ def hash_inputs(job: Job, record: Mapping[str, Any]) -> tuple[str, dict[str, Any
     return digest, entries
 
 
+def _probabilities(
+    item: HemisphereInput, sources: Mapping[str, Path], *, hashed: bool = False
+) -> Iterator[dict[str, str]]:
+    """List the files with probabilities of labels, perhaps with their hashes."""
+    for path, _ in item.probabilities.files if item.probabilities else ():
+        digest = {"sha256": files.sha256_of(path)} if hashed else {}
+        yield {"file": source_address(path, sources), **digest}
+
+
 def _hash_visits(job: Job) -> Iterator[dict[str, Any]]:
     """List the files of all visits that share a sheet, with their hashes."""
     sources = dict(job.sources)
     for visit in job.visits:
-        for path in (*visit.files, *(edit.path for edit in visit.edits)):
+        soft = [path for path, _ in visit.probabilities.files] if visit.probabilities else []
+        for path in (*visit.files, *(edit.path for edit in visit.edits), *soft):
             yield {
                 "session": visit.session,
                 "file": source_address(path, sources),

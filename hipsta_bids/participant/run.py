@@ -278,6 +278,8 @@ def _prepare(
     """Write what describes the dataset as a whole, and list what is to be done."""
     origins = [(item.source, item.source_path) for item in items]
     origins += [(edit.source, edit.source_path) for item in items for edit in item.edits]
+    probabilities = [item.probabilities for item in items if item.probabilities]
+    origins += [(soft.source, soft.source_path) for soft in probabilities]
     origins += [("bids", m.source_path) for item in items for m in item.maps if m.source_path]
     sources = dataset.source_names(origins)
     used_protocols = [
@@ -293,7 +295,10 @@ def _prepare(
         dataset.write_description(out_dir, sources)
         if options.shard is None or not (out_dir / DATASET_FILES["citation"]).exists():
             text = dataset.citation_text(
-                settings, [protocols[k] for k in sorted(protocols)], pybids=options.pybids
+                settings,
+                [protocols[k] for k in sorted(protocols)],
+                pybids=options.pybids,
+                probabilities=bool(probabilities),
             )
             files.write_text(out_dir / DATASET_FILES["citation"], text)
         dataset.write_sidecar(out_dir)

@@ -104,6 +104,8 @@ class CohortPlan:
     """mm of neighboring cortex, by which the mid-curve extends beyond the subiculum."""
     head: int | None = None
     """Number of digitations of a head, up to 4; without it there are bodies alone."""
+    probabilities: bool = False
+    """Write the share of each voxel that a tissue fills, too."""
 
     def __post_init__(self) -> None:
         regions = REGIONS if self.head is None else ("head",)
@@ -116,8 +118,9 @@ class CohortPlan:
         problem = None
         if self.cortex and KINDS[self.kind].power != 1:
             problem = f"the shape {self.kind} cannot extend into cortex; choose another kind"
-        if self.head is not None and (self.shift or self.cortex or self.kind != CohortPlan.kind):
-            problem = "a head has a shape of its own; remove shift, cortex and kind"
+        bodies = self.shift or self.cortex or self.probabilities or self.kind != CohortPlan.kind
+        if self.head is not None and bodies:
+            problem = "a head has a shape of its own; remove shift, cortex, kind, probabilities"
         if self.head is not None and not 0 <= self.head <= _MOST_DIGITATIONS:
             problem = f"a head has 0 to {_MOST_DIGITATIONS} digitations, not {self.head}"
         if not (1 <= self.n_subjects <= _MOST_SUBJECTS and self.seed >= 0):
@@ -265,6 +268,7 @@ def write_cohort(
         hemispheres,
         layouts=(layout,),
         voxel_size=voxel_size,
+        probabilities=plan.probabilities,
         columns=_columns(plan),
         rows={
             one.label: (one.group, f"{one.age:.1f}", one.sex, f"{one.icv:.1f}", one.site)

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import nibabel as nib
 import numpy as np
 from nibabel.affines import from_matvec
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from hipsta_bids import __version__
@@ -19,7 +20,7 @@ from hipsta_bids.phantom.head import HeadPhantom, HeadSpec
 from hipsta_bids.phantom.labels import encode
 from hipsta_bids.phantom.phantom import Phantom
 from hipsta_bids.phantom.shape import PhantomSpec, bad
-from hipsta_bids.protocols.load import load_protocol
+from hipsta_bids.protocols.load import load_protocol, plain_name
 from hipsta_bids.protocols.protocol import Part, Protocol, Tissue
 from hipsta_bids.types import Float, LabelVolume
 
@@ -28,6 +29,9 @@ TRUTH_TABLE = "phantom_truth.tsv"
 
 #: Where bodies of phantoms with a head end, for ``--ends``.
 ENDS_TABLE = "phantom_ends.tsv"
+
+#: Points per axis of a voxel, by which shares are measured.
+_POINTS = 4
 
 BIDS_VERSION = "1.11.0"
 
@@ -102,11 +106,13 @@ def write_dataset(
     layouts: Sequence[str] = ("freesurfer",),
     voxel_size: tuple[float, float, float] = (0.4, 0.4, 0.4),
     axes: str = "LIA",
+    probabilities: bool = False,
     columns: Mapping[str, Mapping[str, Any]] = MappingProxyType({}),
     rows: Mapping[str, Sequence[str]] = MappingProxyType({}),
 ) -> None:
     """Write phantoms as a BIDS dataset with derivatives and a table of the truth.
 
+    ``probabilities`` writes the share of each voxel that a tissue fills beside the labels.
     ``columns`` describes the columns of ``participants.tsv`` beside the labels, as a BIDS sidecar
     does; ``rows`` has their values in this order, by subject label without ``sub-``. The same input
     gives the same bytes. Existing files of the same name are replaced.
@@ -121,6 +127,7 @@ def write_dataset(
         _refuse(layouts, "labels for cortex", lambda protocol: protocol.neighbors != ())
     if any(isinstance(item.spec, HeadSpec) for item in hemispheres):
         _refuse(layouts, "subfields in the head", _has_head)
+    points: dict[str, Any] = {"supersample": _POINTS} if probabilities else {}
     truth: list[dict[str, str]] = []
     ends: list[list[str]] = []
     for item in hemispheres:
@@ -138,11 +145,12 @@ def write_dataset(
                 pose=item.pose,
                 voxel_size=voxel_size,
                 axes=axes,
+                **points,
             )
             path = layout.path.format(
                 subject=f"sub-{item.subject}", side=layout.sides["LR".index(item.hemi)]
             )
-            _write_image(out / "derivatives" / name / path, volume)
+            _write_labels(out / "derivatives" / name / path, item, volume)
     if ends:
         header = ["participant_id", "hemi", "end", "r", "a", "s", "nr", "na", "ns"]
         files.write_tsv(out / ENDS_TABLE, header, ends)
@@ -215,14 +223,23 @@ def _truth_rows(item: Hemisphere, phantom: Phantom | HeadPhantom) -> list[dict[s
     ]
 
 
-def _write_image(path: Path, volume: LabelVolume) -> None:
-    """Write codes as a compressed MGH or NIfTI image, by the suffix."""
-    codes = encode(volume)
+def _write_labels(path: Path, item: Hemisphere, volume: LabelVolume) -> None:
+    """Write labels, and the shares of tissues beside them if the volume has some."""
+    _write_image(path, encode(volume), volume.affine)
+    names = {int(row.tissue): plain_name(row.abbreviation) for row in volume.protocol.labels}
+    for tissue in names.keys() & volume.shares.keys():
+        name = f"sub-{item.subject}_hemi-{item.hemi}_label-{names[tissue]}_probseg.nii.gz"
+        _write_image(path.with_name(name), volume.shares[tissue], volume.affine)
+
+
+def _write_image(path: Path, values: NDArray[Any], affine: Float) -> None:
+    """Write codes or shares as a compressed MGH or NIfTI image, by the suffix."""
     image: Any
     if path.suffix == ".mgz":
-        image = nib.MGHImage(codes, volume.affine)
+        image = nib.MGHImage(values, affine)
     else:
-        image = nib.Nifti1Image(codes.astype(np.int16), volume.affine)
+        kind = np.int16 if np.issubdtype(values.dtype, np.integer) else np.float32
+        image = nib.Nifti1Image(values.astype(kind), affine)
         image.header.set_xyzt_units("mm")
     # Without a time stamp, so that writing the same phantom again does not look like new input.
     files.write_bytes(path, gzip.compress(image.to_bytes(), compresslevel=6, mtime=0))

@@ -215,6 +215,24 @@ def identify_tissue(name: str) -> tuple[Tissue, Part]:
     return Tissue.OTHER, part
 
 
+def covered_labels(text: str, protocol: Protocol) -> tuple[Label, ...]:
+    """List the labels that a code, a name or an abbreviation in the name of a file stands for."""
+    key = plain_name(text)
+    spellings = (
+        [str(label.code) for label in protocol.labels],
+        [plain_name(label.name) for label in protocol.labels],
+        [plain_name(label.abbreviation) for label in protocol.labels],
+    )
+    names = next((names for names in spellings if key in names), ())
+    return tuple(label for label, name in zip(protocol.labels, names, strict=False) if name == key)
+
+
+def plain_name(name: str) -> str:
+    """Reduce a name to letters and digits, without words that do not change what a label is."""
+    words = re.findall("[a-z0-9]+", name.lower())
+    return "".join(word for word in words if word not in _FILLERS) or "".join(words)
+
+
 def protocol_from_names(rows: Iterable[NamedCode], *, name: str, origin: str) -> Protocol:
     """Make a protocol from a label table."""
     labels = tuple(

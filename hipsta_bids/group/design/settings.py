@@ -20,7 +20,16 @@ Splines = Annotated[int, Field(ge=4)]
 AtLeastTwo = Annotated[int, Field(ge=2)]
 #: Fields that say where labels come from, as ``PROVENANCE`` of ``derivatives`` has them.
 Provenance = Literal[
-    "tool", "version", "analysis", "atlas", "hierarchy", "space", "design", "edited", "voxel_size"
+    "tool",
+    "version",
+    "analysis",
+    "atlas",
+    "hierarchy",
+    "space",
+    "design",
+    "edited",
+    "probabilities",
+    "voxel_size",
 ]
 #: How to allow for many tests, as the command line spells it.
 Correction = Literal["fdr2", "bh", "permutation-tfce", "permutation-max"]

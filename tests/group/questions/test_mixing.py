@@ -36,6 +36,7 @@ USUAL = {
     "space": "n/a",
     "design": "cross-sectional",
     "edited": "n/a",
+    "probabilities": "n/a",
     "voxel_size": "0.333 x 0.333 x 0.333",
 }
 OTHER = {
@@ -47,6 +48,7 @@ OTHER = {
     "space": "FSvoxelSpace",
     "design": "longitudinal",
     "edited": "labels",
+    "probabilities": "ashs",
     "voxel_size": "0.333 x 0.333 x 1",
 }
 #: Ages, unlike the groups, which are odd and even.
