@@ -63,7 +63,7 @@ def test_head_is_measured_and_has_the_planted_difference(dataset, patient, tmp_p
         (["--layout", "ashs"], "ashs has no subfields in the head; choose from freesurfer"),
         (["--head", "5"], "0 to 4 digitations, not 5"),
         (["--region", "CA1"], "region 'CA1' is unknown; choose from head"),
-        (["--shift", "1"], "remove shift, cortex and kind"),
+        (["--shift", "1"], "remove shift, cortex, kind, probabilities"),
         (["--thinning", "1.5"], "a wall of 1."),
         (["--thinning", "nan"], "nan mm thinner"),
     ],
