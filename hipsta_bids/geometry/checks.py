@@ -190,7 +190,7 @@ def check_image(body: Body) -> list[Finding]:
 
 def _check_probabilities(body: Body, unlike: digital.Index) -> Finding:
     """Flag probabilities that contradict the labels (N, 3) away from their border."""
-    share = len(unlike) / max(np.count_nonzero(body.inside), 1)
+    share = len(unlike) / max(int(np.count_nonzero(body.inside)), 1)
     return Finding(
         reason="probabilities-unlike",
         value=share,

@@ -152,8 +152,8 @@ def resample_body(body: Body, hemi: str, settings: GridSettings, slices: SliceSe
         # Less where shares already say where the wall is; as much as ever where they are 0 or 1.
         sharp = _smooth(values.reshape(grid.shape), SHARE_SMOOTHING * sigma / settings.spacing)
         reach = SOFT_WINDOW / np.linalg.norm(body.affine[:3, :3], axis=0)
-        known = np.minimum(softness(body.soft.values, reach), 1)
-        weight = _sample(body, points, known).reshape(grid.shape)
+        weights = np.minimum(softness(body.soft.values, reach), 1)
+        weight = _sample(body, points, weights).reshape(grid.shape)
         smooth += weight * (sharp - smooth)
     return Field(
         grid=grid,

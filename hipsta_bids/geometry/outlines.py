@@ -75,8 +75,8 @@ def outline_slice(
     distance = np.where(np.abs(distance) < sigma * fine, exact, distance)
     if share is not None:
         at = _fine_pixels(share.shape, settings.upsampling)
-        known = np.minimum(softness(share, np.full(2, SOFT_WINDOW / pixel)), 1)
-        weight = ndimage.map_coordinates(known, at, order=1, mode="nearest")
+        soft = np.minimum(softness(share, np.full(2, SOFT_WINDOW / pixel)), 1)
+        weight = ndimage.map_coordinates(soft, at, order=1, mode="nearest")
         distance += weight * (_from_share(share, fine, settings) - distance)
     ranks = ranks_of(tissue, settings.upsampling)
     distance = _join(distance, ranks, beside, fine, settings)

@@ -38,16 +38,16 @@ def sheet_share(volume: LabelVolume, body: Bool, sheet: tuple[int, ...]) -> Shee
 
     ``body`` (I, J, K) is the mended sheet, ``sheet`` lists the tissues of which it is made. Where a
     voxel of the body has another label, as of the molecular layer, the label's share counts there
-    and in the voxels nearest to it; filled voxels are full, voxels that were taken out are empty.
+    and in the voxels nearest to it; filled voxels are full, removed voxels are empty.
     """
     if not volume.shares:
         return None
     labeled = np.isin(volume.tissue, sheet)
-    taken = labeled & ~body
-    around = digital.box_around(digital.positions(body | taken))
+    removed = labeled & ~body
+    around = digital.box_around(digital.positions(body | removed))
     edges = np.linalg.norm(volume.affine[:3, :3], axis=0)
     nearest = ndimage.distance_transform_edt(
-        ~(body | taken)[around], sampling=edges, return_distances=False, return_indices=True
+        ~(body | removed)[around], sampling=edges, return_distances=False, return_indices=True
     )
     kind = volume.tissue[around][tuple(nearest)]
     part = np.zeros(kind.shape, dtype=np.float32)
@@ -56,7 +56,7 @@ def sheet_share(volume: LabelVolume, body: Bool, sheet: tuple[int, ...]) -> Shee
             part += share[around] * (True if tissue in sheet else kind == tissue)
     inside = body[around]
     part[inside & ~np.isin(kind, [t for t in volume.shares if t != Tissue.BACKGROUND])] = 1
-    part[taken[around][tuple(nearest)]] = 0
+    part[removed[around][tuple(nearest)]] = 0
     deep = ndimage.binary_erosion(inside, structure=digital.CUBE)
     near = ndimage.binary_dilation(inside, structure=digital.CUBE)
     unlike = digital.positions(np.where(deep, part < _HALF, (part > _HALF) & ~near))

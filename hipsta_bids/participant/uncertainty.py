@@ -245,7 +245,7 @@ def _doubt(volume: LabelVolume, places: Float) -> Float:
     ratio = softness(share, SOFT_WINDOW / edges)
     ramp = np.cbrt(edges.prod()) * np.sqrt(np.pi) / 6
     wide = map_coordinates(ratio, places, order=1, mode="nearest")
-    return np.sqrt(ramp**2 * np.maximum(wide**2 - 1, 0) + LEAST_DOUBT**2)
+    return np.asarray(np.sqrt(ramp**2 * np.maximum(wide**2 - 1, 0) + LEAST_DOUBT**2))
 
 
 def _move_shares(
