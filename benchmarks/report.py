@@ -6,11 +6,13 @@ import platform
 import sys
 from collections.abc import Mapping, Sequence
 from importlib.metadata import version
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 # A benchmark runs as a file, which leaves the checkout and its validation off the path.
-sys.path.append(str(Path(__file__).resolve().parents[1]))
+if find_spec("validation") is None:
+    sys.path.append(str(Path(__file__).resolve().parents[1]))
 
 _LIBRARIES = ("hipsta_bids", "numpy", "scipy", "scikit-image", "tetgen")
 

@@ -303,7 +303,7 @@ def test_a_run_with_other_maps_redoes_and_tidies_up(bids_dir, regions, tmp_path,
         ("x\ty\tregion\n1\t1\ta\n1\t1\ta\n", "occurs 2 times in region a"),
         ("x\ty\tregion\n1\t1\tn/a\n", "no point belongs to a region"),
         ("", "no point belongs to a region"),
-        ("x\ty\tregion\n1\t1\n", "rows and header differ"),
+        ("x\ty\tregion\n1\t1\n", "line 2 has 2 cells, the header 3"),
         (None, "file not found"),
     ],
 )

@@ -96,7 +96,9 @@ def test_no_value_is_made_where_there_was_none(points):
         assert n[:, -1].max() == N // 2
         assert (n[5, TAIL + 1 : TAIL + 4] == 0).all()  # fewer than half have a value
         assert ((n == 0) | (n >= N / 2)).all()
-        assert (np.isfinite(table.p) == (table.n > 0)).all()
+        # A group may have fewer than three participants left, who are not tested.
+        assert (np.isfinite(table.p) <= (table.n > 0)).all()
+        assert np.isfinite(table.p)[table.n > 0.75 * N].all()
 
 
 def test_what_is_experimental_is_said(folder):

@@ -127,7 +127,8 @@ def small(tmp_path, change):
     change(rows)
     write_participants(data, rows, COLUMNS)
     (tmp_path / "shared.toml").write_text(SHARED.replace("50.0", "40.0, 60.0"))
-    return [data, out, "group", "--fit-norms", *MEASURES, "--settings", tmp_path / "shared.toml"]
+    options = ["--settings", tmp_path / "shared.toml", "--allow-missing"]
+    return [data, out, "group", "--fit-norms", *MEASURES, *options]
 
 
 def few_men(rows):
