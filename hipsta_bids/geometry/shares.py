@@ -22,6 +22,7 @@ SOFT_WINDOW = 1.0
 Shares = NDArray[np.float32]
 
 _HALF = 0.5  # of a voxel: the wall
+_MARGIN = 3  # voxels round the sheet in which probabilities are looked at
 
 
 class SheetShare(NamedTuple):
@@ -44,7 +45,10 @@ def sheet_share(volume: LabelVolume, body: Bool, sheet: tuple[int, ...]) -> Shee
         return None
     labeled = np.isin(volume.tissue, sheet)
     removed = labeled & ~body
-    around = digital.box_around(digital.positions(body | removed))
+    index = digital.positions(body | removed)
+    around = digital.box(
+        np.maximum(index.min(axis=0) - _MARGIN, 0), index.max(axis=0) + _MARGIN + 1
+    )
     edges = np.linalg.norm(volume.affine[:3, :3], axis=0)
     nearest = ndimage.distance_transform_edt(
         ~(body | removed)[around], sampling=edges, return_distances=False, return_indices=True
