@@ -99,8 +99,8 @@ def measure_case(case: Case) -> Measured:
     return compare(phantom, case, maps)
 
 
-def draw(phantom: Phantom, case: Case) -> LabelVolume:
-    """Draw a case in FreeSurfer's labels."""
+def draw(phantom: Phantom, case: Case, *, supersample: int = 1) -> LabelVolume:
+    """Draw a case in FreeSurfer's labels; several points per axis give shares of voxels, too."""
     volume = phantom.label_volume(
         load_protocol("freesurfer"),
         hemi=case.hemi,
@@ -108,6 +108,7 @@ def draw(phantom: Phantom, case: Case) -> LabelVolume:
         pose=case.pose,
         axes=case.axes,
         grid_rotation=case.grid_rotation,
+        supersample=supersample,
     )
     return replace(volume, affine=MIRROR @ volume.affine) if case.mirrored else volume
 

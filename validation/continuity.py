@@ -121,7 +121,7 @@ def warped(
     """Pull labels through a smooth random displacement, SD ``size`` mm along each axis."""
     edges = np.linalg.norm(volume.affine[:3, :3], axis=0)
     shape = volume.tissue.shape
-    shift = np.stack([_smooth_noise(shape, smoothness / edges, random) for _ in range(3)])
+    shift = np.stack([smooth_noise(shape, smoothness / edges, random) for _ in range(3)])
     inverse = np.linalg.inv(volume.affine[:3, :3])
     step: Float = inverse @ (shift.reshape(3, -1) * size)
     return _sampled(volume, step)
@@ -136,7 +136,7 @@ def shifted(volume: LabelVolume, share: float, random: np.random.Generator) -> L
     return replace(moved, affine=affine)
 
 
-def _smooth_noise(shape: Sequence[int], length: Float, random: np.random.Generator) -> Float:
+def smooth_noise(shape: Sequence[int], length: Float, random: np.random.Generator) -> Float:
     """Gaussian noise (I, J, K) of SD 1, correlated over ``length`` (3,) voxels."""
     noise = random.standard_normal(shape)
     noise = ndimage.gaussian_filter(noise, length / 2, mode="wrap")

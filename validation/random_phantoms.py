@@ -26,9 +26,9 @@ FINE, IN_PLANE, SLICES = (0.3, 0.5), (0.35, 0.5), (1.0, 2.0)
 Results = Mapping[str, Sequence[tuple[Case, Measured | Refusal]]]
 
 
-def draw(voxels: str, number: int) -> Case:
+def draw(voxels: str, number: int, *, seed: int = SEED) -> Case:
     """Draw a shape, voxels and a position; a shape that cannot exist is drawn again."""
-    generator = np.random.default_rng((SEED, list(TARGETS).index(voxels), number))
+    generator = np.random.default_rng((seed, list(TARGETS).index(voxels), number))
     while True:
         spec = PhantomSpec(
             kind=str(generator.choice(list(KINDS))),

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -170,11 +171,15 @@ def reslice(
     *,
     offset: float = 0.0,
     tilt: float = 0.0,
+    aside: tuple[float, float] = (0.0, 0.0),
+    points: tuple[int, int, int] = (1, 1, 1),
 ) -> LabelVolume:
     """Take the labels at the voxel centers of thick slices.
 
     ``axis`` is the unit vector (3,) across the slices; ``voxel_size`` is pixel, pixel and distance
-    of slices, mm; ``offset`` is a fraction of that distance, ``tilt`` in degrees.
+    of slices, mm; ``offset`` is a fraction of that distance, ``aside`` of the pixels, ``tilt`` in
+    degrees. With several ``points`` along its axes, a voxel gets the label of most of its points,
+    and the share of points of each tissue.
     """
     turn = Rotation.from_euler("x", tilt, degrees=True).as_matrix()
     matrix = slice_frame(axis) @ turn * np.array(voxel_size)
@@ -185,19 +190,33 @@ def reslice(
     reach = np.linalg.solve(matrix, corners - middle[:, None])
     low = np.floor(reach.min(axis=1)) - 1
     shape = (np.ceil(reach.max(axis=1)) + 2 - low).astype(int)
-    affine = from_matvec(matrix, middle + matrix @ (low + np.array([0.0, 0.0, offset])))
+    affine = from_matvec(matrix, middle + matrix @ (low + np.array([*aside, offset])))
     to_volume = np.linalg.inv(volume.affine) @ affine
     index = np.indices(shape).reshape(3, -1)
-    nearest = np.rint(to_volume[:3, :3] @ index + to_volume[:3, 3:]).astype(int)
-    inside = ((nearest >= 0) & (nearest <= size[:, None])).all(axis=0)
-    tissue, part = (np.zeros(index.shape[1], dtype=np.uint8) for _ in range(2))
-    tissue[inside] = volume.tissue[tuple(nearest[:, inside])]
-    part[inside] = volume.part[tuple(nearest[:, inside])]
+    # Background, 0, is the first kind: that of points outside.
+    codes = volume.tissue.astype(np.intp) + 256 * volume.part.astype(np.intp)
+    kinds = np.union1d(0, codes)
+    kind_of = np.searchsorted(kinds, codes)
+    votes = np.zeros((len(kinds), index.shape[1]), dtype=np.uint16)
+    for step in product(*((np.arange(n) + 0.5) / n - 0.5 for n in points)):
+        place = index + np.array(step)[:, None]
+        nearest = np.rint(to_volume[:3, :3] @ place + to_volume[:3, 3:]).astype(int)
+        inside = np.flatnonzero(((nearest >= 0) & (nearest <= size[:, None])).all(axis=0))
+        kind = np.zeros(index.shape[1], dtype=np.intp)
+        kind[inside] = kind_of[tuple(nearest[:, inside])]
+        votes[kind, np.arange(len(kind))] += 1
+    part, tissue = np.divmod(kinds[votes.argmax(axis=0)].reshape(shape), 256)
+    number = int(np.prod(points))
     return LabelVolume(
-        tissue=tissue.reshape(shape),
-        part=part.reshape(shape),
+        tissue=tissue.astype(np.uint8),
+        part=part.astype(np.uint8),
         affine=affine,
         protocol=volume.protocol,
+        shares={
+            int(each): (votes[kinds % 256 == each].sum(axis=0) / np.float32(number)).reshape(shape)
+            for each in np.unique(kinds % 256)
+            if number > 1
+        },
     )
 
 

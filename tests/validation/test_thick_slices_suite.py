@@ -54,6 +54,32 @@ def test_an_offset_moves_slices_by_its_share_of_their_distance():
     np.testing.assert_allclose((moved.affine - plain.affine)[:3, 3], 0.25 * 2.0 * AXIS, atol=1e-12)
 
 
+def test_several_points_per_voxel_give_shares_and_the_label_of_most():
+    volume = numbered()
+    found = reslice(
+        volume, AXIS, (0.6, 0.6, 1.8), offset=0.3, tilt=10.0, aside=(0.2, 0.7), points=(2, 2, 6)
+    )
+    total = sum(found.shares.values())
+    np.testing.assert_allclose(total, 1, atol=1e-6)
+    kinds = np.array(list(found.shares))
+    largest = kinds[np.stack(list(found.shares.values())).argmax(axis=0)]
+    clear = np.stack(list(found.shares.values())).max(axis=0) > 0.5
+    np.testing.assert_array_equal(found.tissue[clear], largest[clear])
+    # Voxels inside, of a label that rises evenly: the mean over the points is that of the place.
+    index = np.argwhere(found.shares[0] == 0)
+    mean = sum(kind * share for kind, share in found.shares.items())[tuple(index.T)]
+    points = index @ found.affine[:3, :3].T + found.affine[:3, 3]
+    place = (points - volume.affine[:3, 3]) / 0.3
+    assert len(index) > 20
+    assert np.abs(mean - (1 + (place - 1).sum(axis=1) / 3)).mean() < 0.25
+
+
+def test_pixels_move_aside_by_their_share():
+    plain, moved = (reslice(numbered(), AXIS, (0.4, 0.4, 2.0), aside=a) for a in ((0, 0), (0.5, 1)))
+    step = np.linalg.inv(plain.affine[:3, :3]) @ (moved.affine - plain.affine)[:3, 3]
+    np.testing.assert_allclose(step, [0.5, 1.0, 0.0], atol=1e-12)
+
+
 def maps(thickness, length=20.0):
     return SimpleNamespace(thickness=thickness, qc={"body_length_mm": length}, decision="use")
 
