@@ -131,7 +131,8 @@ def test_quiet(tmp_path, capsys):
 
 def test_defaults(seen, tmp_path):
     assert main.main(["in", str(tmp_path), "participant"]) == 0
-    assert seen["request"] == InputRequest(bids_dir=Path("in"), output_dir=tmp_path)
+    request = InputRequest(bids_dir=Path("in"), output_dir=tmp_path, probabilities="auto")
+    assert seen["request"] == request
     assert seen["settings"] == Settings()
     n_procs = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     command = f"hipsta-bids in {tmp_path} participant"
@@ -153,11 +154,12 @@ def test_everything_reaches_its_place(seen, tmp_path):
         f" --bids-database-dir db --skip-bids-validation --settings {tmp_path}/s.toml"
         " --write-meshes"
         f" --force --n-procs 3 --mem 4G --timeout 9 -w {tmp_path}/work --stop-on-first-crash -vv"
-        " --no-reports --no-anatomy"
+        " --no-reports --no-anatomy --probabilities p"
     )
     assert main.main(text.split()) == 0
     assert seen["request"] == InputRequest(
         bids_dir=Path("in"),
+        probabilities=Path("p"),
         derivatives={"one": Path("x"), "two": Path("y"), "z": Path("z")},
         freesurfer_dir=Path("f"),
         ashs_dir=Path("a"),
