@@ -54,16 +54,22 @@ def sheet_share(volume: LabelVolume, body: Bool, sheet: tuple[int, ...]) -> Shee
         ~(body | removed)[around], sampling=edges, return_distances=False, return_indices=True
     )
     kind = volume.tissue[around][tuple(nearest)]
-    part = np.zeros(kind.shape, dtype=np.float32)
+    plain = np.zeros(kind.shape, dtype=np.float32)
+    part = plain.copy()
     for tissue, share in volume.shares.items():
-        if tissue != Tissue.BACKGROUND:
-            part += share[around] * (True if tissue in sheet else kind == tissue)
+        if tissue in sheet:
+            plain += share[around]
+        elif tissue != Tissue.BACKGROUND:
+            part += share[around] * (kind == tissue)
+    part += plain
     inside = body[around]
     part[inside & ~np.isin(kind, [t for t in volume.shares if t != Tissue.BACKGROUND])] = 1
     part[removed[around][tuple(nearest)]] = 0
     deep = ndimage.binary_erosion(inside, structure=digital.CUBE)
     near = ndimage.binary_dilation(inside, structure=digital.CUBE)
-    unlike = digital.positions(np.where(deep, part < _HALF, (part > _HALF) & ~near))
+    # Beyond an end plane, the label of head or tail is no contradiction.
+    foreign = ~near & ~np.isin(volume.tissue[around], sheet) & (plain > _HALF)
+    unlike = digital.positions(np.where(deep, part < _HALF, foreign))
     values = np.zeros(body.shape, dtype=np.float32)
     values[around] = np.where(deep, 1, np.where(near, np.clip(part, 0, 1), 0))
     return SheetShare(values, unlike + digital.low_corner(around))
