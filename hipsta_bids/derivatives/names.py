@@ -219,6 +219,9 @@ EXTRA_OUTPUTS: tuple[Output, ...] = (
     _output("template_qc", "metrics", ".json", desc="longitudinal"),
 )
 
+#: Lists of files in a quality record, each an entry with an address.
+FILE_LISTS = ("inputs", "edited", "probabilities", "visits")
+
 #: Files of the whole dataset, by the name of what they hold.
 DATASET_FILES: dict[str, str] = {
     "description": "dataset_description.json",
@@ -389,9 +392,5 @@ def _by_name(sidecar: Output, text_of: Callable[[Output], str]) -> str:
 
 def sources(record: Mapping[str, Any]) -> list[str]:
     """List the inputs of a quality record, with edits and other visits, as BIDS addresses."""
-    entries = [
-        entry
-        for key in ("inputs", "edited", "probabilities", "visits")
-        for entry in record.get(key) or ()
-    ]
+    entries = [entry for key in FILE_LISTS for entry in record.get(key) or ()]
     return list(dict.fromkeys(str(entry["file"]) for entry in entries))

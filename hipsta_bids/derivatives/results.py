@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from hipsta_bids.derivatives.dataset import TABLES
 from hipsta_bids.derivatives.names import (
     EXTRA_OUTPUTS,
+    FILE_LISTS,
     OUTPUTS,
     HemisphereName,
     name_of_record,
@@ -85,7 +86,7 @@ def _order(result: ResultPlace) -> tuple[str, ...]:
 def read_record(result: ResultPlace) -> dict[str, Any]:
     """Read the quality record."""
     record = files.read_json(result.path("qc"))
-    for name in ("inputs", "edited", "probabilities", "visits"):
+    for name in FILE_LISTS:
         entries = record.get(name) or []
         if not isinstance(entries, list) or not all(isinstance(one, dict) for one in entries):
             raise InputError(f"{result.path('qc')}: bad {name}; {_REDO}", reason="bad-json")

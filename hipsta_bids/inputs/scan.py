@@ -185,6 +185,11 @@ class HemisphereInput(Hemisphere):
         return self.files[0].parent / name if Path(name).name == name else Path(name)
 
     @property
+    def probability_files(self) -> tuple[Path, ...]:
+        """Files with probabilities of the labels; none if labels are used alone."""
+        return tuple(path for path, _ in self.probabilities.files) if self.probabilities else ()
+
+    @property
     def edited(self) -> tuple[str, ...]:
         """Kinds of edits, each once."""
         return tuple(dict.fromkeys(edit.kind for edit in self.edits))

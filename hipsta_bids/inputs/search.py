@@ -115,7 +115,7 @@ def find_inputs(request: InputRequest) -> Findings:
         for folder in tree.read_people(request.participants_map)
         if not any((source.path / folder).is_dir() for source in sources)
     ]
-    present = [name for s in sources if lacking for name in map(str, tree.list_folder(s.path)[0])]
+    present = [name for s in sources if lacking for name in tree.list_folder(s.path)[0]]
     refuse_alike(lacking, present, f"{request.participants_map}: column folder")
     results.unused += [
         tree.Ignored(path=Path(folder), reason="named in --participants-map, but no dataset has it")

@@ -153,6 +153,7 @@ def base_record(job: Job) -> dict[str, Any]:
         for end in item.ends
     ]
     published = job.settings.as_published()
+    soft = [{"file": source_address(path, sources)} for path in item.probability_files]
     return {
         "version": __version__,
         "settings_hash": job.settings_hash,
@@ -171,7 +172,7 @@ def base_record(job: Job) -> dict[str, Any]:
             for path, why in item.passed_over
         ],
         "notes": item.notes,
-        **({"probabilities": list(_probabilities(item, sources))} if item.probabilities else {}),
+        **({"probabilities": soft} if soft else {}),
         **({"given_ends": given_ends} if given_ends else {}),
         **({"as_published": published} if published else {}),
     }
@@ -209,7 +210,10 @@ def hash_inputs(job: Job, record: Mapping[str, Any]) -> tuple[str, dict[str, Any
     ]
     entries = {"inputs": inputs, "edited": edited}
     if item.probabilities:
-        entries["probabilities"] = list(_probabilities(item, dict(job.sources), hashed=True))
+        entries["probabilities"] = [
+            entry | {"sha256": files.sha256_of(path)}
+            for entry, path in zip(record["probabilities"], item.probability_files, strict=True)
+        ]
         reading.append([entry["sha256"] for entry in entries["probabilities"]])
         reading.append([list(map(int, tissues)) for _, tissues in item.probabilities.files])
     if job.visits:
@@ -220,21 +224,12 @@ def hash_inputs(job: Job, record: Mapping[str, Any]) -> tuple[str, dict[str, Any
     return digest, entries
 
 
-def _probabilities(
-    item: HemisphereInput, sources: Mapping[str, Path], *, hashed: bool = False
-) -> Iterator[dict[str, str]]:
-    """List the files with probabilities of labels, perhaps with their hashes."""
-    for path, _ in item.probabilities.files if item.probabilities else ():
-        digest = {"sha256": files.sha256_of(path)} if hashed else {}
-        yield {"file": source_address(path, sources), **digest}
-
-
 def _hash_visits(job: Job) -> Iterator[dict[str, Any]]:
     """List the files of all visits that share a sheet, with their hashes."""
     sources = dict(job.sources)
     for visit in job.visits:
-        soft = [path for path, _ in visit.probabilities.files] if visit.probabilities else []
-        for path in (*visit.files, *(edit.path for edit in visit.edits), *soft):
+        edited = (edit.path for edit in visit.edits)
+        for path in (*visit.files, *edited, *visit.probability_files):
             yield {
                 "session": visit.session,
                 "file": source_address(path, sources),

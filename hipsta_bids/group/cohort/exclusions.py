@@ -45,10 +45,10 @@ class UserTable:
 
     @classmethod
     def of(
-        cls, path: Path, rows: Sequence[Mapping[str, str]], visits: Iterable[VisitKey]
+        cls, path: Path, rows: Sequence[Mapping[str, str]], visits: Sequence[VisitKey]
     ) -> "UserTable":
         """Write labels of a table as in the data."""
-        subjects, sessions = zip(*visits, strict=True) if (visits := list(visits)) else ((), ())
+        subjects, sessions = ([visit[n] for visit in visits] for n in (0, 1))
         data = {PARTICIPANT: subjects, SESSION: sessions}
         written, lines = match_rows(rows, data, str(path))
         return cls(path, tuple(written), tuple(lines))

@@ -1,6 +1,6 @@
 """Grid points that count as missing: columns that a repair touched, or rows of a table."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -67,7 +67,7 @@ def mask_note(shares: pd.DataFrame, groups: pd.Series | None) -> str:
     return f"{text}; summary measures are of all points"
 
 
-def _read(path: Path, visits: Iterable[VisitKey]) -> UserTable:
+def _read(path: Path, visits: Sequence[VisitKey]) -> UserTable:
     """Read a table of grid points; participants, sessions and sides without a cell mean all."""
     rows = files.read_tsv(path)
     if rows and (lacking := [name for name in _NODES if name not in rows[0]]):
