@@ -13,10 +13,11 @@ from scipy import ndimage
 
 from hipsta_bids.geometry.body import extract_body
 from hipsta_bids.inputs.search import HemisphereInput
+from hipsta_bids.participant.uncertainty import estimate_uncertainty
 from hipsta_bids.phantom import Phantom, PhantomSpec
 from hipsta_bids.settings import Settings
 from hipsta_bids.types import Decision, Float, HemisphereMaps, LabelVolume
-from validation import cases, continuity, random_phantoms, thick_slices
+from validation import cases, continuity, random_phantoms, thick_slices, uncertainty
 from validation.cases import Case, Measured, Refusal
 from validation.continuity import Movement
 from validation.report import Cell, Cells, Content, suite, table
@@ -57,6 +58,16 @@ MIXED = 4
 MAX_HARD = 0.01
 """mm, largest RMS difference of a map from shares of 0 and 1 to that from labels."""
 MAX_COST = 1.1
+
+POSTERIORS = (("spiral", 2.0), ("spiral", 1.6), ("arc", 2.0), ("arc", 1.6))
+"""Phantoms, by kind and thickness, mm, whose posteriors are drawn."""
+WIDTHS, WIDTH_LENGTH = (0.08, 0.45), 8.0
+"""Least and largest SD of the place of a wall, mm, and over which distance it changes."""
+LENGTHS = (1.0, 3.0)
+"""mm over which displacements of walls are correlated, in equal shares."""
+DRAWS_QUICK, DRAWS_FULL = 3, 12
+COPIES_OF_POSTERIOR = 8
+LEAST_RANK = 0.5
 
 _TIMEOUT = 900.0
 
@@ -113,6 +124,9 @@ def run(full: bool, labels: Path | None = None) -> Iterator[Content]:
     ]
     blurs = BLURS if full else BLURS[2:3]
     yield _blurred(specs, cases.run_cases(partial(measure_blurred, blurs), specs, timeout=_TIMEOUT))
+    drawn = POSTERIORS if full else POSTERIORS[-1:]
+    draws = DRAWS_FULL if full else DRAWS_QUICK
+    yield _coverage(cases.run_cases(partial(measure_draws, draws), drawn, timeout=_TIMEOUT))
     if labels is not None:
         bodies = cases.fine_segmentations(labels, min(COPIES["2 mm slices"][0]))
         copies = [
@@ -179,6 +193,58 @@ def measure_blurred(blurs: Sequence[float], spec: PhantomSpec) -> dict[tuple[flo
         timed = measure_forms(forms, case.hemi, partial(cases.compare, phantom, case))
         results |= {(blur, name): each for name, each in timed.items()}
     return results
+
+
+def measure_draws(draws: int, drawn: tuple[str, float]) -> dict[str, uncertainty.Coverage]:
+    """Draw posteriors of a phantom, whose walls are as far off as each posterior says.
+
+    The errors of their maps are set beside the SDs that copies of the first posterior predict, and
+    of its labels alone.
+    """
+    kind, thickness = drawn
+    generator = np.random.default_rng((SEED, POSTERIORS.index(drawn)))
+    spec = PhantomSpec(kind=kind, thickness=thickness, variation=0.2, length=16.0)
+    case = Case(spec=spec, pose=cases.any_pose(generator))
+    volume = cases.draw(Phantom(spec), case, supersample=POINTS)
+    edges = np.linalg.norm(volume.affine[:3, :3], axis=0)
+    level = continuity.smooth_noise(volume.tissue.shape, WIDTH_LENGTH / edges, generator)
+    width = WIDTHS[0] + (WIDTHS[1] - WIDTHS[0]) / (1 + np.exp(-2 * level))
+    reference = cases.measure_body(volume, case.hemi)
+    posteriors = [draw_posterior(volume, width, generator) for _ in range(draws)]
+    forms = {
+        SHARES: posteriors,
+        LABELS: [replace(posterior, shares={}) for posterior in posteriors],
+    }
+    return {
+        name: uncertainty.compare_errors(
+            reference,
+            [cases.measure_body(volume, case.hemi) for volume in volumes],
+            estimate_uncertainty(volumes[0], case.hemi, Settings(), COPIES_OF_POSTERIOR),
+        )
+        for name, volumes in forms.items()
+    }
+
+
+def draw_posterior(
+    volume: LabelVolume, width: Float, generator: np.random.Generator
+) -> LabelVolume:
+    """Displace shares by noise whose SD along each axis is ``width`` (I, J, K), mm; blur by it."""
+    edges = np.linalg.norm(volume.affine[:3, :3], axis=0)
+    shape = volume.tissue.shape
+    places = np.indices(shape).astype(np.float64)
+    for axis, edge in enumerate(edges):
+        noise = sum(continuity.smooth_noise(shape, each / edges, generator) for each in LENGTHS)
+        places[axis] += width / edge * noise / np.sqrt(len(LENGTHS))
+    levels = np.linspace(0.0, WIDTHS[1], 6)
+    level = np.clip(np.interp(width, levels, np.arange(len(levels))), 0, len(levels) - 1.001)
+    low = level.astype(np.intp)
+    weights = {}
+    for kind, share in volume.shares.items():
+        moved = ndimage.map_coordinates(share, places, order=3, mode="nearest").clip(0, 1)
+        blurred = np.stack([ndimage.gaussian_filter(moved, sd / edges) for sd in levels])
+        first, second = (np.take_along_axis(blurred, n[None], axis=0)[0] for n in (low, low + 1))
+        weights[kind] = (first + (level - low) * (second - first)).astype(np.float32)
+    return label_weights(volume, weights)
 
 
 def measure_copy(copy: Copy) -> dict[str, Timed]:
@@ -332,6 +398,15 @@ def _blurred(
                 values = (None, None, result.reason)
             cells |= dict(zip(names, values, strict=True))
         yield cells
+
+
+@table("soft.coverage")
+def _coverage(outcomes: Sequence[Mapping[str, uncertainty.Coverage] | Refusal]) -> Iterator[Cells]:
+    for name in (LABELS, SHARES):
+        group = [each if isinstance(each, Refusal) else each[name] for each in outcomes]
+        row = uncertainty.coverage_row("posteriors", "phantoms", group, least_rank=LEAST_RANK)
+        row = {"copies of": name, **{k: v for k, v in row.items() if k not in {"change", "bodies"}}}
+        yield row if name == SHARES else row | {"target": None, "met": None}
 
 
 @table("soft.shapes")

@@ -1,6 +1,6 @@
 """Thick slices: bodies are resliced, measured and compared with full resolution."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
@@ -193,20 +193,40 @@ def reslice(
     affine = from_matvec(matrix, middle + matrix @ (low + np.array([*aside, offset])))
     to_volume = np.linalg.inv(volume.affine) @ affine
     index = np.indices(shape).reshape(3, -1)
+    places = (
+        to_volume[:3, :3] @ (index + step[:, None]) + to_volume[:3, 3:]
+        for step in steps_in_voxel(points)
+    )
+    return sample_labels(volume, places, shape, affine)
+
+
+def steps_in_voxel(points: tuple[int, int, int]) -> Iterator[Float]:
+    """Yield steps (3,) from the center of a voxel to points at even distances in it, voxels."""
+    for step in product(*((np.arange(n) + 0.5) / n - 0.5 for n in points)):
+        yield np.array(step)
+
+
+def sample_labels(
+    volume: LabelVolume, places: Iterable[Float], shape: Sequence[int], affine: Float
+) -> LabelVolume:
+    """Take labels at places (3, N), in voxels of the volume, one or more in each of N voxels.
+
+    A voxel gets the label of most of its places and, of several, the share of each tissue.
+    """
+    size = np.array(volume.tissue.shape) - 1
     # Background, 0, is the first kind: that of points outside.
     codes = volume.tissue.astype(np.intp) + 256 * volume.part.astype(np.intp)
     kinds = np.union1d(0, codes)
     kind_of = np.searchsorted(kinds, codes)
-    votes = np.zeros((len(kinds), index.shape[1]), dtype=np.uint16)
-    for step in product(*((np.arange(n) + 0.5) / n - 0.5 for n in points)):
-        place = index + np.array(step)[:, None]
-        nearest = np.rint(to_volume[:3, :3] @ place + to_volume[:3, 3:]).astype(int)
+    votes = np.zeros((len(kinds), int(np.prod(shape))), dtype=np.uint16)
+    for place in places:
+        nearest = np.rint(place).astype(int)
         inside = np.flatnonzero(((nearest >= 0) & (nearest <= size[:, None])).all(axis=0))
-        kind = np.zeros(index.shape[1], dtype=np.intp)
+        kind = np.zeros(votes.shape[1], dtype=np.intp)
         kind[inside] = kind_of[tuple(nearest[:, inside])]
         votes[kind, np.arange(len(kind))] += 1
     part, tissue = np.divmod(kinds[votes.argmax(axis=0)].reshape(shape), 256)
-    number = int(np.prod(points))
+    number = int(votes[:, 0].sum())
     return LabelVolume(
         tissue=tissue.astype(np.uint8),
         part=part.astype(np.uint8),

@@ -22,6 +22,10 @@ SOFT_WINDOW = 1.0
 Shares = NDArray[np.float32]
 
 _HALF = 0.5  # of a voxel: the wall
+_WIDTH_WINDOW = 0.6  # mm, SD of the window in which a wall's width is averaged
+_BLUR = 0.75  # voxels, SD of the Gaussian with which slopes are taken
+_DENSITY = 0.3544
+"""Mean of the standard normal density, weighted by (F (1 - F))^3 of its distribution function F."""
 _MARGIN = 3  # voxels round the sheet in which probabilities are looked at
 
 
@@ -89,3 +93,18 @@ def softness(share: Shares, reach: Float) -> Shares:
     window = (ndimage.gaussian_filter(part, reach) for part in (share * (1 - share), wall))
     observed, expected = window
     return np.asarray(observed / np.maximum(expected, 1e-6), dtype=np.float32)
+
+
+def wall_sd(share: Shares, edges: Float) -> Shares:
+    """Return the SD of the place of the wall near each voxel (I, J, K), mm, by probabilities.
+
+    It is that of a normal distribution function with their slope where they are near a half, less
+    what the Gaussian and voxels of these ``edges`` (3,), mm, make of a sharp wall.
+    """
+    smooth = ndimage.gaussian_filter(share, _BLUR)
+    slope = ndimage.gaussian_gradient_magnitude(share, _BLUR)
+    weight = (smooth * (1 - smooth)) ** 3
+    reach = _WIDTH_WINDOW / edges
+    slope, weight = (ndimage.gaussian_filter(part, reach) for part in (weight * slope, weight))
+    variance = (_DENSITY * weight / np.maximum(slope, 1e-9)) ** 2 - _BLUR**2 - 1 / 12
+    return np.asarray(np.cbrt(edges.prod()) * np.sqrt(np.maximum(variance, 0)), dtype=np.float32)

@@ -34,7 +34,7 @@ from hipsta_bids.geometry.checks import check_thickness, raise_flags
 from hipsta_bids.geometry.digital import box, to_ras
 from hipsta_bids.geometry.ends import EndPlanes
 from hipsta_bids.geometry.measures import pool_sd
-from hipsta_bids.geometry.shares import SOFT_WINDOW, softness
+from hipsta_bids.geometry.shares import wall_sd
 from hipsta_bids.geometry.sheet_checks import RIVAL_OFF
 from hipsta_bids.io.volumes import moved
 from hipsta_bids.participant.measure import measure_hemisphere, unfold
@@ -234,18 +234,11 @@ def perturb(
 
 
 def _doubt(volume: LabelVolume, places: Float) -> Float:
-    """Read how far walls may lie elsewhere, by their probabilities: SD (N,), mm, at places (3, N).
-
-    Beyond the ramp that voxels make of a wall, probabilities of a wall at a normal distance have
-    p (1 - p) in proportion to its SD: the integral across the wall is SD / sqrt(pi).
-    """
-    edges = np.linalg.norm(volume.affine[:3, :3], axis=0)
-    sheet = [k for k in volume.shares if k in volume.protocol.sheet]
+    """Read how far walls may lie elsewhere: SD (N,), mm, by probabilities at places (3, N)."""
+    sheet = [kind for kind in volume.shares if kind in volume.protocol.sheet]
     share = np.clip(sum(volume.shares[kind] for kind in sheet), 0, 1)
-    ratio = softness(share, SOFT_WINDOW / edges)
-    ramp = np.cbrt(edges.prod()) * np.sqrt(np.pi) / 6
-    wide = map_coordinates(ratio, places, order=1, mode="nearest")
-    return np.asarray(np.sqrt(ramp**2 * np.maximum(wide**2 - 1, 0) + LEAST_DOUBT**2))
+    width = wall_sd(share, np.linalg.norm(volume.affine[:3, :3], axis=0))
+    return np.hypot(map_coordinates(width, places, order=1, mode="nearest"), LEAST_DOUBT)
 
 
 def _move_shares(

@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy import ndimage
+from scipy.stats import norm
 
 from hipsta_bids.geometry.body import extract_body
-from hipsta_bids.geometry.shares import sheet_share, softness
+from hipsta_bids.geometry.shares import sheet_share, softness, wall_sd
 from hipsta_bids.participant.uncertainty import estimate_uncertainty, perturb
 from hipsta_bids.phantom import Phantom, PhantomSpec
 from hipsta_bids.protocols.load import load_protocol
@@ -40,6 +41,18 @@ def test_true_shares_are_soft_and_labels_are_not(direction):
     assert np.mean(soft) == pytest.approx(1.0, abs=0.15)
     labels = half_space(unit, 0.3) > 0.5
     assert np.abs(softness(labels.astype(np.float32), np.full(3, 2.0))).max() < 1e-6
+
+
+@pytest.mark.parametrize("direction", [(0, 0, 1), (1, 1, 0), (3, 2, 1)])
+@pytest.mark.parametrize("sd", [0.0, 0.2, 0.45])
+def test_the_width_of_a_thin_wall_is_the_sd_of_its_place(direction, sd):
+    edges = np.full(3, 0.4)
+    depth = np.indices((36, 36, 36)).reshape(3, -1).T @ direction / np.linalg.norm(direction) * 0.4
+    steps = np.linspace(-0.18, 0.18, 9)  # of voxels along the normal
+    near = 0.9 - np.abs(depth - depth.mean())[:, None] + steps
+    share = np.mean(near > 0 if sd == 0 else norm.cdf(near / sd), axis=1).reshape(36, 36, 36)
+    width = wall_sd(share.astype(np.float32), edges)[16:20, 16:20, 16:20]
+    assert np.mean(width) == pytest.approx(sd, abs=0.13 if sd == 0 else 0.03)
 
 
 def block(shares):
