@@ -10,7 +10,7 @@ from scipy.sparse import csgraph
 from scipy.special import ndtri
 
 from hipsta_bids.geometry.digital import piece_sizes
-from hipsta_bids.geometry.shares import SHARE_SMOOTHING, SOFT_WINDOW, softness
+from hipsta_bids.geometry.shares import SHARE_SMOOTHING
 from hipsta_bids.protocols.protocol import Tissue, lateral_rank
 from hipsta_bids.settings import SliceSettings
 from hipsta_bids.types import Bool, Float, Int
@@ -51,12 +51,13 @@ def outline_slice(
     pixel: float,
     settings: SliceSettings,
     beside: Sequence[NDArray[np.uint8]] = (),
-    share: Stack | None = None,
+    soft: tuple[Stack, Stack] | None = None,
 ) -> Stack:
     """Signed distance, mm, from the ribbon's outline in a slice with pixels of ``pixel`` mm.
 
-    Where the ribbon is broken, the slices ``beside`` it show that. The outline is where the
-    ``share`` (I, J) of the ribbon in the pixels is a half, if it is known.
+    Where the ribbon is broken, the slices ``beside`` it show that. Where the ribbon's
+    shares (I, J) in the pixels are known, ``soft`` holds them and the proportion (I, J) in which
+    the outline follows their half.
 
     It is sampled at finer pixels, positive inside, and clipped at the setting ``reach``. Across a
     straight edge, a mask smoothed by a Gaussian is the normal distribution function of the distance
@@ -73,10 +74,10 @@ def outline_slice(
     distance = _signed_distance(smooth > 0.5, fine)  # noqa: PLR2004 -- the outline
     exact = sigma * fine * ndtri(np.clip(smooth, 1e-6, 1 - 1e-6))
     distance = np.where(np.abs(distance) < sigma * fine, exact, distance)
-    if share is not None:
+    if soft is not None:
+        share, proportion = soft
         at = _fine_pixels(share.shape, settings.upsampling)
-        soft = np.minimum(softness(share, np.full(2, SOFT_WINDOW / pixel)), 1)
-        weight = ndimage.map_coordinates(soft, at, order=1, mode="nearest")
+        weight = ndimage.map_coordinates(proportion, at, order=1, mode="nearest")
         distance += weight * (_from_share(share, fine, settings) - distance)
     ranks = ranks_of(tissue, settings.upsampling)
     distance = _join(distance, ranks, beside, fine, settings)

@@ -43,7 +43,8 @@ def sheet_share(volume: LabelVolume, body: Bool, sheet: tuple[int, ...]) -> Shee
 
     ``body`` (I, J, K) is the mended sheet, ``sheet`` lists the tissues of which it is made. Where a
     voxel of the body has another label, as of the molecular layer, the label's share counts there
-    and in the voxels nearest to it; filled voxels are full, removed voxels are empty.
+    and in the voxels that have no nearer voxel of this label. The share of a head or tail label is
+    divided like the other labels of its voxel. Filled voxels are full, removed voxels are empty.
     """
     if not volume.shares:
         return None
@@ -54,21 +55,29 @@ def sheet_share(volume: LabelVolume, body: Bool, sheet: tuple[int, ...]) -> Shee
         np.maximum(index.min(axis=0) - _MARGIN, 0), index.max(axis=0) + _MARGIN + 1
     )
     edges = np.linalg.norm(volume.affine[:3, :3], axis=0)
-    nearest = ndimage.distance_transform_edt(
-        ~(body | removed)[around], sampling=edges, return_distances=False, return_indices=True
-    )
-    kind = volume.tissue[around][tuple(nearest)]
+    inside, kind = body[around], volume.tissue[around]
+
+    def at_nearest(values: Bool, voxels: Bool) -> Bool:
+        nearest = ndimage.distance_transform_edt(
+            ~voxels, sampling=edges, return_distances=False, return_indices=True
+        )
+        return np.asarray(values[tuple(nearest)])
+
     plain = np.zeros(kind.shape, dtype=np.float32)
-    part = plain.copy()
+    part, subfields = plain.copy(), plain.copy()
     for tissue, share in volume.shares.items():
+        if tissue not in (Tissue.BACKGROUND, Tissue.HIPPOCAMPUS):
+            subfields += share[around]
         if tissue in sheet:
             plain += share[around]
-        elif tissue != Tissue.BACKGROUND:
-            part += share[around] * (kind == tissue)
+        elif tissue != Tissue.BACKGROUND and inside[kind == tissue].any():
+            part += share[around] * at_nearest(inside, kind == tissue)
     part += plain
-    inside = body[around]
+    if Tissue.HIPPOCAMPUS in volume.shares:
+        hidden = volume.shares[Tissue.HIPPOCAMPUS][around]
+        part *= np.where(hidden < subfields, 1 + hidden / np.maximum(subfields, 1e-6), 1)
     part[inside & ~np.isin(kind, [t for t in volume.shares if t != Tissue.BACKGROUND])] = 1
-    part[removed[around][tuple(nearest)]] = 0
+    part[at_nearest(removed[around], (body | removed)[around])] = 0
     deep = ndimage.binary_erosion(inside, structure=digital.CUBE)
     near = ndimage.binary_dilation(inside, structure=digital.CUBE)
     # Beyond an end plane, the label of head or tail is no contradiction.
@@ -82,13 +91,15 @@ def sheet_share(volume: LabelVolume, body: Bool, sheet: tuple[int, ...]) -> Shee
 def softness(share: Shares, reach: Float) -> Shares:
     """Return how soft the wall is near each voxel: 0 for binary labels, 1 for shares.
 
-    ``share`` has 2 or 3 axes. Above 1, probabilities are wider than the ramp that voxels make of a
-    wall. It is the sum of p (1 - p) in a Gaussian window of SD ``reach``, voxels, over the sum that
-    the wall's true shares have. A voxel's share of a half-space is the distribution function of its
-    projection on the normal, whose width depends little on the direction: per area of wall, the sum
-    is a sixth of a voxel's edge along the normal.
+    Above 1, probabilities are wider than the ramp that voxels make of a wall. Slices across an axis
+    with ``reach`` 0 are looked at apart. Softness is the sum of p (1 - p) in a Gaussian window of
+    SD ``reach``, voxels, over the sum that the wall's true shares have. A voxel's share of a
+    half-space is the distribution function of its projection on the normal, whose width depends
+    little on the direction: per area of wall, the sum is a sixth of a voxel's edge along the
+    normal.
     """
-    slopes = np.gradient(ndimage.gaussian_filter(share, 0.5))
+    smooth = ndimage.gaussian_filter(share, np.where(reach > 0, 0.5, 0))
+    slopes = np.gradient(smooth, axis=tuple(np.flatnonzero(reach).tolist()))
     wall = np.sqrt(sum(slope * slope for slope in slopes)) / 6
     window = (ndimage.gaussian_filter(part, reach) for part in (share * (1 - share), wall))
     observed, expected = window

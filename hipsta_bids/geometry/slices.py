@@ -5,7 +5,8 @@ one slice to the next, and blending slices in place would break it. Each slice b
 distance from its outline (``outlines``); the ribbons of neighboring slices are aligned
 (``ribbon``), or registered where one is none, and the shapes between them are blends of both, moved
 along. Where head or tail labels hide how the sheet continues, its shapes are extrapolated from
-inside. Turns of the ribbon that touch are kept apart.
+inside. Turns of the ribbon that touch are kept apart. Where the shares of voxels are known,
+outlines are corrected by what the shapes, averaged through each slice, differ from them.
 """
 
 from dataclasses import dataclass, replace
@@ -18,6 +19,7 @@ from scipy import ndimage
 from hipsta_bids.geometry import digital, outlines, ribbon
 from hipsta_bids.geometry.body import Body
 from hipsta_bids.geometry.outlines import Stack
+from hipsta_bids.geometry.shares import SOFT_WINDOW, softness
 from hipsta_bids.protocols.protocol import LATERAL_END, MEDIAL_END
 from hipsta_bids.settings import SliceSettings
 from hipsta_bids.types import Bool, Float
@@ -41,6 +43,15 @@ FLOW_ITERATIONS = 5
 HIDDEN_DEPTH = 0.1
 #: At such ends, and beyond the last slice, shapes go on changing at this fraction of their pace.
 EXTRAPOLATION = 0.5
+#: Shapes are compared with shares up to this distance from the outlines, mm: three fourths of the
+#: reach of distances.
+FIT_REACH = 1.5
+#: Levels in each slice at which shapes are compared with its shares.
+FIT_LEVELS = 5
+#: Shares are compared with the shapes in a Gaussian window of this SD, mm: a voxel of usual slices.
+FIT_WINDOW = 0.4
+#: Added to the share of the levels at which the wall crosses a voxel.
+FIT_RIDGE = 0.1
 
 _LEVELS = (2, 1)
 """Sizes of pixels in the registration, from coarse to those of the segmentation."""
@@ -255,6 +266,10 @@ def _stacked(
     if len(tissue) == 1:
         tissue = np.concatenate([tissue, tissue])
         share = None if share is None else np.concatenate([share, share])
+    soft = None
+    if share is not None:
+        reach = SOFT_WINDOW / pixel
+        soft = np.minimum(softness(share, np.array([0, reach, reach])), 1)
     images = np.stack(
         [
             outlines.outline_slice(
@@ -262,7 +277,7 @@ def _stacked(
                 pixel,
                 settings,
                 list(tissue[max(n - 1, 0) : n + 2]),
-                None if share is None else share[n],
+                None if share is None or soft is None else (share[n], soft[n]),
             )
             for n, image in enumerate(tissue)
         ]
@@ -274,6 +289,7 @@ def _stacked(
         ]
     )
     fine = pixel / settings.upsampling
+    plain = images
     images = np.minimum(images, outlines.keep_apart(ends[0], ends[1]))
     images = outlines.cut_rings(images, fine)
     ranks = [outlines.ranks_of(image, settings.upsampling) for image in tissue]
@@ -293,7 +309,35 @@ def _stacked(
         flows = np.zeros((2, len(images) - 1, *tissue.shape[1:]), dtype=np.float32)
     bends = np.zeros((2, len(images), *flows.shape[2:]), dtype=np.float32)
     _align(flows, bends, ribbon.align_nodes(ribbons, fine), settings)
-    return _SliceStack(outlines=images, ends=ends, flows=flows, bends=bends, settings=settings)
+    stack = _SliceStack(outlines=images, ends=ends, flows=flows, bends=bends, settings=settings)
+    if share is not None and soft is not None:
+        is_plain = _shrunk((images == plain).astype(np.float32), settings.upsampling) == 1
+        images += _misfit(stack, share, is_plain, pixel, soft)
+    return stack
+
+
+def _misfit(stack: _SliceStack, share: Stack, usable: Bool, pixel: float, soft: Stack) -> Stack:
+    """Compute how far outside the outlines the shares of pixels (N, I, J) are, mm; fine pixels.
+
+    The shapes between slices give each pixel a share as well, its mean through the slice. The shift
+    is one step of Gauss and Newton, in a window round each pixel, on the pixels that are ``usable``
+    (N, I, J): not cut, dropped or thickened. It is in proportion to ``soft`` (N, I, J).
+    """
+    up = stack.settings.upsampling
+    near = usable & (np.abs(_shrunk(stack.outlines, up)) < FIT_REACH)
+    pixels = np.argwhere(near).T.astype(np.float32)
+    places = (pixels[1:] + 0.5) * up - 0.5
+    error, slope = share * near, np.zeros_like(share)
+    for level in (np.arange(FIT_LEVELS, dtype=np.float32) + 0.5) / FIT_LEVELS - 0.5:
+        distance = stack.blend(pixels[0] + level, places) / pixel
+        error[near] -= np.clip(distance + 0.5, 0, 1) / FIT_LEVELS
+        slope[near] += np.maximum(1 - np.abs(distance), 0) / FIT_LEVELS
+    window = (0, FIT_WINDOW / pixel, FIT_WINDOW / pixel)
+    step = pixel * ndimage.gaussian_filter(error, window)
+    step /= ndimage.gaussian_filter(slope, window) + FIT_RIDGE
+    shift = soft * np.clip(step, -pixel, pixel)
+    grid = np.indices(stack.outlines.shape, dtype=np.float32)
+    return _interpolated(shift, grid[0], *((grid[1:] + 0.5) / up - 0.5))
 
 
 def _align(

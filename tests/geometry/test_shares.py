@@ -86,6 +86,34 @@ def test_the_layer_that_was_handed_over_carries_its_share():
     np.testing.assert_allclose(alone[5, 5, 6:12], [1, 1, 0, 0, 0, 0], atol=1e-6)
 
 
+def test_the_layer_counts_in_voxels_of_the_sheet_beside_it():
+    def shares(full):
+        full[SUBICULUM][2, 2:10, 7], full[LAYER][2, 2:10, 7] = 0.6, 0.4
+        return {}
+
+    volume = block(shares)
+    with_layer = np.isin(volume.tissue, (SUBICULUM, LAYER))
+    values = sheet_share(volume, with_layer, (SUBICULUM,)).values
+    np.testing.assert_allclose(values[2, 5, 6:9], 1, atol=1e-6)
+    alone = sheet_share(volume, volume.tissue == SUBICULUM, (SUBICULUM,)).values
+    np.testing.assert_allclose(alone[2, 5, 6:9], [1, 0.6, 0], atol=1e-6)
+
+
+def test_a_tail_label_is_divided_like_the_other_labels_of_the_voxel():
+    def shares(full):
+        tail = np.zeros_like(full[SUBICULUM])
+        wall, deep = (2, slice(2, 10), 3), (slice(3, 9), slice(3, 9), 3)
+        full[SUBICULUM][wall], tail[wall] = 0.3, 0.2  # half of the voxel is background
+        full[SUBICULUM][deep], tail[deep] = 0.6, 0.4
+        tail[2:10, 2:10, 2], full[SUBICULUM][2:10, 2:10, 2] = 0.8, 0.2
+        return {Tissue.HIPPOCAMPUS: tail}
+
+    volume = block(shares)
+    values = sheet_share(volume, volume.tissue == SUBICULUM, (SUBICULUM,)).values
+    np.testing.assert_allclose(values[2:5, 5, 3], [0.5, 1, 1], atol=1e-6)
+    assert values[5, 5, 2] == pytest.approx(0.2)  # most of the voxel is tail
+
+
 def test_labels_decide_what_is_filled_taken_out_and_deep():
     def shares(full):
         share = full[SUBICULUM].copy()
