@@ -15,7 +15,7 @@ from hipsta_bids.protocols.protocol import Tissue
 from hipsta_bids.types import Bool, Float, LabelVolume
 
 #: Where voxels have shares, the smoothing of binary labels is less by this factor.
-SHARE_SMOOTHING = 0.35
+SHARE_SMOOTHING = 0.45
 #: SD of the window in which it is judged whether they have, mm.
 SOFT_WINDOW = 1.0
 
