@@ -66,9 +66,9 @@ class GridSettings(toml.SettingsTable):
 
     spacing: Annotated[float, Field(ge=0.1, le=1)] = 0.35
     """Distance of grid nodes and so the edge length of the meshes, mm."""
-    smoothing: Annotated[float, Field(ge=0, le=3)] = 1.25
+    smoothing: Annotated[float, Field(ge=0, le=3)] = 0.9
     """Standard deviation of the Gaussian, in in-plane voxels of the segmentation."""
-    min_smoothing: NonNegativeFloat = 0.5
+    min_smoothing: NonNegativeFloat = 0.36
     """Least standard deviation of that Gaussian, mm. It keeps finer voxels from changing maps:
     smoothing of thin edges and narrow bends changes the mean thickness."""
     beyond: NonNegativeFloat = 1.75

@@ -29,11 +29,6 @@ MOTION_SD = 0.4
 #: A change of size or shape weighs against it this share of what it explains.
 MOTION_PRIOR = 0.02
 
-#: SD of the window in which the smoothed body takes up as much space as the labels, mm, ...
-VOLUME_WINDOW = 1.0
-#: ... and the most by which its walls are moved for that, mm.
-VOLUME_REACH = 0.1
-
 _MAX_REPEATS = 1.3
 """Median number of equal slices in a row, along two axes, of labels that were resampled: 1 in
 labels of four brains as their programs wrote them, 2 if each voxel was divided."""
@@ -154,12 +149,10 @@ def resample_body(body: Body, hemi: str, settings: GridSettings, slices: SliceSe
     sigma = max(settings.smoothing * in_plane_voxel(body.affine), settings.min_smoothing)
     values = values.reshape(grid.shape)
     smooth = _smooth(values, sigma / settings.spacing)
-    smooth = _keep_volume(smooth, values, settings.spacing)
     if body.soft:
         # Less where shares already say where the wall is; as much as ever where they are 0 or 1.
         sharp = _smooth(values, SHARE_SMOOTHING * sigma / settings.spacing)
-        reach = SOFT_WINDOW / np.linalg.norm(body.affine[:3, :3], axis=0)
-        weights = np.minimum(softness(body.soft.values, reach), 1)
+        weights = _soft_weights(body.soft.values, np.linalg.norm(body.affine[:3, :3], axis=0))
         weight = _sample(body, points, weights).reshape(grid.shape)
         smooth += weight * (sharp - smooth)
     return Field(
@@ -315,30 +308,16 @@ def _smooth(values: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:
     return np.asarray(2 * smoothed - smooth(smoothed))
 
 
-def _keep_volume(
-    smooth: NDArray[np.float32], values: NDArray[np.float32], spacing: float
-) -> NDArray[np.float32]:
-    """Move the walls of a smoothed body, at one half, so that it takes up the space it had before.
-
-    Walls that are only a few SDs of the smoothing apart move away from each other, and bent ones
-    move as well. In a window, the excess of space over the area of the walls is their distance from
-    where they were in the mean. Labels tell this mean much better than a single place of a wall.
-    """
-    window = partial(
-        ndimage.gaussian_filter,
-        sigma=VOLUME_WINDOW / spacing,
-        mode=("constant", "constant", "nearest"),
-        truncate=3.0,
-    )
-
-    def slope(of: NDArray[np.float32]) -> NDArray[np.float32]:
-        return np.asarray(np.sqrt(sum(step * step for step in np.gradient(of))))
-
-    steepness = slope(smooth)
-    space = np.clip((smooth - 0.5) / np.maximum(steepness, 1e-3) + 0.5, 0, 1)
-    move = window(space - values) / np.maximum(window(slope(space)), 1e-2)
-    reach = VOLUME_REACH / spacing
-    return np.asarray(smooth - np.clip(move, -reach, reach) * steepness, dtype=np.float32)
+def _soft_weights(share: NDArray[np.float32], edges: Float) -> NDArray[np.float32]:
+    """Softness of walls, up to 1, of voxels (I, J, K) with edges (3,), mm; 0 far from any wall."""
+    reach = SOFT_WINDOW / edges
+    wall = digital.positions((share > 0) & (share < 1))
+    weights = np.zeros_like(share)
+    if len(wall):
+        room = np.ceil(2 * reach).astype(int)
+        near = digital.box(np.maximum(wall.min(axis=0) - room, 0), wall.max(axis=0) + room + 1)
+        weights[near] = np.minimum(softness(share[near], reach), 1)
+    return weights
 
 
 def in_plane_voxel(affine: Float) -> float:

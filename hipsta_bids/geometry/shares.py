@@ -15,7 +15,7 @@ from hipsta_bids.protocols.protocol import Tissue
 from hipsta_bids.types import Bool, Float, LabelVolume
 
 #: Where voxels have shares, the smoothing of binary labels is less by this factor.
-SHARE_SMOOTHING = 0.45
+SHARE_SMOOTHING = 0.6
 #: SD of the window in which it is judged whether they have, mm.
 SOFT_WINDOW = 1.0
 
@@ -109,8 +109,8 @@ def softness(share: Shares, reach: Float) -> Shares:
 def wall_sd(share: Shares, edges: Float) -> Shares:
     """Return the SD of the place of the wall near each voxel (I, J, K), mm, by probabilities.
 
-    It is that of a normal distribution function with their slope where they are near a half, less
-    what the Gaussian and voxels of these ``edges`` (3,), mm, make of a sharp wall.
+    Where probabilities are near a half, a normal distribution function with their slope has this
+    SD, less what the Gaussian and voxels of these ``edges`` (3,), mm, make of a sharp wall.
     """
     smooth = ndimage.gaussian_filter(share, _BLUR)
     slope = ndimage.gaussian_gradient_magnitude(share, _BLUR)
