@@ -1,9 +1,12 @@
 """The suite of walls from shares: what is made of shares, and what its tables say."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.stats import norm
 
+from hipsta_bids.geometry.shares import wall_sd
 from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.protocols.protocol import Part, Tissue
 from hipsta_bids.types import LabelVolume
@@ -11,9 +14,12 @@ from validation import cases, soft
 from validation.cases import Measured, Refusal
 from validation.continuity import Movement
 from validation.soft import LABELS, NOISY, SHARES, Timed
+from validation.uncertainty import Coverage
 
 CA1, SUBICULUM = int(Tissue.CA1), int(Tissue.SUBICULUM)
 REFUSED = Refusal(reason="topology", message="a knot")
+_NUMBERS = dict.fromkeys(("chance", "error", "sd", "mean_error", "mean_sd"), 0.3)
+COVERED = dict.fromkeys((LABELS, SHARES), Coverage(covered=0.95, rank=0.6, **_NUMBERS))
 
 
 def volume_of(share, voxel=0.4):
@@ -208,14 +214,39 @@ def test_the_cost_is_the_median_ratio_over_hemispheres_with_both_maps():
     assert (row["hemispheres"], row["ratio"], row["met"]) == (3, pytest.approx(1.05), True)
 
 
+def test_copies_by_probabilities_are_held_to_coverage_and_rank():
+    labels, shares = soft._coverage([COVERED, COVERED, REFUSED]).rows
+    assert (labels["copies of"], labels["met"]) == (LABELS, None)
+    assert (shares["copies of"], shares["met"], shares["number"]) == (SHARES, True, 3)
+    low = {name: replace(each, rank=0.45) for name, each in COVERED.items()}
+    assert soft._coverage([low]).rows[1]["met"] is False
+
+
+def test_walls_of_a_posterior_are_off_by_its_width():
+    volume = volume_of(wall(shape=(30, 40, 40), at=14.5))
+    for width in (0.1, 0.4):
+        posterior = soft.draw_posterior(
+            volume, np.full(volume.tissue.shape, width), np.random.default_rng(1)
+        )
+        share = posterior.shares[CA1]
+        place = 0.4 * (30 - share.sum(axis=0)) - 0.4 * 15  # mm from the wall
+        assert np.std(place) == pytest.approx(width, rel=0.3)
+        assert abs(np.mean(place)) < 0.5 * width
+        spread = np.mean(wall_sd(share, np.full(3, 0.4))[14:16, 8:-8, 8:-8])
+        assert spread == pytest.approx(width, abs=0.08)
+
+
 def test_the_quick_run_without_labels_has_no_real_shapes(monkeypatch):
     forms = {LABELS: measured(0.0), SHARES: measured(0.0), NOISY: measured(0.0)}
     monkeypatch.setattr(
         cases, "run_groups", lambda _, groups, **__: {key: [forms] for key in groups}
     )
-    monkeypatch.setattr(cases, "run_cases", lambda *_, **__: [{(0.4, LABELS): measured(0.0)}])
+    blurred = {(0.4, LABELS): measured(0.0)}
+    runs = iter([[blurred], [COVERED]])
+    monkeypatch.setattr(cases, "run_cases", lambda *_, **__: next(runs))
     suite = soft.run(full=False)
-    assert [table.name for table in suite.tables] == ["random", "continuity", "blurred", "cost"]
+    names = ["random", "continuity", "blurred", "coverage", "cost"]
+    assert [table.name for table in suite.tables] == names
     assert "`--labels`" in suite.text
 
 
