@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import cKDTree
+from scipy.special import ndtr
 
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry import digital
@@ -28,6 +29,9 @@ MOTION_REACH = 3.0
 MOTION_SD = 0.4
 #: A change of size or shape weighs against it this share of what it explains.
 MOTION_PRIOR = 0.02
+
+#: SD of the window, mm, in which the sheet's thickness is looked at: it holds both walls.
+THICKNESS_WINDOW = 1.0
 
 _MAX_REPEATS = 1.3
 """Median number of equal slices in a row, along two axes, of labels that were resampled: 1 in
@@ -148,7 +152,7 @@ def resample_body(body: Body, hemi: str, settings: GridSettings, slices: SliceSe
     cavities = cavities[body.tissue[tuple(cavities.T)] > 0]
     sigma = max(settings.smoothing * in_plane_voxel(body.affine), settings.min_smoothing)
     values = values.reshape(grid.shape)
-    smooth = _smooth(values, sigma / settings.spacing)
+    smooth = smooth_body(values, sigma, in_plane_voxel(body.affine), settings.spacing)
     if body.soft:
         # Less where shares already say where the wall is; as much as ever where they are 0 or 1.
         sharp = _smooth(values, SHARE_SMOOTHING * sigma / settings.spacing)
@@ -306,6 +310,41 @@ def _smooth(values: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:
     )
     smoothed = smooth(values)
     return np.asarray(2 * smoothed - smooth(smoothed))
+
+
+def smooth_body(
+    values: NDArray[np.float32], sigma: float, voxel: float, spacing: float
+) -> NDArray[np.float32]:
+    """Smooth a mask (A, B, W) by ``sigma``, mm, and leave the walls of thin sheets where they are.
+
+    The mask was interpolated between voxels with edges ``voxel``, mm; its nodes are ``spacing`` mm
+    apart. Smoothing makes a step at z = 0 to 2 F(z / sigma) - F(z / (sigma 2**0.5)), with the
+    normal distribution function F: below zero beyond two SDs. So the second wall of a thin sheet
+    raises the values at the first, and both would move outward. This is taken off again, by the
+    local thickness: twice the volume over the area of walls in a window.
+    """
+    smooth = _smooth(values, sigma / spacing)
+    window = partial(
+        ndimage.gaussian_filter,
+        sigma=THICKNESS_WINDOW / spacing,
+        mode=("constant", "constant", "nearest"),
+        truncate=2.0,
+    )
+    sharp: NDArray[np.float32] = smooth - np.float32(0.5)
+    sharp = np.clip(sharp / np.maximum(_slope(smooth), 1e-3) + 0.5, 0, 1, dtype=np.float32)
+    ratio = window(sharp) / np.maximum(window(_slope(sharp)), 1e-3) * spacing / THICKNESS_WINDOW
+    thickness = np.linspace(0.3, 4.0, 75)
+    near, far = (thickness / np.sqrt(times * sigma**2 + voxel**2 / 6) for times in (1, 2))
+    raised = ndtr(-far) - 2 * ndtr(-near)
+    seen = thickness / THICKNESS_WINDOW
+    expected = (ndtr(seen) - 0.5) / ((1 + np.exp(-(seen**2) / 2)) / np.sqrt(2 * np.pi))
+    shift = np.interp(ratio, expected, np.maximum(raised, 0))
+    return np.asarray(smooth - shift * np.clip(4 * smooth * (1 - smooth), 0, 1), dtype=np.float32)
+
+
+def _slope(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Length of the gradient, per node."""
+    return np.asarray(np.sqrt(sum(step * step for step in np.gradient(values))))
 
 
 def _soft_weights(share: NDArray[np.float32], edges: Float) -> NDArray[np.float32]:

@@ -44,7 +44,8 @@ def sheet_share(volume: LabelVolume, body: Bool, sheet: tuple[int, ...]) -> Shee
     ``body`` (I, J, K) is the mended sheet, ``sheet`` lists the tissues of which it is made. Where a
     voxel of the body has another label, as of the molecular layer, the label's share counts there
     and in the voxels that have no nearer voxel of this label. The share of a head or tail label is
-    divided like the other labels of its voxel. Filled voxels are full, removed voxels are empty.
+    divided like the other labels of its voxel: wholly up to two thirds of theirs, and not at all
+    where it is as large. Filled voxels are full, removed voxels are empty.
     """
     if not volume.shares:
         return None
@@ -75,7 +76,8 @@ def sheet_share(volume: LabelVolume, body: Bool, sheet: tuple[int, ...]) -> Shee
     part += plain
     if Tissue.HIPPOCAMPUS in volume.shares:
         hidden = volume.shares[Tissue.HIPPOCAMPUS][around]
-        part *= np.where(hidden < subfields, 1 + hidden / np.maximum(subfields, 1e-6), 1)
+        ratio = hidden / np.maximum(subfields, 1e-6)
+        part *= 1 + ratio * np.clip(3 * (1 - ratio), 0, 1)
     part[inside & ~np.isin(kind, [t for t in volume.shares if t != Tissue.BACKGROUND])] = 1
     part[at_nearest(removed[around], (body | removed)[around])] = 0
     deep = ndimage.binary_erosion(inside, structure=digital.CUBE)

@@ -8,11 +8,12 @@ import pytest
 from geometry_cases import plain_body, resampled, rigid, rotation, straight_ends
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.interpolate import CubicSpline
 
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry import digital
 from hipsta_bids.geometry.ends import EndPlanes
-from hipsta_bids.geometry.grid import continued_nodes, in_plane_voxel
+from hipsta_bids.geometry.grid import continued_nodes, in_plane_voxel, smooth_body
 from hipsta_bids.protocols.protocol import Tissue
 
 EXACT = 1e-9  # rounding of coordinates of some ten mm
@@ -143,6 +144,22 @@ def test_field_is_free_at_the_sides(case):
     values = case.field.values
     edge = np.concatenate([values[[0, -1]].ravel(), values[:, [0, -1]].ravel()])
     assert (edge < -0.49).all()  # nothing but background within the margin
+
+
+@pytest.mark.parametrize("thickness", [1.0, 1.2, 1.6, 2.4])
+def test_smoothing_does_not_move_close_walls_apart(thickness):
+    """Without its last step, a sheet of 1.2 mm in voxels of .4 mm becomes .018 mm thicker."""
+    voxel, spacing, sigma = 0.4, 0.35, 0.36
+    widths = []
+    for offset in np.linspace(0, spacing, 7, endpoint=False):
+        z = (np.arange(40) - 20) * spacing + offset
+        fine = z[:, None] + np.linspace(-voxel, voxel, 801)
+        weight = 1 - np.abs(fine - z[:, None]) / voxel  # of voxels anywhere, interpolated
+        slab = np.average(np.abs(fine) < thickness / 2, axis=1, weights=weight)
+        values = np.broadcast_to(slab.astype(np.float32), (24, 24, 40))
+        smooth = smooth_body(values, sigma, voxel, spacing)[12, 12]
+        widths.append(np.ptp(CubicSpline(z, smooth - 0.5).roots(extrapolate=False)))
+    assert np.mean(widths) == pytest.approx(thickness, abs=0.006)
 
 
 @pytest.mark.parametrize(

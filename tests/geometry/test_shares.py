@@ -114,6 +114,22 @@ def test_a_tail_label_is_divided_like_the_other_labels_of_the_voxel():
     assert values[5, 5, 2] == pytest.approx(0.2)  # most of the voxel is tail
 
 
+def test_shares_of_a_tail_label_do_not_switch():
+    def part(tail):
+        def shares(full):
+            wall = (2, slice(2, 10), 3)
+            full[SUBICULUM][wall] = 1 - tail
+            return {Tissue.HIPPOCAMPUS: np.where(full[SUBICULUM] == 1 - tail, tail, 0)}
+
+        volume = block(shares)
+        return sheet_share(volume, volume.tissue == SUBICULUM, (SUBICULUM,)).values[2, 5, 3]
+
+    parts = np.array([part(np.float32(tail)) for tail in np.arange(0.3, 0.7, 0.01)])
+    assert parts[0] == pytest.approx(1.0)
+    assert parts[-1] == pytest.approx(0.31)
+    assert np.abs(np.diff(parts)).max() < 0.07  # a switch at a half would make it 0.5
+
+
 def test_labels_decide_what_is_filled_taken_out_and_deep():
     def shares(full):
         share = full[SUBICULUM].copy()
