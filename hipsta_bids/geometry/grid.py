@@ -336,8 +336,8 @@ def smooth_body(
     thickness = np.linspace(0.3, 4.0, 75)
     near, far = (thickness / np.sqrt(times * sigma**2 + voxel**2 / 6) for times in (1, 2))
     raised = ndtr(-far) - 2 * ndtr(-near)
-    seen = thickness / THICKNESS_WINDOW
-    expected = (ndtr(seen) - 0.5) / ((1 + np.exp(-(seen**2) / 2)) / np.sqrt(2 * np.pi))
+    scaled = thickness / THICKNESS_WINDOW
+    expected = (ndtr(scaled) - 0.5) / ((1 + np.exp(-(scaled**2) / 2)) / np.sqrt(2 * np.pi))
     shift = np.interp(ratio, expected, np.maximum(raised, 0))
     return np.asarray(smooth - shift * np.clip(4 * smooth * (1 - smooth), 0, 1), dtype=np.float32)
 
