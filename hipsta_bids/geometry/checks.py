@@ -229,8 +229,12 @@ def check_end_labels(
 
 
 def _check_beyond(volume: types.LabelVolume, body: Body) -> list[Finding]:
-    """Flag ends without head or tail labels at which all labels end."""
+    """Flag ends without head or tail labels at which the labels of the sheet end.
+
+    The dentate gyrus and CA4 end before the sheet does, which closes behind them in the tail.
+    """
     labeled = (volume.tissue > 0) & (volume.tissue <= Tissue.HIPPOCAMPUS)
+    labeled &= ~np.isin(volume.tissue, volume.protocol.interior)
     points = digital.voxel_points(labeled, volume.affine)
     findings = []
     ends = body.ends
