@@ -14,7 +14,7 @@ import numpy as np
 from nibabel.affines import apply_affine
 
 from hipsta_bids.errors import GeometryError
-from hipsta_bids.geometry import catalog, checks, columns
+from hipsta_bids.geometry import catalog, checks, columns, repairs
 from hipsta_bids.geometry.align import align
 from hipsta_bids.geometry.average import average_labels
 from hipsta_bids.geometry.body import Body, check_side, extract_body, relabel_by_mask
@@ -278,9 +278,9 @@ def measure_laid(
     with clock("measures"):
         maps = catalog.measure_maps(measured)
         repaired = repaired_columns(sheet, solid)
+        effect = repairs.measure_effect(sheet, solid, repaired)
         layers, folded_layers = measure.space_layers(sheet, settings)
         overlap = _overlap(body, frame, motion)
-        repairs = [checks.add_consequence(measure.describe_repair(r), sheet) for r in solid.repairs]
         findings = [
             *laid.image,
             *checks.check_image(body),
@@ -291,6 +291,7 @@ def measure_laid(
             *folded_layers,
             *(_of_frame(finding, motion) for finding in measure.find_all(common)),
         ]
+        doubtful = repairs.doubtful_columns(sheet, solid, findings)
         return HemisphereMaps(
             sheet=sheet,
             layers=layers,
@@ -299,6 +300,7 @@ def measure_laid(
             sections=catalog.measure_sections(measured),
             subfield=measured.subfield,
             repaired=repaired,
+            doubtful=doubtful,
             body_mask=volume.in_file(body.inside),
             summary=catalog.summarize(measured, for_region(volume.protocol, body.region).sheet),
             qc={
@@ -312,7 +314,8 @@ def measure_laid(
                 "filled_fraction": 1 - float(sheet.valid.mean()),
                 "regions_outside": "head and tail (as in Diers et al. 2023)",
                 "repaired_fraction": float(repaired.mean()),
-                "repaired_change_mm": checks.change_of_mean(sheet, repaired),
+                **repairs.repair_metrics(solid, body, sheet, effect),
+                "doubtful_fraction": float(doubtful.mean()),
                 "frame": "person",
                 "frame_visits": len(frame.motions),
                 "frame_to_visit": motion.round(6).tolist(),
@@ -320,10 +323,7 @@ def measure_laid(
                 "frame_overlap": overlap,
                 "flag_margins": checks.flag_margins(findings),
             },
-            repairs=(
-                *(f"{finding.text}{checks.consequence_text(finding)}" for finding in repairs),
-                *checks.describe_uncus(body, settings.checks),
-            ),
+            repairs=repairs.list_repairs(solid, body, sheet, effect, settings.checks),
             flags=tuple(checks.raise_flags(findings, sheet, partial(checks.name_place, body=body))),
             mesh=measured.mesh,
             coordinates=measured.coordinates,
@@ -370,7 +370,7 @@ def _of_visit(body: Body, solid: SolidField, settings: Settings) -> list[Finding
     cuts = solid.touched & (solid.field.values < 0)
     step = 2 * body.ends.half_slice
     return [
-        *map(measure.describe_repair, solid.repairs),
+        *map(repairs.describe_repair, solid.repairs),
         *checks.check_cavities(body, settings.checks),
         *checks.check_labels(body, settings.checks),
         *checks.check_cross_sections(solid.field, step, settings.checks, cuts),

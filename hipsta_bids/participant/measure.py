@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from hipsta_bids.errors import GeometryError
-from hipsta_bids.geometry import sheet_checks
+from hipsta_bids.geometry import repairs, sheet_checks
 from hipsta_bids.geometry.body import Body, check_mask, check_side, extract_body
 from hipsta_bids.geometry.boundaries import Boundaries, find_boundaries
 from hipsta_bids.geometry.catalog import (
@@ -24,8 +24,6 @@ from hipsta_bids.geometry.catalog import (
     summarize,
 )
 from hipsta_bids.geometry.checks import (
-    add_consequence,
-    change_of_mean,
     check_cavities,
     check_cross_sections,
     check_end_labels,
@@ -34,8 +32,6 @@ from hipsta_bids.geometry.checks import (
     check_labels,
     check_thickness,
     check_voxels_across,
-    consequence_text,
-    describe_uncus,
     find_contacts,
     flag_margins,
     name_place,
@@ -61,7 +57,7 @@ from hipsta_bids.geometry.sheet import (
     straighten_rows,
     whole_body,
 )
-from hipsta_bids.geometry.topology import Repair, SolidField, repair_topology, repaired_columns
+from hipsta_bids.geometry.topology import SolidField, repair_topology, repaired_columns
 from hipsta_bids.participant.whole import Own, check_fine, measure_whole
 from hipsta_bids.protocols import EXPERIMENTAL
 from hipsta_bids.protocols.load import for_region
@@ -120,6 +116,11 @@ class Evidence(Measured):
     def repaired(self) -> Bool:
         """Columns (Nx, Ny) that a repair touched."""
         return repaired_columns(self.sheet, self.solid)
+
+    @cached_property
+    def effect(self) -> Float:
+        """By how much repairs raise the thickness (Nx, Ny), mm."""
+        return repairs.measure_effect(self.sheet, self.solid, self.repaired)
 
 
 def find_all(evidence: Evidence) -> list[Finding]:
@@ -201,7 +202,7 @@ def find_all(evidence: Evidence) -> list[Finding]:
         ),
     ]
     return [
-        *map(describe_repair, solid.repairs),
+        *map(repairs.describe_repair, solid.repairs),
         *map(_whole, rows),
         *[
             sheet_checks.check_rival(evidence.thickness, *rival, checks)
@@ -218,19 +219,6 @@ def find_all(evidence: Evidence) -> list[Finding]:
         *sheet_checks.check_subfields(sheet, evidence.subfield, checks),
         *sheet_checks.check_ridges(sheet, evidence.thickness, checks),
     ]
-
-
-def describe_repair(repair: Repair) -> Finding:
-    """Return the finding of a repair: its size over the limit."""
-    return Finding(
-        reason="large-repair",
-        value=repair.excess,
-        limit=1.0,
-        text=str(repair),
-        remedy="a large repair, look at the labels there",
-        points=repair.points,
-        placed=True,
-    )
 
 
 def _whole(row: tuple[str, float, float, str, str, Float | float]) -> Finding:
@@ -281,7 +269,7 @@ def quality_metrics(evidence: Evidence) -> dict[str, Any]:
         "thickness_expected_mm": boundaries.sheet_thickness,
         "regions_outside": "head and tail (as in Diers et al. 2023)",
         "repaired_fraction": float(evidence.repaired.mean()),
-        "repaired_change_mm": change_of_mean(evidence.sheet, evidence.repaired),
+        **repairs.repair_metrics(solid, body, evidence.sheet, evidence.effect),
         **({"mask_change": asdict(body.mask_change)} if body.mask_change else {}),
     }
 
@@ -467,12 +455,10 @@ def measure_hemisphere(
     evidence = unfold(volume, hemi, settings, clock)
     sheet = evidence.sheet
     with clock("measures"):
-        repairs = [
-            add_consequence(describe_repair(repair), sheet) for repair in evidence.solid.repairs
-        ]
         layers, folded_layers = space_layers(sheet, settings)
         findings = [*_find(volume, hemi, evidence), *folded_layers]
         maps = measure_maps(evidence)
+        doubtful = repairs.doubtful_columns(sheet, evidence.solid, findings)
         return HemisphereMaps(
             sheet=sheet,
             layers=layers,
@@ -481,12 +467,16 @@ def measure_hemisphere(
             sections=measure_sections(evidence),
             subfield=evidence.subfield,
             repaired=evidence.repaired,
+            doubtful=doubtful,
             body_mask=volume.in_file(evidence.body.inside),
             summary=summarize(evidence, for_region(volume.protocol, region).sheet),
-            qc={**quality_metrics(evidence), "flag_margins": flag_margins(findings)},
-            repairs=(
-                *(f"{finding.text}{consequence_text(finding)}" for finding in repairs),
-                *describe_uncus(evidence.body, settings.checks),
+            qc={
+                **quality_metrics(evidence),
+                "doubtful_fraction": float(doubtful.mean()),
+                "flag_margins": flag_margins(findings),
+            },
+            repairs=repairs.list_repairs(
+                evidence.solid, evidence.body, sheet, evidence.effect, settings.checks
             ),
             flags=_flags(evidence, findings),
             mesh=evidence.mesh,

@@ -163,6 +163,7 @@ def measure_whole(
             sections=catalog.measure_sections(measured),
             subfield=subfield,
             repaired=np.zeros(subfield.shape, dtype=bool),
+            doubtful=np.zeros(subfield.shape, dtype=bool),
             body_mask=volume.in_file(tissue > 0),
             summary=catalog.summarize(measured, volume.protocol.sheet),
             qc={

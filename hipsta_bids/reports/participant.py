@@ -395,7 +395,7 @@ def _sheets(series: Series) -> Mapping[str, Any] | None:
         "pictures": pictures,
         "uncertainty": [_uncertainty(h) for h in uncertain],
         "whole": series.whole,
-        "repaired": any(h.sheet.repaired.any() for h in measured),
+        "doubtful": any(h.sheet.doubtful.any() for h in measured),
         "invalid": any(not h.sheet.valid.all() for h in measured),
     }
 

@@ -1,8 +1,8 @@
 """What a person is told about a hemisphere first: the decision of its record, and what it rests on.
 
 A hemisphere with a flag is one to look at, whatever was repaired. Its headline is the flag with the
-largest consequence: by how much the mean thickness could be off, then the share of the map. What
-repairs touch does not count: it does not go along with errors (docs/quality.md).
+largest consequence: by how much the mean thickness could be off, then the share of the map. Without
+a flag, the headline is what was repaired.
 """
 
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ import numpy as np
 
 from hipsta_bids.reports.page import number, read_table
 from hipsta_bids.reports.results import Finding, Hemisphere
-from hipsta_bids.types import Decision
+from hipsta_bids.types import REPAIR_EFFECT, Decision
 
 #: How a person rates a hemisphere, in the order of the keys 1, 2, 3; the last leaves it out.
 RATINGS = ("use", "unsure", "exclude")
@@ -19,6 +19,20 @@ RATINGS = ("use", "unsure", "exclude")
 #: Flags about volumes that were sampled besides.
 _BESIDES = ("map-outside", "map-unusable", "roi-unusable")
 
+#: What repairs do, and their kinds (:class:`Repair`): a single one, and several.
+_REPAIRS = {
+    "filled": {
+        "cavity": ("1 gap", "gaps"),
+        "slit": ("1 slit", "slits"),
+        "fill": ("1 hole", "holes"),
+    },
+    "cut": {"cut": ("1 bridge", "bridges")},
+    "parted": {"part": ("1 contact of turns", "contacts of turns")},
+    "removed": {"island": ("1 separate piece", "separate pieces")},
+    "excluded": {"uncus": ("the uncus", "pieces of the uncus")},
+}
+
+_SOUND = "No check raised a flag, and no label was repaired."
 _ROUNDING = 0.005
 """mm; means that differ by less read the same."""
 
@@ -79,24 +93,45 @@ def verdict_of(hemisphere: Hemisphere) -> Verdict:
         )
     return Verdict(
         decision=decision,
-        reason="No check found anything to look at.",
+        reason=_repairs(hemisphere),
         consequence=_of_repairs(hemisphere),
         advice="",
     )
 
 
+def _repairs(hemisphere: Hemisphere) -> str:
+    """Write how many repairs of each kind there were."""
+    kinds = hemisphere.metrics.get("repair_kinds") or {}
+    actions = []
+    for action, nouns in _REPAIRS.items():
+        counts = [(kinds[kind], *names) for kind, names in nouns.items() if kind in kinds]
+        if counts:
+            listed = [f"{n} {plural}" if n > 1 else single for n, single, plural in counts]
+            *first, last = listed
+            start = f"{', '.join(first)} and " if first else ""
+            actions.append(f"{start}{last} {action}")
+    return f"Labels were repaired: {', '.join(actions)}." if actions else _SOUND
+
+
 def _of_repairs(hemisphere: Hemisphere) -> str:
-    """Write how much of the map repairs touch; that they do is no sign that it is wrong."""
-    count = len(hemisphere.record.get("repairs") or [])
-    if not count:
-        return "No label was repaired."
-    share, change = (
-        number(hemisphere.metrics, key) for key in ("repaired_fraction", "repaired_change_mm")
+    """Write how much of the map depends on repairs, and by how much the mean thickness does."""
+    keys = ("repaired_fraction", "repaired_change_mm", "doubtful_fraction")
+    share, change, hatched = (number(hemisphere.metrics, key) for key in keys)
+    if not share > 0:
+        return "The map does not depend on it." if hemisphere.record.get("repairs") else ""
+    mean = hemisphere.summary.get("thickness_mean", np.nan)
+    before, after = f"{mean - change:.2f}", f"{mean:.2f}"
+    effect = f"{before} instead of {after} mm" if before != after else f"the same, {after} mm"
+    look = (
+        f"Hatched: {hatched:.1%} of the map, where thickness at a repair is over"
+        f" {REPAIR_EFFECT:g} mm off its neighbors."
+        if hatched > 0
+        else "Nothing is hatched: thickness at repairs agrees with its neighbors, and filled gaps"
+        " have a rule."
     )
-    mean = hemisphere.summary.get("thickness_mean", np.nan) - change
     return (
-        f"{count} repair{'s' if count > 1 else ''} of the labels, {share:.1%} of the map; "
-        f"with values of the neighbors, the mean would be {mean:.2f} mm."
+        f"Repairs touch {share:.1%} of the map; without repairs, the mean thickness"
+        f" would be {effect}. {look}"
     )
 
 

@@ -47,8 +47,10 @@ def make_solid(*, added=(), removed=(), stumps=()):
             touched[node] = change
     return SolidField(
         field=Field(grid=grid, values=values),
+        before=Field(grid=grid, values=values),
         repairs=(),
         touched=touched,
+        gaps=np.zeros_like(touched),
         euler_before=1,
         euler_after=1,
         changed_fraction=0.0,

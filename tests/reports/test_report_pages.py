@@ -60,7 +60,10 @@ def test_decisions_are_said_with_what_to_do(out):
     assert [title for page in verdicts for title, _ in page] == [
         *("Use", "Use", "Look before use", "Do not use")
     ]
-    assert [reason for _, reason in verdicts[0]] == 2 * ["No check found anything to look at."]
+    assert [reason for _, reason in verdicts[0]] == [
+        "No check raised a flag, and no label was repaired.",
+        "Labels were repaired: 1 bridge cut.",
+    ]
     assert verdicts[1][1][1].startswith("The body is interrupted at RAS")
     assert "the body is interrupted at RAS" in second
     assert "fill in missing slices" in second
@@ -244,7 +247,7 @@ def test_a_section_that_fails_costs_itself_only(out, monkeypatch, caplog):
     monkeypatch.setattr(participant_module, "SECTIONS", (broken, *participant_module.SECTIONS))
     text = participant_page(out, "01", None, read_cohort(out))
     assert "ZeroDivisionError: by zero" in text
-    assert "No check found anything to look at." in text
+    assert "no label was repaired." in text
     assert "section x" in caplog.text
 
 
