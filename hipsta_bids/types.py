@@ -232,10 +232,8 @@ FAMILY = {
     "hemispheres": ("measure", "contrast"),
     "all": ("contrast",),
 }
-
-
-#: Columns at a repair are hatched if thickness differs by more, mm, from its neighbors.
-REPAIR_EFFECT = 0.05
+#: Columns at a repair are hatched if thickness is farther off its neighbors, mm.
+HATCHED_FROM = 0.05
 
 
 class Decision(StrEnum):

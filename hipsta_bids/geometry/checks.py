@@ -32,9 +32,6 @@ from hipsta_bids.types import Bool, Finding, Flag, Float, Sheet
 #: A flag concerns the columns within this distance of what was found, mm.
 FLAG_REACH = 1.0
 
-_NEGLIGIBLE = 0.005
-"""mm; means that differ by less read the same."""
-
 #: A cut this near, mm, to both the subiculum and CA2 or CA3 severs but turns that touch.
 CONTACT_REACH = 1.2
 #: Probabilities that contradict this share of the body's voxels, away from its border, are flagged.
@@ -463,8 +460,7 @@ def raise_flags(
             flags.append(
                 Flag(
                     reason=finding.reason,
-                    message=f"{finding.text}{location}: {finding.remedy}"
-                    + consequence_text(consequence),
+                    message=f"{finding.text}{location}: {finding.remedy}",
                     value=float(finding.value),
                     limit=float(finding.limit),
                     points=finding.points,
@@ -528,20 +524,3 @@ def _grid_laplace(shape: tuple[int, int]) -> sparse.csr_array:
     edges = sparse.coo_array((np.ones(first.size), (first, second)), shape=(number.size,) * 2)
     weights = (edges + edges.T).tocsr()
     return sparse.csr_array(sparse.diags_array(weights.sum(axis=1)) - weights)
-
-
-def consequence_text(finding: Finding) -> str:
-    """Write what a finding means for the map, to follow its message; empty if that is unknown."""
-    if np.isnan(finding.share):
-        return ""
-    if finding.share == 0:
-        return "; no measured column lies near"
-    extent = "all columns" if finding.share == 1 else f"{finding.share:.1%} of the columns"
-    if np.isnan(finding.change):
-        return f"; it concerns {extent}"
-    if abs(finding.change) < _NEGLIGIBLE:
-        return f"; it concerns {extent} and does not change the mean thickness"
-    change = f"{abs(finding.change):.2f} mm {'less' if finding.change > 0 else 'more'}"
-    if finding.share == 1:
-        return f"; it concerns all columns, the mean thickness may be {change}"
-    return f"; it concerns {extent}: with values of the neighbors, the mean would be {change}"

@@ -81,12 +81,6 @@ def find_walls(sheet: Sheet, motion: Float, field: Field) -> Walls:
     return walls
 
 
-def lengths_inside(sheet: Sheet, field: Field) -> Float:
-    """Measure the lengths (Nx, Ny) of columns inside a body, mm; NaN where one has no wall."""
-    low, high = np.moveaxis(_ends_inside(sheet, np.eye(4), field), -1, 0)
-    return np.asarray(high - low + _length(sheet))
-
-
 def find_edges(whole: Sheet, motion: Float, field: Field) -> Float:
     """Find where rows of the mid-surface of a sheet from edge to edge leave the body.
 

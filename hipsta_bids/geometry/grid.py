@@ -176,10 +176,7 @@ def resample_body(body: Body, hemi: str, settings: GridSettings, slices: SliceSe
 
 
 def before_mending(field: Field) -> Field:
-    """Undo in a field the filling and parting of labels.
-
-    Smoothing is linear, but for a small correction (``smooth_body``).
-    """
+    """Undo the filling and parting of labels; smoothing is linear, but for a small correction."""
     values = field.values
     for nodes, sign in ((field.slits, 1), (field.cavities, 1), (field.separated, -1)):
         if nodes is not None and nodes.any():

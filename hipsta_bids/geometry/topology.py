@@ -88,8 +88,6 @@ class SolidField:
     """Changes that were made, in their order."""
     touched: Bool
     """(A, B, W) nodes whose side was changed."""
-    gaps: Bool
-    """(A, B, W) nodes of cavities that were filled."""
     euler_before: int
     """Euler number of the body's voxels before the repairs; 1 is right."""
     euler_after: int
@@ -165,7 +163,6 @@ def repair_topology(
         before=field,
         repairs=repairs,
         touched=touched,
-        gaps=_gaps_in(state.shape, edits),
         euler_before=euler_before,
         euler_after=membranes.euler(state),
         changed_fraction=float(np.count_nonzero(changed) / size),
@@ -203,15 +200,6 @@ def _changes(field: Field, after: Bool, edits: Sequence[membranes.Edit]) -> tupl
         if nodes is not None:
             touched |= nodes
     return changed, touched
-
-
-def _gaps_in(shape: tuple[int, ...], edits: Sequence[membranes.Edit]) -> Bool:
-    """Mark the nodes (A, B, W) of cavities that were filled, on a padded grid of a shape."""
-    nodes = np.zeros(shape, dtype=bool)
-    for edit in edits:
-        if edit.kind == "cavity":
-            nodes[tuple(edit.nodes.T)] = True
-    return nodes[membranes.INNER]
 
 
 def _before_smoothing(field: Field) -> list[membranes.Edit]:

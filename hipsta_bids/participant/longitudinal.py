@@ -278,7 +278,6 @@ def measure_laid(
     with clock("measures"):
         maps = catalog.measure_maps(measured)
         repaired = repaired_columns(sheet, solid)
-        effect = repairs.measure_effect(sheet, solid, repaired)
         layers, folded_layers = measure.space_layers(sheet, settings)
         overlap = _overlap(body, frame, motion)
         findings = [
@@ -313,8 +312,7 @@ def measure_laid(
                 "filled_columns": int(np.count_nonzero(~sheet.valid)),
                 "filled_fraction": 1 - float(sheet.valid.mean()),
                 "regions_outside": "head and tail (as in Diers et al. 2023)",
-                "repaired_fraction": float(repaired.mean()),
-                **repairs.repair_metrics(solid, body, sheet, effect),
+                **repairs.repair_metrics(sheet, solid, repaired, body),
                 "doubtful_fraction": float(doubtful.mean()),
                 "frame": "person",
                 "frame_visits": len(frame.motions),
@@ -323,7 +321,7 @@ def measure_laid(
                 "frame_overlap": overlap,
                 "flag_margins": checks.flag_margins(findings),
             },
-            repairs=repairs.list_repairs(solid, body, sheet, effect, settings.checks),
+            repairs=(*map(str, solid.repairs), *checks.describe_uncus(body, settings.checks)),
             flags=tuple(checks.raise_flags(findings, sheet, partial(checks.name_place, body=body))),
             mesh=measured.mesh,
             coordinates=measured.coordinates,
@@ -370,7 +368,7 @@ def _of_visit(body: Body, solid: SolidField, settings: Settings) -> list[Finding
     cuts = solid.touched & (solid.field.values < 0)
     step = 2 * body.ends.half_slice
     return [
-        *map(repairs.describe_repair, solid.repairs),
+        *map(measure.describe_repair, solid.repairs),
         *checks.check_cavities(body, settings.checks),
         *checks.check_labels(body, settings.checks),
         *checks.check_cross_sections(solid.field, step, settings.checks, cuts),

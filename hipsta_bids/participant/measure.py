@@ -32,6 +32,7 @@ from hipsta_bids.geometry.checks import (
     check_labels,
     check_thickness,
     check_voxels_across,
+    describe_uncus,
     find_contacts,
     flag_margins,
     name_place,
@@ -57,7 +58,7 @@ from hipsta_bids.geometry.sheet import (
     straighten_rows,
     whole_body,
 )
-from hipsta_bids.geometry.topology import SolidField, repair_topology, repaired_columns
+from hipsta_bids.geometry.topology import Repair, SolidField, repair_topology, repaired_columns
 from hipsta_bids.participant.whole import Own, check_fine, measure_whole
 from hipsta_bids.protocols import EXPERIMENTAL
 from hipsta_bids.protocols.load import for_region
@@ -116,11 +117,6 @@ class Evidence(Measured):
     def repaired(self) -> Bool:
         """Columns (Nx, Ny) that a repair touched."""
         return repaired_columns(self.sheet, self.solid)
-
-    @cached_property
-    def effect(self) -> Float:
-        """By how much repairs raise the thickness (Nx, Ny), mm."""
-        return repairs.measure_effect(self.sheet, self.solid, self.repaired)
 
 
 def find_all(evidence: Evidence) -> list[Finding]:
@@ -202,7 +198,7 @@ def find_all(evidence: Evidence) -> list[Finding]:
         ),
     ]
     return [
-        *map(repairs.describe_repair, solid.repairs),
+        *map(describe_repair, solid.repairs),
         *map(_whole, rows),
         *[
             sheet_checks.check_rival(evidence.thickness, *rival, checks)
@@ -219,6 +215,19 @@ def find_all(evidence: Evidence) -> list[Finding]:
         *sheet_checks.check_subfields(sheet, evidence.subfield, checks),
         *sheet_checks.check_ridges(sheet, evidence.thickness, checks),
     ]
+
+
+def describe_repair(repair: Repair) -> Finding:
+    """Return the finding of a repair: its size over the limit."""
+    return Finding(
+        reason="large-repair",
+        value=repair.excess,
+        limit=1.0,
+        text=str(repair),
+        remedy="a large repair, look at the labels there",
+        points=repair.points,
+        placed=True,
+    )
 
 
 def _whole(row: tuple[str, float, float, str, str, Float | float]) -> Finding:
@@ -268,8 +277,7 @@ def quality_metrics(evidence: Evidence) -> dict[str, Any]:
         "filled_fraction": float(1 - valid.mean()),
         "thickness_expected_mm": boundaries.sheet_thickness,
         "regions_outside": "head and tail (as in Diers et al. 2023)",
-        "repaired_fraction": float(evidence.repaired.mean()),
-        **repairs.repair_metrics(solid, body, evidence.sheet, evidence.effect),
+        **repairs.repair_metrics(evidence.sheet, solid, evidence.repaired, body),
         **({"mask_change": asdict(body.mask_change)} if body.mask_change else {}),
     }
 
@@ -475,8 +483,9 @@ def measure_hemisphere(
                 "doubtful_fraction": float(doubtful.mean()),
                 "flag_margins": flag_margins(findings),
             },
-            repairs=repairs.list_repairs(
-                evidence.solid, evidence.body, sheet, evidence.effect, settings.checks
+            repairs=(
+                *map(str, evidence.solid.repairs),
+                *describe_uncus(evidence.body, settings.checks),
             ),
             flags=_flags(evidence, findings),
             mesh=evidence.mesh,

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from hipsta_bids.protocols.protocol import Part, Protocol
-from hipsta_bids.types import REPAIR_EFFECT, Float
+from hipsta_bids.types import HATCHED_FROM, Float
 
 #: How every unfolded map lies, of either hemisphere.
 ORIENTATION = (
@@ -16,10 +16,7 @@ ORIENTATION = (
     " anterior above."
 )
 #: What oblique hatching means on unfolded maps.
-HATCHING = (
-    "near a flag, or at a repair (no filled gap) if thickness is over"
-    f" {REPAIR_EFFECT:g} mm off its neighbors"
-)
+HATCHING = f"near a flag, or a repair (no filled gap) {HATCHED_FROM:g} mm off its neighbors"
 #: Both ends of the axes of unfolded maps: of x to the right, and of y upward.
 X_ENDS, Y_ENDS = ("medial", "lateral"), ("posterior", "anterior")
 

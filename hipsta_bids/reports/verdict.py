@@ -11,7 +11,7 @@ import numpy as np
 
 from hipsta_bids.reports.page import number, read_table
 from hipsta_bids.reports.results import Finding, Hemisphere
-from hipsta_bids.types import REPAIR_EFFECT, Decision
+from hipsta_bids.types import Decision
 
 #: How a person rates a hemisphere, in the order of the keys 1, 2, 3; the last leaves it out.
 RATINGS = ("use", "unsure", "exclude")
@@ -19,17 +19,15 @@ RATINGS = ("use", "unsure", "exclude")
 #: Flags about volumes that were sampled besides.
 _BESIDES = ("map-outside", "map-unusable", "roi-unusable")
 
-#: What repairs do, and their kinds (:class:`Repair`): a single one, and several.
+#: Repairs by their kinds (:class:`Repair`).
 _REPAIRS = {
-    "filled": {
-        "cavity": ("1 gap", "gaps"),
-        "slit": ("1 slit", "slits"),
-        "fill": ("1 hole", "holes"),
-    },
-    "cut": {"cut": ("1 bridge", "bridges")},
-    "parted": {"part": ("1 contact of turns", "contacts of turns")},
-    "removed": {"island": ("1 separate piece", "separate pieces")},
-    "excluded": {"uncus": ("the uncus", "pieces of the uncus")},
+    "cavity": "gaps filled",
+    "slit": "slits filled",
+    "fill": "holes filled",
+    "cut": "bridges cut",
+    "part": "touching turns parted",
+    "island": "separate pieces removed",
+    "uncus": "uncus excluded",
 }
 
 _SOUND = "No check raised a flag, and no label was repaired."
@@ -85,8 +83,8 @@ def verdict_of(hemisphere: Hemisphere) -> Verdict:
         finding = hemisphere.findings[0]
         return Verdict(
             decision=decision,
-            reason=_sentence(finding.message.split("; it concerns")[0]),
-            consequence=_of_flag(hemisphere, finding),
+            reason=_sentence(finding.message),
+            consequence=of_flag(hemisphere, finding),
             advice="Look at the numbered places; then use it, correct the labels, or exclude it.",
             change=finding.change,
             share=finding.share,
@@ -102,15 +100,8 @@ def verdict_of(hemisphere: Hemisphere) -> Verdict:
 def _repairs(hemisphere: Hemisphere) -> str:
     """Write how many repairs of each kind there were."""
     kinds = hemisphere.metrics.get("repair_kinds") or {}
-    actions = []
-    for action, nouns in _REPAIRS.items():
-        counts = [(kinds[kind], *names) for kind, names in nouns.items() if kind in kinds]
-        if counts:
-            listed = [f"{n} {plural}" if n > 1 else single for n, single, plural in counts]
-            *first, last = listed
-            start = f"{', '.join(first)} and " if first else ""
-            actions.append(f"{start}{last} {action}")
-    return f"Labels were repaired: {', '.join(actions)}." if actions else _SOUND
+    counts = [f"{text} ({kinds[kind]})" for kind, text in _REPAIRS.items() if kind in kinds]
+    return f"Labels were repaired: {', '.join(counts)}." if counts else _SOUND
 
 
 def _of_repairs(hemisphere: Hemisphere) -> str:
@@ -118,24 +109,17 @@ def _of_repairs(hemisphere: Hemisphere) -> str:
     keys = ("repaired_fraction", "repaired_change_mm", "doubtful_fraction")
     share, change, hatched = (number(hemisphere.metrics, key) for key in keys)
     if not share > 0:
-        return "The map does not depend on it." if hemisphere.record.get("repairs") else ""
+        return ""
     mean = hemisphere.summary.get("thickness_mean", np.nan)
-    before, after = f"{mean - change:.2f}", f"{mean:.2f}"
-    effect = f"{before} instead of {after} mm" if before != after else f"the same, {after} mm"
-    look = (
-        f"Hatched: {hatched:.1%} of the map, where thickness at a repair is over"
-        f" {REPAIR_EFFECT:g} mm off its neighbors."
-        if hatched > 0
-        else "Nothing is hatched: thickness at repairs agrees with its neighbors, and filled gaps"
-        " have a rule."
-    )
+    before, after = f"{mean - change:.2f}", f"{mean:.2f} mm"
     return (
-        f"Repairs touch {share:.1%} of the map; without repairs, the mean thickness"
-        f" would be {effect}. {look}"
+        f"Repairs touch {share:.1%} of the map; without repairs, the mean thickness would be "
+        f"{f'{before} instead of' if f'{before} mm' != after else 'the same,'} {after}. "
+        f"{f'{hatched:.1%} of the map is' if hatched else 'Nothing is'} hatched as doubtful."
     )
 
 
-def _of_flag(hemisphere: Hemisphere, finding: Finding) -> str:
+def of_flag(hemisphere: Hemisphere, finding: Finding) -> str:
     """Write what a flag may do to the map."""
     if finding.reason in _BESIDES:
         return "Thickness and shape do not depend on it."

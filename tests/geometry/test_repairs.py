@@ -1,6 +1,7 @@
 """What repairs do to thickness, on plates of which it is known."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from test_columns import BENT, HIGH, LOW, at, flat_sheet, plate_field
 
 from hipsta_bids.geometry.grid import Field, _smooth, before_mending
 from hipsta_bids.geometry.measures import column_area
-from hipsta_bids.geometry.repairs import doubtful_columns, mean_effect, measure_effect
+from hipsta_bids.geometry.repairs import doubtful_columns, repair_metrics
 from hipsta_bids.geometry.topology import SolidField, repaired_columns
 from hipsta_bids.types import Finding
 
@@ -17,13 +18,12 @@ DENT = 0.4  # mm
 
 
 def solid_of(before, touched, gaps=None):
-    """A plate whose labels were ``before``, repaired at nodes."""
+    """A plate whose labels were ``before``, repaired at nodes, and had gaps at nodes."""
     return SolidField(
-        field=plate_field(at(LOW), at(HIGH)),
+        field=replace(plate_field(at(LOW), at(HIGH)), cavities=gaps),
         before=before,
         repairs=(),
         touched=touched,
-        gaps=np.zeros_like(touched) if gaps is None else gaps,
         euler_before=1,
         euler_after=1,
         changed_fraction=0.0,
@@ -41,13 +41,14 @@ def test_a_filled_dent_raises_the_mean_by_its_depth_and_share():
     far = y > 11  # the dent has a slope
     solid = solid_of(before, np.ones(before.values.shape, dtype=bool))
     share = column_area(sheet)[far].sum() / column_area(sheet).sum()
+    body = SimpleNamespace(uncus=())
+    metrics = repair_metrics(sheet, solid, far, body)
     # The spline rounds the corner of the dent.
-    effect = measure_effect(sheet, solid, far)
-    assert (effect[~far] == 0).all()
-    assert np.abs(effect[far] - DENT).max() < 0.5 * DENT
-    assert mean_effect(sheet, effect) == pytest.approx(DENT * share, abs=BENT)
-    assert measure_effect(sheet, solid, y < 9) == pytest.approx(0, abs=BENT)
-    assert not measure_effect(sheet, solid, np.zeros_like(far)).any()
+    assert metrics["repaired_change_mm"] == pytest.approx(DENT * share, abs=BENT)
+    assert metrics["repaired_fraction"] == far.mean()
+    near = repair_metrics(sheet, solid, y < 9, body)
+    assert near["repaired_change_mm"] == pytest.approx(0, abs=BENT / 4)
+    assert repair_metrics(sheet, solid, np.zeros_like(far), body)["repaired_change_mm"] == 0
 
 
 def test_a_stump_is_doubtful_and_a_filled_gap_is_not():

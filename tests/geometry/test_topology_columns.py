@@ -50,7 +50,6 @@ def make_solid(*, added=(), removed=(), stumps=()):
         before=Field(grid=grid, values=values),
         repairs=(),
         touched=touched,
-        gaps=np.zeros_like(touched),
         euler_before=1,
         euler_after=1,
         changed_fraction=0.0,

@@ -46,12 +46,11 @@ def test_repairs_are_the_headline_of_what_can_be_used(out):
     assert 0 < hatched <= share
     mean, change = found.summary["thickness_mean"], found.metrics["repaired_change_mm"]
     verdict = verdict_of(found)
-    assert verdict.reason == "Labels were repaired: 1 bridge cut."
+    assert verdict.reason == "Labels were repaired: bridges cut (1)."
     assert abs(change) < 0.005  # a stump is left
     assert verdict.consequence == (
         f"Repairs touch {share:.1%} of the map; without repairs, the mean thickness would be"
-        f" the same, {mean:.2f} mm. Hatched: {hatched:.1%} of the map, where thickness at a repair"
-        " is over 0.05 mm off its neighbors."
+        f" the same, {mean:.2f} mm. {hatched:.1%} of the map is hatched as doubtful."
     )
     sound = verdict_of(hemisphere(out, "01", "L"))
     assert (sound.reason, sound.consequence) == (
@@ -70,25 +69,27 @@ def test_filled_gaps_have_a_rule(out):
     }
     verdict = verdict_of(changed(found, metrics=metrics))
     assert verdict.reason == (
-        "Labels were repaired: 9 gaps, 2 slits and 1 hole filled, the uncus excluded."
+        "Labels were repaired: gaps filled (9), slits filled (2), holes filled (1), uncus"
+        " excluded (1)."
     )
     mean = found.summary["thickness_mean"]
     assert verdict.consequence == (
         "Repairs touch 41.3% of the map; without repairs, the mean thickness would be"
-        f" {mean - 0.06:.2f} instead of {mean:.2f} mm. Nothing is hatched: thickness at repairs"
-        " agrees with its neighbors, and filled gaps have a rule."
+        f" {mean - 0.06:.2f} instead of {mean:.2f} mm. Nothing is hatched as doubtful."
     )
-    none = metrics | {"repair_kinds": {"uncus": 1}, "repaired_fraction": 0.0}
-    verdict = verdict_of(changed(found, metrics=none))
-    assert verdict.reason == "Labels were repaired: the uncus excluded."
-    assert verdict.consequence == "The map does not depend on it."
+    beside = metrics | {"repair_kinds": {"uncus": 1}, "repaired_fraction": 0.0}
+    verdict = verdict_of(changed(found, metrics=beside))
+    assert (verdict.reason, verdict.consequence) == (
+        "Labels were repaired: uncus excluded (1).",
+        "",
+    )
 
 
 def test_a_flag_decides_whatever_was_repaired(out):
     found = hemisphere(out, "01", "R")
     mean = found.summary["thickness_mean"]
     flags = [
-        flag("edge-notch", "a notch near RAS 1 2 3 mm: look; it concerns 20%", 0.2, -0.05),
+        flag("edge-notch", "a notch near RAS 1 2 3 mm: look", 0.2, -0.05),
         flag("noisy-labels", "noise: look", None, None),
     ]
     verdict = verdict_of(changed(found, decision="look", flags=flags))
