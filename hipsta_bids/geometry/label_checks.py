@@ -114,7 +114,7 @@ def naming_causes(volume: LabelVolume) -> Iterator[None]:
         causes = [f"{found.text} ({found.remedy}); " for found in whole if found.raised]
         sides = border_sides(hippocampal_voxels(volume), volume.affine)
         if sides and error.reason not in _UNCUT:
-            remedy = "use a larger or uncropped image if it cuts them"
+            remedy = "if it cuts them, use a larger image"
             causes.append(f"the labels touch the {sides} border of the image ({remedy}); ")
         raise GeometryError("".join([*causes, str(error)]), reason=error.reason) from error
 

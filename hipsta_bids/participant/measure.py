@@ -131,8 +131,8 @@ def find_all(evidence: Evidence) -> list[Finding]:
             "ends-uncertain",
             uncertainty,
             checks.flag_end,
-            f"the {end} end, which has no label, is certain to {uncertainty:.1f} mm only",
-            "check it",
+            f"the {end} end has no label and is uncertain by {uncertainty:.1f} mm",
+            "check the end plane, or place it by hand (--ends)",
             middle[:, row],
         )
         for end, uncertainty, row in (
@@ -177,7 +177,7 @@ def find_all(evidence: Evidence) -> list[Finding]:
             else 0.0,
             checks.flag_bending,
             f"dentate gyrus labels lie on the outer side of the bend ({evidence.bending:.1f} rad)",
-            "look at which wall is called interior; thickness does not depend on it",
+            "check which wall is interior; thickness does not depend on it",
             1.0,
         ),
         (
@@ -224,7 +224,7 @@ def describe_repair(repair: Repair) -> Finding:
         value=repair.excess,
         limit=1.0,
         text=str(repair),
-        remedy="a large repair, look at the labels there",
+        remedy="the repair is large, check the labels there",
         points=repair.points,
         placed=True,
     )

@@ -259,8 +259,8 @@ def test_a_hole_is_filled_and_reported(plain, damage):
     maps = measure(damage.erase(where))
     assert maps.decision == Decision.USE
     # Beside the dentate gyrus it is a cavity, where the sheet goes round it.
-    (repair,) = [text for text in maps.repairs if not text.startswith("filled a cavity")]
-    assert repair.startswith("filled a hole")
+    (repair,) = [text for text in maps.repairs if not text.startswith("a gap of")]
+    assert repair.startswith("a hole of")
     place = np.array(repair.split("RAS ")[1].split()[:3], dtype=float)
     true = plain.phantom.body.place(0.5, 0.5, 0.0)
     assert np.linalg.norm(place - true) < 1.2  # mm, about half the thickness: it says where to look
@@ -273,7 +273,7 @@ def test_a_bridge_is_cut_and_reported(plain, damage):
     maps = measure(damage.relabel(where, Tissue.CA1))
     assert maps.decision == Decision.USE
     (repair,) = maps.repairs
-    assert repair.startswith("cut a bridge")
+    assert repair.startswith("a bridge of")
     assert maps.qc["euler_before"] == 0
     assert_only_local_change(plain, maps, points=12)
 
@@ -283,7 +283,7 @@ def test_an_island_is_removed_and_reported(plain, damage):
     maps = measure(damage.relabel(where, Tissue.CA1))
     assert maps.decision == Decision.USE
     (repair,) = maps.repairs
-    assert repair.startswith("removed a separate piece")
+    assert repair.startswith("a separate piece of")
     assert_only_local_change(plain, maps, points=0)
 
 
