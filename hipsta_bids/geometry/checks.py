@@ -230,7 +230,8 @@ def _check_beyond(volume: types.LabelVolume, body: Body) -> list[Finding]:
     The dentate gyrus and CA4 end before the sheet does, which closes behind them in the tail.
     """
     labeled = (volume.tissue > 0) & (volume.tissue <= Tissue.HIPPOCAMPUS)
-    labeled &= ~np.isin(volume.tissue, volume.protocol.interior)
+    protocol = volume.protocol
+    labeled &= ~np.isin(volume.tissue, list({*protocol.interior} - {*protocol.layer}))
     points = digital.voxel_points(labeled, volume.affine)
     findings = []
     ends = body.ends
