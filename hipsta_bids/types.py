@@ -232,6 +232,8 @@ FAMILY = {
     "hemispheres": ("measure", "contrast"),
     "all": ("contrast",),
 }
+#: Columns at a repair are hatched if thickness is farther off its neighbors, mm.
+HATCHED_FROM = 0.05
 
 
 class Decision(StrEnum):
@@ -331,6 +333,8 @@ class HemisphereMaps:
     """(Nx, Ny) values of Tissue."""
     repaired: Bool
     """(Nx, Ny) columns that a repair of the topology touched."""
+    doubtful: Bool
+    """(Nx, Ny) columns near a flag, or of odd thickness at a repair that is no filled gap."""
     body_mask: BodyMask
     """Measured body, on the grid of the labels' file."""
     summary: Mapping[str, float]
@@ -355,6 +359,7 @@ class HemisphereMaps:
             )
         _set(self, "subfield", np.uint8, shape)
         _set(self, "repaired", np.bool_, shape)
+        _set(self, "doubtful", np.bool_, shape)
         ordered = sorted(self.flags, key=lambda flag: flag.consequence, reverse=True)
         object.__setattr__(self, "flags", tuple(ordered))
 

@@ -77,6 +77,7 @@ def make_maps(*, hemi="L", flags=(), repairs=(), holes=(), repaired=()):
         sections={row.name: np.arange(NY) + k for k, row in enumerate(SECTIONS)},
         subfield=subfield,
         repaired=touched,
+        doubtful=touched,
         body_mask=BodyMask(
             inside=np.eye(3)[None] > 0,
             start=(1, 0, 2),

@@ -109,7 +109,7 @@ def measure_trial(trial: Trial) -> Outcome:
         same_plane=_same_plane(volume, hemi, maps) if kind == "ragged-end" else 0.0,
         moved=_moved(reference.qc["posterior_plane"], maps.qc["posterior_plane"]),
         found=found.get(kind, maps.qc["cavities_mm3"]),
-        warned=any("does the head begin there" in repair for repair in maps.repairs),
+        warned=any("where the head begins" in repair for repair in maps.repairs),
     )
 
 

@@ -85,8 +85,8 @@ def load(out_dir: str | Path, *, protocol: str | None = None, region: str = "bod
     Returns
     -------
     Results
-        ``maps``: every map of the sheet, ``subfield``, ``valid``, ``repaired`` and ``position``
-        (RAS mm of the mid-surface); where they were made, SDs of perturbed copies
+        ``maps``: every map of the sheet, ``subfield``, ``valid``, ``repaired``, ``doubtful`` and
+        ``position`` (RAS mm of the mid-surface); where they were made, SDs of perturbed copies
         (``thickness_sd``) and maps of other volumes, by their names; by protocol, participant
         (``sub-01``), session (``ses-1``; ``n/a`` in datasets without), side (``L``, ``R``), x and
         y (-1 to 1 in the body), with units; NaN where there is no map. ``decision`` has
@@ -170,7 +170,12 @@ def _lazy_dataset(root: Path, hemispheres: list[Hemisphere], table: pd.DataFrame
         return read_sheet(path, (name,), shape=shape)[name]
 
     def variable(name: str) -> tuple[tuple[str, ...], Any, Mapping[str, str]]:
-        kind = {"subfield": np.object_, "valid": np.bool_, "repaired": np.bool_}
+        kind = {
+            "subfield": np.object_,
+            "valid": np.bool_,
+            "repaired": np.bool_,
+            "doubtful": np.bool_,
+        }
         last = ("ras",) if name == "position" else ()
         inner = (*shape, *(len(POSITION) for _ in last))
         values = read_later(outer, inner, kind.get(name, np.float64), partial(read, name))

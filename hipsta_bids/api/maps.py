@@ -239,6 +239,7 @@ class Measurement:
             subfield=self.subfield,
             valid=sheet.valid,
             repaired=self.hemisphere.repaired,
+            doubtful=self.hemisphere.doubtful,
             points={"midthickness": sheet.points[:, :, sheet.middle]},
             ends=body_ends(self.settings.body.region, sheet.valid.shape[1]),
         )
@@ -256,7 +257,8 @@ class Measurement:
         sheet, layers = self.hemisphere.sheet, self.hemisphere.layers
         nz = sheet.points.shape[2]
         grid = ("x", "y")
-        state = {"subfield": self.subfield, "valid": sheet.valid, "repaired": self.table.repaired}
+        state = {"subfield": self.subfield, "valid": sheet.valid}
+        state |= {name: getattr(self.table, name) for name in ("repaired", "doubtful")}
         variables: dict[str, Variable] = {
             row.name: (grid, self.maps[row.name], attributes(row.name)) for row in MAPS
         }

@@ -41,8 +41,8 @@ def plot_sheet(
 ) -> "Axes":
     """Draw a map on the unfolded sheet, with borders and names of subfields.
 
-    Maps of both sides lie alike: medial left, lateral right, anterior up. Columns that were
-    repaired are hatched; columns filled from their neighbors are crossed.
+    Maps of both sides lie alike: medial left, lateral right, anterior up. Doubtful
+    columns are hatched; columns filled from their neighbors are crossed.
 
     Parameters
     ----------
@@ -318,6 +318,7 @@ def _bare_sheet(
         subfield=state.get("subfield", np.full(shape, "")).astype(np.str_),
         valid=state.get("valid", np.ones(shape)).astype(np.bool_),
         repaired=state.get("repaired", np.zeros(shape)).astype(np.bool_),
+        doubtful=state.get("doubtful", np.zeros(shape)).astype(np.bool_),
         points={},
         ends=ends,
     )

@@ -86,6 +86,7 @@ def _write_sheet(result: ResultPlace, maps: HemisphereMaps, protocol: Protocol) 
         "subfield": [short.get(code, files.MISSING) for code in maps.subfield.ravel().tolist()],
         "valid": _truths(maps.sheet.valid),
         "repaired": _truths(maps.repaired),
+        "doubtful": _truths(maps.doubtful),
     }
     definitions = describe_columns(NODES | POSITION)
     definitions |= {row.name: _measure(row) for row in MAPS} | describe_columns(STATE)

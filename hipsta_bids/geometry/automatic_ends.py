@@ -119,7 +119,7 @@ def find_ends(
 
 def _no_body() -> GeometryError:
     return GeometryError(
-        "no slice has both CA1 and CA2/CA3, and no head and tail are labeled; label them, "
+        "no slice has both CA1 and CA2/CA3; head and tail have no labels: label both ends, "
         "or check the protocol",
         reason="no-body",
     )
@@ -273,8 +273,8 @@ def _mean_ends(
         allowed &= levels == levels[np.abs(levels - high).argmin()]
     if not allowed.any():
         raise GeometryError(
-            f"the labels extend less than {settings.min_length:g} mm from the one known end; "
-            "check that end, or label the whole hippocampus",
+            f"the labels extend less than {settings.min_length:g} mm from the known end; "
+            "check the known end, or label the whole hippocampus",
             reason="body-too-short",
         )
     weight = np.where(allowed, weight, -np.inf)

@@ -218,8 +218,8 @@ def _check_ends_reached(points: Float, ends: EndPlanes) -> None:
         gap = float((sign * ends.height(points, end)).min())
         if gap > _LAST_VOXEL:
             raise GeometryError(
-                f"the labels end {gap:.1f} mm before the {end} end plane; check these "
-                "labels, and the head and tail",
+                f"the labels end {gap:.1f} mm before the {end} end plane; check the "
+                "labels of body, head and tail",
                 reason="body-too-short",
             )
 
@@ -347,7 +347,7 @@ def check_reach(
     if share < settings.min_cortex_reach:
         raise GeometryError(
             f"region {settings.region}: cortex is labeled along {share * length:.1f} of "
-            f"{length:.1f} mm; label it all along, or measure the body",
+            f"{length:.1f} mm; label the cortex all along, or measure the body",
             reason="cortex-incomplete",
         )
 
@@ -408,7 +408,7 @@ def check_mask(
             value=mask.voxel / voxel,
             limit=settings.max_mask_ratio,
             text=f"the edited mask has voxels of {mask.voxel:.2f} mm, the labels of {voxel:.2f} mm",
-            remedy="draw it on the grid of the labels",
+            remedy="draw the mask on the grid of the labels",
             share=1.0,
         ),
         Finding(
@@ -417,7 +417,7 @@ def check_mask(
             limit=settings.max_mask_change,
             text=f"the edited mask adds {change.added} voxels to the body and removes "
             f"{change.removed} of {change.before}",
-            remedy="check that it is in the space of the labels",
+            remedy="check the space of the mask",
             share=1.0,
         ),
     ]

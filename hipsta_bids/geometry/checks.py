@@ -32,9 +32,6 @@ from hipsta_bids.types import Bool, Finding, Flag, Float, Sheet
 #: A flag concerns the columns within this distance of what was found, mm.
 FLAG_REACH = 1.0
 
-_NEGLIGIBLE = 0.005
-"""mm; means that differ by less read the same."""
-
 #: A cut this near, mm, to both the subiculum and CA2 or CA3 severs but turns that touch.
 CONTACT_REACH = 1.2
 #: Probabilities that contradict this share of the body's voxels, away from its border, are flagged.
@@ -181,7 +178,7 @@ def check_image(body: Body) -> list[Finding]:
             limit=0,
             text=f"{np.count_nonzero(outer)} voxels of the body lie at the "
             f"{border_sides(body.inside, body.affine)} border of the image",
-            remedy="use a larger or uncropped image if it cuts them",
+            remedy="if it cuts them, use a larger image",
             points=points[outer],
         ),
         *([_check_probabilities(body, body.soft.unlike)] if body.soft else []),
@@ -195,9 +192,8 @@ def _check_probabilities(body: Body, unlike: digital.Index) -> Finding:
         reason="probabilities-unlike",
         value=share,
         limit=UNLIKE_SHARE,
-        text=f"probabilities contradict labels more than a voxel inside or outside the sheet"
-        f" ({share:.1%} of the body's voxels)",
-        remedy="check that both are of one run",
+        text=f"probabilities contradict {share:.1%} of the labels, more than a voxel from the wall",
+        remedy="check that one run made labels and probabilities",
         points=digital.to_ras(unlike, body.affine),
     )
 
@@ -229,8 +225,13 @@ def check_end_labels(
 
 
 def _check_beyond(volume: types.LabelVolume, body: Body) -> list[Finding]:
-    """Flag ends without head or tail labels at which all labels end."""
+    """Flag ends without head or tail labels at which the labels of the sheet end.
+
+    The dentate gyrus and CA4 end before the sheet does, which closes behind them in the tail.
+    """
     labeled = (volume.tissue > 0) & (volume.tissue <= Tissue.HIPPOCAMPUS)
+    protocol = volume.protocol
+    labeled &= ~np.isin(volume.tissue, list({*protocol.interior} - {*protocol.layer}))
     points = digital.voxel_points(labeled, volume.affine)
     findings = []
     ends = body.ends
@@ -245,8 +246,8 @@ def _check_beyond(volume: types.LabelVolume, body: Body) -> list[Finding]:
                 reason="labels-end",
                 value=1 - float(beyond) / max(len(near), 1),
                 limit=1 - BEYOND_SHARE,
-                text=f"the labels end where the body does, at its {end} end",
-                remedy="it may be cut short there; label the whole hippocampus",
+                text=f"the labels of the sheet end at the {end} end of the body",
+                remedy="label the whole hippocampus, or check where the labels were cut",
                 points=near,
             )
         )
@@ -260,7 +261,7 @@ def describe_uncus(body: Body, settings: CheckSettings) -> list[str]:
     points = digital.to_ras(body.uncus, body.affine)
     volume = len(points) * body.voxel_volume
     reach = float(-body.ends.height(points, "anterior").min())
-    far = f"; it begins {reach:.1f} mm behind the anterior end: does the head begin there?"
+    far = f"; it begins {reach:.1f} mm behind the anterior end: check where the head begins"
     warning = far if reach > settings.uncus_reach else ""
     return [f"the uncus was excluded, {volume:.0f} mm3 at {name_place(points, body)}{warning}"]
 
@@ -274,7 +275,7 @@ def check_cavities(body: Body, settings: CheckSettings) -> list[Finding]:
             value=len(cavity) / size,
             limit=settings.flag_cavity,
             text=f"a cavity of {len(cavity) * body.voxel_volume:.0f} mm3 without a label was "
-            f"divided, sheet to interior; the mean may be off by {len(cavity) / size / 2:.0%}",
+            f"divided; the mean may be off by {len(cavity) / size / 2:.0%}",
             remedy="label the cavity",
             points=digital.to_ras(cavity, body.affine),
         )
@@ -313,12 +314,12 @@ def check_labels(body: Body, settings: CheckSettings) -> list[Finding]:
             (float(len(body.gap)), float(settings.flag_gap)),
             f"a thin gap of {len(body.gap)} voxels without a label divides the sheet",
             body.gap,
-            "fill it in the labels",
+            "fill the gap in the labels",
         ),
         (
             "loose-part",
             (loose, settings.flag_loose_part),
-            f"{loose:.0%} of the sheet do not touch the rest by any face of a voxel",
+            f"{loose:.0%} of the sheet touches the rest at no face of a voxel",
             digital.positions(pieces == second) + low if loose else np.zeros((0, 3)),
             "fill the gap in the labels",
         ),
@@ -459,8 +460,7 @@ def raise_flags(
             flags.append(
                 Flag(
                     reason=finding.reason,
-                    message=f"{finding.text}{location}: {finding.remedy}"
-                    + consequence_text(consequence),
+                    message=f"{finding.text}{location}: {finding.remedy}",
                     value=float(finding.value),
                     limit=float(finding.limit),
                     points=finding.points,
@@ -524,20 +524,3 @@ def _grid_laplace(shape: tuple[int, int]) -> sparse.csr_array:
     edges = sparse.coo_array((np.ones(first.size), (first, second)), shape=(number.size,) * 2)
     weights = (edges + edges.T).tocsr()
     return sparse.csr_array(sparse.diags_array(weights.sum(axis=1)) - weights)
-
-
-def consequence_text(finding: Finding) -> str:
-    """Write what a finding means for the map, to follow its message; empty if that is unknown."""
-    if np.isnan(finding.share):
-        return ""
-    if finding.share == 0:
-        return "; no measured column lies near"
-    extent = "all columns" if finding.share == 1 else f"{finding.share:.1%} of the columns"
-    if np.isnan(finding.change):
-        return f"; it concerns {extent}"
-    if abs(finding.change) < _NEGLIGIBLE:
-        return f"; it concerns {extent} and does not change the mean thickness"
-    change = f"{abs(finding.change):.2f} mm {'less' if finding.change > 0 else 'more'}"
-    if finding.share == 1:
-        return f"; it concerns all columns, the mean thickness may be {change}"
-    return f"; it concerns {extent}: with values of the neighbors, the mean would be {change}"

@@ -151,7 +151,7 @@ def make_disk(points: Float, triangles: Int, cell: NDArray[np.intp]) -> Disk:
     euler = len(corners) - len(unique_edges(closed)) + len(closed)
     if euler != 1:
         raise GeometryError(
-            f"the sheet has {(1 - euler) // 2} handles: parts of it touch or are bridged; "
+            f"the sheet has {(1 - euler) // 2} handles: parts of the sheet touch; "
             "correct the labels by hand",
             reason="whole-topology",
         )

@@ -211,7 +211,7 @@ def _checked(planes: dict[End, EndPlane], axis: Float, half_slice: float) -> End
             name = "tail" if end == "posterior" else "head"
             raise GeometryError(
                 f"labels of the {name} lie on both sides of the body or inside it, near {at}: "
-                "correct them",
+                "correct these labels",
                 reason="end-labels-inside",
             )
         if tilt > 50:  # noqa: PLR2004 -- beyond this the labels do not end across the long axis
@@ -226,8 +226,8 @@ def _checked(planes: dict[End, EndPlane], axis: Float, half_slice: float) -> End
             ]
             if lacking:
                 raise GeometryError(
-                    f"labels from the {end} end near {at} do not reach the {lacking[0]} end, "
-                    "which has none; label the whole hippocampus",
+                    f"the labels near {at} are cut short: the {lacking[0]} end has no labels; "
+                    "label the whole hippocampus",
                     reason="labels-end",
                 )
             raise GeometryError(

@@ -257,7 +257,7 @@ def _solvable() -> Iterator[None]:
 
 def _unsolvable() -> GeometryError:
     return GeometryError(
-        "a Laplace problem has no solution: the mesh is broken or not connected", reason="laplace"
+        "a Laplace problem has no solution: the mesh is broken; check the labels", reason="laplace"
     )
 
 

@@ -1,6 +1,6 @@
 """The working grid, which turns from one end plane to the other, and the smoothed body on it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -120,6 +120,8 @@ class Field:
     """Grid with the nodes."""
     beyond: int = 0
     """Number of levels along w that lie beyond each end plane."""
+    smoothing: float = 0.0
+    """SD of the Gaussian by which the labels were smoothed, nodes."""
     values: NDArray[np.float32]
     """(A, B, W), -0.5 far outside and 0.5 deep inside; a little beyond near the wall."""
     separated: Bool | None = None
@@ -161,6 +163,7 @@ def resample_body(body: Body, hemi: str, settings: GridSettings, slices: SliceSe
     return Field(
         grid=grid,
         beyond=round(settings.beyond / grid.step),
+        smoothing=sigma / settings.spacing,
         values=smooth - np.float32(0.5),
         separated=separated,
         slits=_nodes_in(body.filled, body, points, grid.shape),
@@ -169,6 +172,15 @@ def resample_body(body: Body, hemi: str, settings: GridSettings, slices: SliceSe
             digital.positions(body.interior & (body.tissue == 0)), body, points, grid.shape
         ),
     )
+
+
+def before_mending(field: Field) -> Field:
+    """Undo the filling and parting of labels; smoothing is linear, but for a small correction."""
+    values = field.values
+    for nodes, sign in ((field.slits, 1), (field.cavities, 1), (field.separated, -1)):
+        if nodes is not None and nodes.any():
+            values = values - sign * _smooth(nodes.astype(np.float32), field.smoothing)
+    return replace(field, values=values)
 
 
 def cut_across(body: Body) -> bool:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.body import wrong_side
-from hipsta_bids.geometry.digital import to_ras
+from hipsta_bids.geometry.digital import to_ras, voxel_points
 from hipsta_bids.geometry.ends import hippocampal_voxels, long_axis
 from hipsta_bids.geometry.grid import check_voxel
 from hipsta_bids.protocols.protocol import CORE, LATERAL_END, MEDIAL_END, Part, Tissue
@@ -56,6 +56,9 @@ _WHOLE_BOW = 0.075
 _ELONGATED = 1.8
 #: Usual directions in a left hemisphere, RAS: from tail to head, and to medial.
 _USUAL = np.array([0.0, 0.86, -0.51]), np.array([1.0, 0.0, 0.0])
+#: No head lies so far from the middle of the scanner that a hemisphere, 25 mm from its midline, is
+#: on the other side of the middle by more than this, mm.
+_WRONG_SIDE = 10.0
 #: Between 60 degrees, a head turned by 30, and 150, an image with two flipped axes turned by 30.
 _TURNED = 105.0
 
@@ -87,6 +90,20 @@ def check_label_image(volume: LabelVolume, hemi: str, settings: CheckSettings) -
     return [*_check_volumes(volume), *_check_axes(volume, hemi)]
 
 
+def note_position(volume: LabelVolume, hemi: str) -> list[str]:
+    """Note that labels lie on the other side of the origin, where no hemisphere of their side is.
+
+    No map depends on it: a header may have lost the place of the image in the scanner.
+    """
+    points = voxel_points(hippocampal_voxels(volume), volume.affine)
+    right = float(points[:, 0].mean()) if len(points) else 0.0
+    if (right if hemi == "L" else -right) <= _WRONG_SIDE:
+        return []
+    side, opposite = ("left", "right") if hemi == "L" else ("right", "left")
+    place = f"the {side} hippocampus lies {abs(right):.0f} mm to the {opposite} of the origin"
+    return [f"{place}. Check the affine of the image. Maps do not depend on it."]
+
+
 @contextmanager
 def naming_causes(volume: LabelVolume) -> Iterator[None]:
     """Name, in a refusal within the block, an impossible volume or the border of the image."""
@@ -97,7 +114,7 @@ def naming_causes(volume: LabelVolume) -> Iterator[None]:
         causes = [f"{found.text} ({found.remedy}); " for found in whole if found.raised]
         sides = border_sides(hippocampal_voxels(volume), volume.affine)
         if sides and error.reason not in _UNCUT:
-            remedy = "use a larger or uncropped image if it cuts them"
+            remedy = "if it cuts them, use a larger image"
             causes.append(f"the labels touch the {sides} border of the image ({remedy}); ")
         raise GeometryError("".join([*causes, str(error)]), reason=error.reason) from error
 

@@ -122,7 +122,7 @@ def check_subfields(
             reason="subfield-gap",
             value=size,
             limit=settings.flag_subfield_gap,
-            text=f"{tissue.name} is missing over {size:.1f} mm, and is there before and behind",
+            text=f"{tissue.name} is missing over {size:.1f} mm between rows that have it",
             remedy="complete the labels there",
             points=_known(middle[edge, first:last]),
         )

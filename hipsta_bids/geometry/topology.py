@@ -62,18 +62,17 @@ class Repair:
         return self.excess > 1
 
     def __str__(self) -> str:
-        noun = {
-            "part": "parted two turns that touch, by a slit",
-            "slit": "filled a slit or pit",
-            "cut": "cut a bridge",
-            "fill": "filled a hole",
-            "island": "removed a separate piece",
-            "cavity": "filled a cavity",
-            "uncus": "excluded the uncus, a piece",
+        size = f"of {self.voxels} grid node{'s' if self.voxels > 1 else ''}"
+        text = {
+            "part": f"two touching turns were parted by a slit {size}",
+            "slit": f"a slit or pit {size} was filled",
+            "cut": f"a bridge {size} was cut",
+            "fill": f"a hole {size} was filled",
+            "island": f"a separate piece {size} was removed",
+            "cavity": f"a gap {size} was filled",
+            "uncus": f"a piece of the uncus, {size[3:]}, was excluded",
         }[self.kind]
-        return (
-            f"{noun} of {self.voxels} grid nodes at {position_text(self.position, self.subfield)}"
-        )
+        return f"{text} at {position_text(self.position, self.subfield)}"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -82,6 +81,8 @@ class SolidField:
 
     field: Field
     """Field after all repairs."""
+    before: Field
+    """Field before all repairs."""
     repairs: tuple[Repair, ...]
     """Changes that were made, in their order."""
     touched: Bool
@@ -158,6 +159,7 @@ def repair_topology(
             separated=None,
             slits=None,
         ),
+        before=field,
         repairs=repairs,
         touched=touched,
         euler_before=euler_before,
@@ -268,7 +270,7 @@ def _unrepaired(
     return GeometryError(
         "holes or bridges of the labels cannot be repaired (Euler number "
         f"{membranes.euler(state)}, closed {membranes.euler(state, plates=True)}), near "
-        f"{at}; correct them there",
+        f"{at}; correct the labels there",
         reason="topology",
     )
 

@@ -309,17 +309,18 @@ def warm_up() -> None:
 
 def check_item(item: HemisphereInput, settings: Settings) -> list[str]:
     """Read and check the labels of a hemisphere without measuring it; list the problems."""
-    from hipsta_bids.geometry.label_checks import check_label_image, naming_causes  # noqa: PLC0415  (heavy)
+    from hipsta_bids.geometry import label_checks as checks  # noqa: PLC0415  (heavy)
     from hipsta_bids.inputs.labels import read_label_volume  # noqa: PLC0415  (heavy)
 
     try:
         volume = read_label_volume(item, settings.body.region)
-        with naming_causes(volume):
-            findings = check_label_image(volume, item.hemi, settings.checks)
+        with checks.naming_causes(volume):
+            findings = checks.check_label_image(volume, item.hemi, settings.checks)
     except HipstaError as error:
         return [f"will be refused: {error}"]
     flags = [f"will be flagged: {f.text}: {f.remedy}" for f in findings if f.raised]
-    return [*flags, *(f"will be noted: {note}" for note in volume.notes)]
+    notes = (*volume.notes, *checks.note_position(volume, item.hemi))
+    return [*flags, *(f"will be noted: {note}" for note in notes)]
 
 
 def run_job(job: Job) -> Outcome:
@@ -340,7 +341,7 @@ Measure = Callable[[LabelVolume, str, Settings, CostClock], HemisphereMaps]
 
 def measure_job(job: Job, measure: Measure | None = None) -> Outcome:
     """Measure a hemisphere, by default on a sheet of its own, and write its results."""
-    from hipsta_bids.geometry.label_checks import naming_causes  # noqa: PLC0415  (workers only)
+    from hipsta_bids.geometry.label_checks import naming_causes, note_position  # noqa: PLC0415  (workers only)
     from hipsta_bids.inputs.labels import read_label_volume  # noqa: PLC0415  (likewise)
     from hipsta_bids.io.volumes import limit_memory  # noqa: PLC0415  (likewise)
     from hipsta_bids.participant.measure import find_body, measure_hemisphere  # noqa: PLC0415
@@ -356,7 +357,8 @@ def measure_job(job: Job, measure: Measure | None = None) -> Outcome:
             volume = read_label_volume(job.item, job.settings.body.region)
             edges = np.linalg.norm(volume.affine[:3, :3], axis=0)
             record["provenance"]["voxel_size"] = " x ".join(f"{edge:.3g}" for edge in edges)
-        record["notes"] = [*record["notes"], *volume.notes]
+        noted = (*volume.notes, *note_position(volume, job.item.hemi))
+        record["notes"] = [*record["notes"], *noted]
         with naming_causes(volume):
             maps = (measure or measure_hemisphere)(volume, job.item.hemi, job.settings, clock)
         mapped: list[Mapped] = []

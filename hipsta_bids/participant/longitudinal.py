@@ -14,7 +14,7 @@ import numpy as np
 from nibabel.affines import apply_affine
 
 from hipsta_bids.errors import GeometryError
-from hipsta_bids.geometry import catalog, checks, columns
+from hipsta_bids.geometry import catalog, checks, columns, repairs
 from hipsta_bids.geometry.align import align
 from hipsta_bids.geometry.average import average_labels
 from hipsta_bids.geometry.body import Body, check_side, extract_body, relabel_by_mask
@@ -280,7 +280,6 @@ def measure_laid(
         repaired = repaired_columns(sheet, solid)
         layers, folded_layers = measure.space_layers(sheet, settings)
         overlap = _overlap(body, frame, motion)
-        repairs = [checks.add_consequence(measure.describe_repair(r), sheet) for r in solid.repairs]
         findings = [
             *laid.image,
             *checks.check_image(body),
@@ -291,6 +290,7 @@ def measure_laid(
             *folded_layers,
             *(_of_frame(finding, motion) for finding in measure.find_all(common)),
         ]
+        doubtful = repairs.doubtful_columns(sheet, solid, findings)
         return HemisphereMaps(
             sheet=sheet,
             layers=layers,
@@ -299,6 +299,7 @@ def measure_laid(
             sections=catalog.measure_sections(measured),
             subfield=measured.subfield,
             repaired=repaired,
+            doubtful=doubtful,
             body_mask=volume.in_file(body.inside),
             summary=catalog.summarize(measured, for_region(volume.protocol, body.region).sheet),
             qc={
@@ -311,8 +312,8 @@ def measure_laid(
                 "filled_columns": int(np.count_nonzero(~sheet.valid)),
                 "filled_fraction": 1 - float(sheet.valid.mean()),
                 "regions_outside": "head and tail (as in Diers et al. 2023)",
-                "repaired_fraction": float(repaired.mean()),
-                "repaired_change_mm": checks.change_of_mean(sheet, repaired),
+                **repairs.repair_metrics(sheet, solid, repaired, body),
+                "doubtful_fraction": float(doubtful.mean()),
                 "frame": "person",
                 "frame_visits": len(frame.motions),
                 "frame_to_visit": motion.round(6).tolist(),
@@ -320,10 +321,7 @@ def measure_laid(
                 "frame_overlap": overlap,
                 "flag_margins": checks.flag_margins(findings),
             },
-            repairs=(
-                *(f"{finding.text}{checks.consequence_text(finding)}" for finding in repairs),
-                *checks.describe_uncus(body, settings.checks),
-            ),
+            repairs=(*map(str, solid.repairs), *checks.describe_uncus(body, settings.checks)),
             flags=tuple(checks.raise_flags(findings, sheet, partial(checks.name_place, body=body))),
             mesh=measured.mesh,
             coordinates=measured.coordinates,

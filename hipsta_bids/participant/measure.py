@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from hipsta_bids.errors import GeometryError
-from hipsta_bids.geometry import sheet_checks
+from hipsta_bids.geometry import repairs, sheet_checks
 from hipsta_bids.geometry.body import Body, check_mask, check_side, extract_body
 from hipsta_bids.geometry.boundaries import Boundaries, find_boundaries
 from hipsta_bids.geometry.catalog import (
@@ -24,8 +24,6 @@ from hipsta_bids.geometry.catalog import (
     summarize,
 )
 from hipsta_bids.geometry.checks import (
-    add_consequence,
-    change_of_mean,
     check_cavities,
     check_cross_sections,
     check_end_labels,
@@ -34,7 +32,6 @@ from hipsta_bids.geometry.checks import (
     check_labels,
     check_thickness,
     check_voxels_across,
-    consequence_text,
     describe_uncus,
     find_contacts,
     flag_margins,
@@ -134,8 +131,8 @@ def find_all(evidence: Evidence) -> list[Finding]:
             "ends-uncertain",
             uncertainty,
             checks.flag_end,
-            f"the {end} end, which has no label, is certain to {uncertainty:.1f} mm only",
-            "check it",
+            f"the {end} end has no label and is uncertain by {uncertainty:.1f} mm",
+            "check the end plane, or place it by hand (--ends)",
             middle[:, row],
         )
         for end, uncertainty, row in (
@@ -180,7 +177,7 @@ def find_all(evidence: Evidence) -> list[Finding]:
             else 0.0,
             checks.flag_bending,
             f"dentate gyrus labels lie on the outer side of the bend ({evidence.bending:.1f} rad)",
-            "look at which wall is called interior; thickness does not depend on it",
+            "check which wall is interior; thickness does not depend on it",
             1.0,
         ),
         (
@@ -227,7 +224,7 @@ def describe_repair(repair: Repair) -> Finding:
         value=repair.excess,
         limit=1.0,
         text=str(repair),
-        remedy="a large repair, look at the labels there",
+        remedy="the repair is large, check the labels there",
         points=repair.points,
         placed=True,
     )
@@ -280,8 +277,7 @@ def quality_metrics(evidence: Evidence) -> dict[str, Any]:
         "filled_fraction": float(1 - valid.mean()),
         "thickness_expected_mm": boundaries.sheet_thickness,
         "regions_outside": "head and tail (as in Diers et al. 2023)",
-        "repaired_fraction": float(evidence.repaired.mean()),
-        "repaired_change_mm": change_of_mean(evidence.sheet, evidence.repaired),
+        **repairs.repair_metrics(evidence.sheet, solid, evidence.repaired, body),
         **({"mask_change": asdict(body.mask_change)} if body.mask_change else {}),
     }
 
@@ -467,12 +463,10 @@ def measure_hemisphere(
     evidence = unfold(volume, hemi, settings, clock)
     sheet = evidence.sheet
     with clock("measures"):
-        repairs = [
-            add_consequence(describe_repair(repair), sheet) for repair in evidence.solid.repairs
-        ]
         layers, folded_layers = space_layers(sheet, settings)
         findings = [*_find(volume, hemi, evidence), *folded_layers]
         maps = measure_maps(evidence)
+        doubtful = repairs.doubtful_columns(sheet, evidence.solid, findings)
         return HemisphereMaps(
             sheet=sheet,
             layers=layers,
@@ -481,11 +475,16 @@ def measure_hemisphere(
             sections=measure_sections(evidence),
             subfield=evidence.subfield,
             repaired=evidence.repaired,
+            doubtful=doubtful,
             body_mask=volume.in_file(evidence.body.inside),
             summary=summarize(evidence, for_region(volume.protocol, region).sheet),
-            qc={**quality_metrics(evidence), "flag_margins": flag_margins(findings)},
+            qc={
+                **quality_metrics(evidence),
+                "doubtful_fraction": float(doubtful.mean()),
+                "flag_margins": flag_margins(findings),
+            },
             repairs=(
-                *(f"{finding.text}{consequence_text(finding)}" for finding in repairs),
+                *map(str, evidence.solid.repairs),
                 *describe_uncus(evidence.body, settings.checks),
             ),
             flags=_flags(evidence, findings),

@@ -82,7 +82,9 @@ def _measure_visits(jobs: tuple[Job, ...]) -> list[Outcome]:
         def run(volume: Any, hemi: str, _settings: Any, clock: Any) -> HemisphereMaps:  # noqa: ANN401
             if job not in usable or frame is None:
                 longitudinal.check_alone(volume, hemi, settings)  # says what is wrong
-                raise problem or HipstaError("no visit can be read", reason="internal-error")
+                raise problem or HipstaError(
+                    "no visit can be read; check the labels", reason="internal-error"
+                )
             if job not in on_sheet:
                 raise GeometryError(
                     "this visit does not resemble the other visits: check participant, side and "

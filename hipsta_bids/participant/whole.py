@@ -163,6 +163,7 @@ def measure_whole(
             sections=catalog.measure_sections(measured),
             subfield=subfield,
             repaired=np.zeros(subfield.shape, dtype=bool),
+            doubtful=np.zeros(subfield.shape, dtype=bool),
             body_mask=volume.in_file(tissue > 0),
             summary=catalog.summarize(measured, volume.protocol.sheet),
             qc={
@@ -352,7 +353,7 @@ def _findings(disk: Disk, edges: Edges, folded: float, masked: float, region: st
             value=length,
             limit=FLAG_HOLE,
             text=f"the sheet has a hole with a perimeter of {length:.0f} mm",
-            remedy="look at the labels there; it has no values",
+            remedy="check the labels there; the hole has no values",
             points=center[None],
         )
         for length, center in zip(disk.holes, disk.centers, strict=True)

@@ -8,13 +8,15 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from hipsta_bids.protocols.protocol import Part, Protocol
-from hipsta_bids.types import Float
+from hipsta_bids.types import HATCHED_FROM, Float
 
 #: How every unfolded map lies, of either hemisphere.
 ORIENTATION = (
     "Unfolded maps of both hemispheres lie alike: medial left, lateral right, posterior below,"
     " anterior above."
 )
+#: What oblique hatching means on unfolded maps.
+HATCHING = f"near a flag, or a repair (no filled gap) {HATCHED_FROM:g} mm off its neighbors"
 #: Both ends of the axes of unfolded maps: of x to the right, and of y upward.
 X_ENDS, Y_ENDS = ("medial", "lateral"), ("posterior", "anterior")
 

@@ -265,7 +265,7 @@ def draw_sheet(
         x, y, values, cmap=kind.colors, vmin=scale[0], vmax=scale[1], shading="nearest",
         rasterized=True,
     )  # fmt: skip
-    for nodes, hatch in ((sheet.repaired, "////"), (hatched, "xxxx")):
+    for nodes, hatch in ((sheet.doubtful, "////"), (hatched, "xxxx")):
         if nodes.any():
             _hatch(axis, nodes, x, y, hatch)
     _draw_borders(axis, names, x, y)

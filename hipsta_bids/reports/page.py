@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from hipsta_bids import __version__
 from hipsta_bids.reports.cells import FILTERS
-from hipsta_bids.reports.display import ORIENTATION
+from hipsta_bids.reports.display import HATCHING, ORIENTATION
 from hipsta_bids.settings import Settings
 
 if TYPE_CHECKING:
@@ -82,7 +82,7 @@ def _environment() -> "Environment":
         return Markup(source.read_text(encoding="utf-8"))  # noqa: S704  (no user's text in it)
 
     environment.filters |= FILTERS
-    environment.globals |= {"asset": asset, "orientation": ORIENTATION}
+    environment.globals |= {"asset": asset, "orientation": ORIENTATION, "hatching": HATCHING}
     return environment
 
 

@@ -39,7 +39,7 @@ from hipsta_bids.reports.results import (
     read_views,
 )
 from hipsta_bids.reports.slices import stack_of
-from hipsta_bids.reports.verdict import RATINGS
+from hipsta_bids.reports.verdict import RATINGS, of_flag
 from hipsta_bids.reports.visits import draw_visits
 from hipsta_bids.types import Decision, Float
 
@@ -156,9 +156,6 @@ def _body(mask: NDArray[np.bool_], views: Views) -> tuple[Float, NDArray[np.int6
     points = (vertices - 2 * step) @ views.affine[:3, :3].T + views.affine[:3, 3]
     return points, triangles
 
-
-#: What a message says of the columns concerned, which the headline says of the same finding.
-_CONCERNS = "; it concerns"
 
 #: Rows of the quality table that hold words, and the keys of the quality record.
 _FACTS = (
@@ -348,20 +345,14 @@ def _sides(series: Series) -> Mapping[str, Any]:
         card = card_of(hemisphere, series.cohort, view)
         points = _points_of(hemisphere)
         placeless = [f for f in hemisphere.findings if f.point is None]
-        reason = card["verdict"].reason.rstrip(".").lower()
-
-        def message(finding: Finding, reason: str = reason) -> str:
-            head = finding.message.partition(_CONCERNS)[0]
-            return head if reason.startswith(head.lower()) else finding.message
-
         cards.append(
             {
                 **card,
                 "points": [
-                    (min(f.kind for f in found), "; ".join(map(message, found)))
+                    (min(f.kind for f in found), "; ".join(_message(f, hemisphere) for f in found))
                     for found in points.values()
                 ],
-                "rest": [(f.kind, message(f)) for f in placeless],
+                "rest": [(f.kind, _message(f, hemisphere)) for f in placeless],
                 "map": draw_map(THICKNESS, [hemisphere], pins=list(points))
                 if hemisphere.measured
                 else None,
@@ -372,6 +363,13 @@ def _sides(series: Series) -> Mapping[str, Any]:
             }
         )
     return {"cards": cards, "ratings": RATINGS, "legend": _legend(series), "whole": series.whole}
+
+
+def _message(finding: Finding, hemisphere: Hemisphere) -> str:
+    """Write a finding; flags, except the headline's, with their consequence."""
+    if np.isnan(finding.share) or finding.message == hemisphere.findings[0].message:
+        return finding.message
+    return f"{finding.message}. {of_flag(hemisphere, finding)}"
 
 
 def _legend(series: Series) -> Mapping[str, str]:
@@ -395,7 +393,7 @@ def _sheets(series: Series) -> Mapping[str, Any] | None:
         "pictures": pictures,
         "uncertainty": [_uncertainty(h) for h in uncertain],
         "whole": series.whole,
-        "repaired": any(h.sheet.repaired.any() for h in measured),
+        "doubtful": any(h.sheet.doubtful.any() for h in measured),
         "invalid": any(not h.sheet.valid.all() for h in measured),
     }
 

@@ -84,6 +84,7 @@ class SheetTable:
     """(Nx, Ny), empty where missing."""
     valid: NDArray[np.bool_]
     repaired: NDArray[np.bool_]
+    doubtful: NDArray[np.bool_]
     points: Mapping[str, Float]
     """(Nx, Ny, 3) RAS mm, by name of the surface."""
     ends: tuple[int, int] | None = None
@@ -203,9 +204,9 @@ class Hemisphere:
     @cached_property
     def sheet(self) -> SheetTable:
         """Its sheet."""
-        words = ("subfield", "valid", "repaired")
+        words = ("subfield", "valid", "repaired", "doubtful")
         columns = read_sheet(self.result.path("sheet"), words=words)
-        subfield, valid, repaired = (columns.pop(name) for name in words)
+        subfield, valid, repaired, doubtful = (columns.pop(name) for name in words)
         if "uncertainty_copies" in self.metrics and self.result.path("uncertainty").exists():
             columns |= read_sheet(self.result.path("uncertainty"))
         if self.record.get("visits") and self.result.path("change").exists():
@@ -217,6 +218,7 @@ class Hemisphere:
             subfield=subfield.astype(np.str_),
             valid=valid == "true",
             repaired=repaired == "true",
+            doubtful=doubtful == "true",
             points={name: _surface_points(self.result, name, valid.shape) for name in SURFACES},
             ends=body_ends(self.result.name.region, valid.shape[1]),
         )

@@ -1,8 +1,8 @@
 """What a person is told about a hemisphere first: the decision of its record, and what it rests on.
 
 A hemisphere with a flag is one to look at, whatever was repaired. Its headline is the flag with the
-largest consequence: by how much the mean thickness could be off, then the share of the map. What
-repairs touch does not count: it does not go along with errors (docs/quality.md).
+largest consequence: by how much the mean thickness could be off, then the share of the map. Without
+a flag, the headline is what was repaired.
 """
 
 from dataclasses import dataclass
@@ -19,6 +19,18 @@ RATINGS = ("use", "unsure", "exclude")
 #: Flags about volumes that were sampled besides.
 _BESIDES = ("map-outside", "map-unusable", "roi-unusable")
 
+#: Repairs by their kinds (:class:`Repair`).
+_REPAIRS = {
+    "cavity": "gaps filled",
+    "slit": "slits filled",
+    "fill": "holes filled",
+    "cut": "bridges cut",
+    "part": "touching turns parted",
+    "island": "separate pieces removed",
+    "uncus": "uncus excluded",
+}
+
+_SOUND = "No check raised a flag, and no label was repaired."
 _ROUNDING = 0.005
 """mm; means that differ by less read the same."""
 
@@ -71,36 +83,43 @@ def verdict_of(hemisphere: Hemisphere) -> Verdict:
         finding = hemisphere.findings[0]
         return Verdict(
             decision=decision,
-            reason=_sentence(finding.message.split("; it concerns")[0]),
-            consequence=_of_flag(hemisphere, finding),
+            reason=_sentence(finding.message),
+            consequence=of_flag(hemisphere, finding),
             advice="Look at the numbered places; then use it, correct the labels, or exclude it.",
             change=finding.change,
             share=finding.share,
         )
     return Verdict(
         decision=decision,
-        reason="No check found anything to look at.",
+        reason=_repairs(hemisphere),
         consequence=_of_repairs(hemisphere),
         advice="",
     )
 
 
+def _repairs(hemisphere: Hemisphere) -> str:
+    """Write how many repairs of each kind there were."""
+    kinds = hemisphere.metrics.get("repair_kinds") or {}
+    counts = [f"{text} ({kinds[kind]})" for kind, text in _REPAIRS.items() if kind in kinds]
+    return f"Labels were repaired: {', '.join(counts)}." if counts else _SOUND
+
+
 def _of_repairs(hemisphere: Hemisphere) -> str:
-    """Write how much of the map repairs touch; that they do is no sign that it is wrong."""
-    count = len(hemisphere.record.get("repairs") or [])
-    if not count:
-        return "No label was repaired."
-    share, change = (
-        number(hemisphere.metrics, key) for key in ("repaired_fraction", "repaired_change_mm")
-    )
-    mean = hemisphere.summary.get("thickness_mean", np.nan) - change
+    """Write how much of the map depends on repairs, and by how much the mean thickness does."""
+    keys = ("repaired_fraction", "repaired_change_mm", "doubtful_fraction")
+    share, change, hatched = (number(hemisphere.metrics, key) for key in keys)
+    if not share > 0:
+        return ""
+    mean = hemisphere.summary.get("thickness_mean", np.nan)
+    before, after = f"{mean - change:.2f}", f"{mean:.2f} mm"
     return (
-        f"{count} repair{'s' if count > 1 else ''} of the labels, {share:.1%} of the map; "
-        f"with values of the neighbors, the mean would be {mean:.2f} mm."
+        f"Repairs touch {share:.1%} of the map; without repairs, the mean thickness would be "
+        f"{f'{before} instead of' if f'{before} mm' != after else 'the same,'} {after}. "
+        f"{f'{hatched:.1%} of the map is' if hatched else 'Nothing is'} hatched as doubtful."
     )
 
 
-def _of_flag(hemisphere: Hemisphere, finding: Finding) -> str:
+def of_flag(hemisphere: Hemisphere, finding: Finding) -> str:
     """Write what a flag may do to the map."""
     if finding.reason in _BESIDES:
         return "Thickness and shape do not depend on it."

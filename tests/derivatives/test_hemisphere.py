@@ -370,7 +370,7 @@ def test_headlines_have_25_words_at_most(message, short):
 def test_headlines_keep_the_subfields_of_a_place_and_the_remedy():
     place = position_text((-20.8, -19.0, -16.8), "PRESUBICULUM, SUBICULUM, CA1, CA3")
     problem = "holes or bridges of the labels cannot be repaired (Euler number -3, closed 1)"
-    message = f"{problem}, near {place}; correct them there"
+    message = f"{problem}, near {place}; correct the labels there"
     assert len(message.split()) > 25
     assert headline(message) == message
 

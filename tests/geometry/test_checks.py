@@ -220,5 +220,19 @@ def test_an_end_at_which_all_labels_end_is_flagged(arc, part):
     assert ("anterior" if part is Part.HEAD else "posterior") in flags[0].text
 
 
+def test_a_dentate_gyrus_that_ends_before_the_sheet_is_no_missing_label(arc):
+    """In the tail the sheet closes behind it: only the sheet's labels are counted."""
+    ends = arc.body.ends
+    automatic = replace(ends, posterior=ends.posterior._replace(rule="core"))
+    body = replace(arc.body, ends=automatic)
+    protocol = arc.volume.protocol
+    core = np.isin(arc.volume.tissue, list({*protocol.interior} - {*protocol.layer}))
+    hollow = replace(arc.volume, tissue=np.where(core, 0, arc.volume.tissue))
+    (_, whole), (_, without) = (check_end_labels(v, body, CHECKS) for v in (arc.volume, hollow))
+    assert core.any()
+    assert whole.reason == "labels-end"
+    assert whole.value == without.value
+
+
 def test_short_head_and_tail_labels_are_enough(arc):
     assert not any(found.raised for found in check_end_labels(arc.volume, arc.body, CHECKS))

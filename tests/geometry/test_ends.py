@@ -364,7 +364,7 @@ def test_labels_that_do_not_lead_away_from_their_end_are_refused():
         0.2,
     )
     assert turned.axis[1] == pytest.approx(1.0)
-    with pytest.raises(GeometryError, match=r"do not reach the .* end, which has none") as caught:
+    with pytest.raises(GeometryError, match=r"are cut short: the .* end has no labels") as caught:
         ends_mod._checked(
             {
                 "posterior": ends_mod.EndPlane(np.zeros(3), np.array([0.5, 0.866, 0.0]), "labels"),

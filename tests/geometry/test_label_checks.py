@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from hipsta_bids.cli import main
 from hipsta_bids.errors import ExitCode, GeometryError
-from hipsta_bids.geometry.label_checks import check_label_image, naming_causes
+from hipsta_bids.geometry.label_checks import check_label_image, naming_causes, note_position
 from hipsta_bids.inputs.labels import read_label_volume
 from hipsta_bids.phantom import (
     KINDS,
@@ -236,6 +236,21 @@ def test_what_is_cut_short_does_not_tell_its_direction(hippocampus):
     middle = np.abs(share - np.median(share[hippocampus.tissue > 0])) < 5.0
     volume = unlabeled(replace(hippocampus, tissue=np.where(middle, hippocampus.tissue, 0)))
     assert flags(volume) == set()
+
+
+@pytest.mark.parametrize(("hemi", "other", "sign"), [("L", "right", 1), ("R", "left", -1)])
+def test_a_hemisphere_far_on_the_other_side_of_the_origin_is_noted(body, hemi, other, sign):
+    """As 31 mm to the right for the left one; a head 30 mm aside is possible."""
+
+    def at(right):
+        affine = body.affine.copy()
+        middle = affine[0, :3] @ np.argwhere(body.tissue > 0).mean(axis=0)
+        affine[0, 3] = sign * right - middle
+        return note_position(replace(body, affine=affine), hemi)
+
+    (note,) = at(31.0)
+    assert f"31 mm to the {other} of the origin" in note
+    assert at(5.0) == at(-25.0) == []
 
 
 def test_few_voxels_decide_nothing(body):

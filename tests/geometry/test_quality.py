@@ -78,7 +78,7 @@ def test_large_repairs_are_flagged_one_by_one(evidence):
     large = [finding for finding in found if finding.reason == "large-repair"]
     assert [finding.margin for finding in large] == [1.5, 0.7, np.inf]
     assert [finding.raised for finding in large] == [True, False, True]
-    assert "cut a bridge of 30 grid nodes at RAS 1.0 2.0 3.0 mm" in large[0].text
+    assert "a bridge of 30 grid nodes was cut at RAS 1.0 2.0 3.0 mm" in large[0].text
 
 
 @pytest.mark.parametrize(("fraction", "wanted"), [(0.06, ["much-repaired"]), (0.04, [])])

@@ -349,7 +349,7 @@ def test_separated_turns_are_reported(slab):
     found = solid_of(replace(slab.field, separated=separated), TopologySettings())
     (repair,) = found.repairs
     assert (repair.kind, repair.voxels, repair.large) == ("part", 5, False)
-    assert str(repair).startswith("parted two turns that touch, by a slit of 5 grid nodes at RAS")
+    assert str(repair).startswith("two touching turns were parted by a slit of 5 grid nodes at RAS")
     assert found.touched[separated].all()
 
 

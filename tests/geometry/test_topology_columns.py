@@ -47,6 +47,7 @@ def make_solid(*, added=(), removed=(), stumps=()):
             touched[node] = change
     return SolidField(
         field=Field(grid=grid, values=values),
+        before=Field(grid=grid, values=values),
         repairs=(),
         touched=touched,
         euler_before=1,

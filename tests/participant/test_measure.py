@@ -79,6 +79,11 @@ def test_columns_at_a_filled_hole_are_marked(plain, damage):
     assert not maps.repaired[distance > 0.5 + 0.4 + 0.35 + 0.6].any()
     assert maps.qc["repaired_fraction"] == pytest.approx(maps.repaired.mean())
     assert not plain.maps.repaired.any()
+    assert not maps.doubtful[~maps.repaired].any()  # no flag
+    assert maps.qc["doubtful_fraction"] == pytest.approx(maps.doubtful.mean())
+    assert sum(maps.qc["repair_kinds"].values()) == len(maps.repairs)
+    assert not plain.maps.doubtful.any()
+    assert plain.maps.qc["repaired_change_mm"] == 0
 
 
 def test_the_sheet_lies_in_the_middle_of_the_wall_from_end_to_end(case):
@@ -254,8 +259,8 @@ def test_a_hole_is_filled_and_reported(plain, damage):
     maps = measure(damage.erase(where))
     assert maps.decision == Decision.USE
     # Beside the dentate gyrus it is a cavity, where the sheet goes round it.
-    (repair,) = [text for text in maps.repairs if not text.startswith("filled a cavity")]
-    assert repair.startswith("filled a hole")
+    (repair,) = [text for text in maps.repairs if not text.startswith("a gap of")]
+    assert repair.startswith("a hole of")
     place = np.array(repair.split("RAS ")[1].split()[:3], dtype=float)
     true = plain.phantom.body.place(0.5, 0.5, 0.0)
     assert np.linalg.norm(place - true) < 1.2  # mm, about half the thickness: it says where to look
@@ -268,7 +273,7 @@ def test_a_bridge_is_cut_and_reported(plain, damage):
     maps = measure(damage.relabel(where, Tissue.CA1))
     assert maps.decision == Decision.USE
     (repair,) = maps.repairs
-    assert repair.startswith("cut a bridge")
+    assert repair.startswith("a bridge of")
     assert maps.qc["euler_before"] == 0
     assert_only_local_change(plain, maps, points=12)
 
@@ -278,7 +283,7 @@ def test_an_island_is_removed_and_reported(plain, damage):
     maps = measure(damage.relabel(where, Tissue.CA1))
     assert maps.decision == Decision.USE
     (repair,) = maps.repairs
-    assert repair.startswith("removed a separate piece")
+    assert repair.startswith("a separate piece of")
     assert_only_local_change(plain, maps, points=0)
 
 

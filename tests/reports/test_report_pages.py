@@ -60,7 +60,10 @@ def test_decisions_are_said_with_what_to_do(out):
     assert [title for page in verdicts for title, _ in page] == [
         *("Use", "Use", "Look before use", "Do not use")
     ]
-    assert [reason for _, reason in verdicts[0]] == 2 * ["No check found anything to look at."]
+    assert [reason for _, reason in verdicts[0]] == [
+        "No check raised a flag, and no label was repaired.",
+        "Labels were repaired: bridges cut (1).",
+    ]
     assert verdicts[1][1][1].startswith("The body is interrupted at RAS")
     assert "the body is interrupted at RAS" in second
     assert "fill in missing slices" in second
@@ -75,14 +78,14 @@ def test_backticks_of_messages_become_code_and_tags_in_them_stay_text():
 
 def test_a_finding_has_one_share(copy):
     """That of the headline, where the headline is about it."""
-    concerns = "; it concerns 3.0% of the columns: with values of the neighbors"
     heads = [f"a bump near RAS {x}.0 -20.0 -20.0 mm (CA1): look there" for x in (20, 25)]
-    flags = [{"reason": "a", "message": h + concerns, "columns_share": 0.03} for h in heads]
+    flags = [{"reason": "a", "message": h, "columns_share": 0.03} for h in heads]
     path = next((copy / "sub-02/anat").glob("*hemi-L*_metrics.json"))
     spoil(path, lambda record: record.update(flags=flags, repairs=[]))
     text = participant_page(copy, "02", None, read_cohort(copy))
     listed = re.findall(r'<span class="kind">flag</span> (.*?)</li>', text)
-    assert listed == [heads[0], heads[1] + concerns]
+    consequence = "It concerns 3.0% of the map; the effect on the mean thickness is unknown."
+    assert listed == [heads[0], f"{heads[1]}. {consequence}"]
     assert "It concerns 3.0% of the map" in text
 
 
@@ -244,7 +247,7 @@ def test_a_section_that_fails_costs_itself_only(out, monkeypatch, caplog):
     monkeypatch.setattr(participant_module, "SECTIONS", (broken, *participant_module.SECTIONS))
     text = participant_page(out, "01", None, read_cohort(out))
     assert "ZeroDivisionError: by zero" in text
-    assert "No check found anything to look at." in text
+    assert "no label was repaired." in text
     assert "section x" in caplog.text
 
 

@@ -36,62 +36,60 @@ def test_each_decision_has_its_verdict(out):
     assert RATINGS[-1] == "exclude"
 
 
-def table_of(found):
-    """Read the sheet table without the package: columns by name, (Nx, Ny)."""
+def test_repairs_are_the_headline_of_what_can_be_used(out):
+    found = hemisphere(out, "01", "R")
     with found.result.path("sheet").open() as file:
         rows = list(csv.DictReader(file, delimiter="\t"))
-    shape = int(rows[-1]["x"]), int(rows[-1]["y"])
-    numbers = {k: np.array([float(r[k]) for r in rows]).reshape(shape) for k in ("r", "a", "s")}
-    numbers["thickness"] = np.array([float(r["thickness"]) for r in rows]).reshape(shape)
-    repaired = np.array([r["repaired"] == "true" for r in rows]).reshape(shape)
-    return numbers, repaired
-
-
-def areas_of(points):
-    """A quarter of every quadrilateral to each of its corners, by two triangles."""
-    area = np.zeros(points.shape[:2])
-    for i, j in np.ndindex(points.shape[0] - 1, points.shape[1] - 1):
-        a, b, c, d = points[i, j], points[i + 1, j], points[i + 1, j + 1], points[i, j + 1]
-        whole = 0.5 * np.linalg.norm(np.cross(c - a, d - b))
-        for k in ((i, j), (i + 1, j), (i + 1, j + 1), (i, j + 1)):
-            area[k] += whole / 4
-    return area
-
-
-def smoothed(values, where):
-    """Let marked values become the mean of their neighbors, again and again."""
-    found, known = values.copy(), np.pad(np.ones(values.shape), 1)
-    count = known[:-2, 1:-1] + known[2:, 1:-1] + known[1:-1, :-2] + known[1:-1, 2:]
-    for _ in range(4000):
-        wide = np.pad(found, 1)
-        mean = (wide[:-2, 1:-1] + wide[2:, 1:-1] + wide[1:-1, :-2] + wide[1:-1, 2:]) / count
-        found = np.where(where, mean, values)
-    return found
-
-
-def test_what_repairs_may_do_is_that_of_the_repaired_columns(out):
-    found = hemisphere(out, "01", "R")
-    numbers, repaired = table_of(found)
-    assert repaired.any()
-    thickness = numbers["thickness"]
-    area = areas_of(np.stack([numbers[k] for k in "ras"], axis=-1))
-    mean = np.average(thickness, weights=area)
-    other = np.average(smoothed(thickness, repaired), weights=area)
-    verdict = verdict_of(found)
-    assert verdict.reason == "No check found anything to look at."
-    assert found.metrics["repaired_change_mm"] == pytest.approx(mean - other, abs=1e-5)
-    assert verdict.consequence == (
-        f"1 repair of the labels, {repaired.mean():.1%} of the map; with values"
-        f" of the neighbors, the mean would be {other:.2f} mm."
+    share, hatched = (
+        np.mean([row[name] == "true" for row in rows]) for name in ("repaired", "doubtful")
     )
-    assert verdict_of(hemisphere(out, "01", "L")).consequence == "No label was repaired."
+    assert 0 < hatched <= share
+    mean, change = found.summary["thickness_mean"], found.metrics["repaired_change_mm"]
+    verdict = verdict_of(found)
+    assert verdict.reason == "Labels were repaired: bridges cut (1)."
+    assert abs(change) < 0.005  # a stump is left
+    assert verdict.consequence == (
+        f"Repairs touch {share:.1%} of the map; without repairs, the mean thickness would be"
+        f" the same, {mean:.2f} mm. {hatched:.1%} of the map is hatched as doubtful."
+    )
+    sound = verdict_of(hemisphere(out, "01", "L"))
+    assert (sound.reason, sound.consequence) == (
+        "No check raised a flag, and no label was repaired.",
+        "",
+    )
+
+
+def test_filled_gaps_have_a_rule(out):
+    found = hemisphere(out, "01", "R")
+    metrics = {
+        "repair_kinds": {"cavity": 9, "slit": 2, "fill": 1, "uncus": 1},
+        "repaired_fraction": 0.413,
+        "repaired_change_mm": 0.06,
+        "doubtful_fraction": 0.0,
+    }
+    verdict = verdict_of(changed(found, metrics=metrics))
+    assert verdict.reason == (
+        "Labels were repaired: gaps filled (9), slits filled (2), holes filled (1), uncus"
+        " excluded (1)."
+    )
+    mean = found.summary["thickness_mean"]
+    assert verdict.consequence == (
+        "Repairs touch 41.3% of the map; without repairs, the mean thickness would be"
+        f" {mean - 0.06:.2f} instead of {mean:.2f} mm. Nothing is hatched as doubtful."
+    )
+    beside = metrics | {"repair_kinds": {"uncus": 1}, "repaired_fraction": 0.0}
+    verdict = verdict_of(changed(found, metrics=beside))
+    assert (verdict.reason, verdict.consequence) == (
+        "Labels were repaired: uncus excluded (1).",
+        "",
+    )
 
 
 def test_a_flag_decides_whatever_was_repaired(out):
     found = hemisphere(out, "01", "R")
     mean = found.summary["thickness_mean"]
     flags = [
-        flag("edge-notch", "a notch near RAS 1 2 3 mm: look; it concerns 20%", 0.2, -0.05),
+        flag("edge-notch", "a notch near RAS 1 2 3 mm: look", 0.2, -0.05),
         flag("noisy-labels", "noise: look", None, None),
     ]
     verdict = verdict_of(changed(found, decision="look", flags=flags))
