@@ -232,6 +232,11 @@ class CheckSettings(toml.SettingsTable):
     """Flag a band that is thicker than both by more than this, one per distance, mm."""
     flag_groove: toml.Numbers = (0.62, 0.85, 0.85)
     """Flag a band that is thinner than both by more than this, one per distance, mm."""
+    flag_bump: NonNegativeFloat = 5.8
+    """Flag a patch thicker than round about by more roughnesses of the smoother wall (128 real
+    hemispheres: 2 above it)."""
+    smooth_wall: PositiveFloat = 0.08
+    """Least roughness of a wall, mm: phantoms, which are smooth, stay below 4.5 times it."""
     uncus_reach: NonNegativeFloat = 2.0
     """Warn of an uncus that begins farther than this behind the anterior plane, mm."""
     flag_cavity: NonNegativeFloat = 0.03

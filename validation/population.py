@@ -83,6 +83,7 @@ CALIBRATED: Mapping[str, tuple[str, float]] = MappingProxyType(
         "subfield-gap": ("flag_subfield_gap", 1.5),
         "thickness-ridge": ("flag_ridge", 0.45),
         "thickness-groove": ("flag_groove", 0.55),
+        "wall-bump": ("flag_bump", 5.0),
         "thin-gap": ("flag_gap", 60),
     }
 )
