@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from hipsta_bids.errors import SettingsError
 from hipsta_bids.geometry.digital import CUBE, to_ras
-from hipsta_bids.protocols.protocol import Part, Tissue
+from hipsta_bids.protocols.protocol import LATERAL_END, MEDIAL_END, Part, Tissue
 from hipsta_bids.types import Bool, Float, LabelVolume, Sheet
 
 Position = tuple[float, float]
@@ -384,6 +384,60 @@ def _uncus(site: Site, size: float, _: Position, *, bridge: float) -> Defect:
     return Defect(volume=volume, changed=site.points[both])
 
 
+def _ball(site: Site, size: float, position: Position, *, wall: int) -> Defect:
+    """Let a ball of the sheet's label stand on a wall, over other labels; size is its radius."""
+    outward = site.normal(position) * (1 if wall else -1)
+    middle = site.column(position)[wall] + 0.6 * size * outward
+    return site.added(site.within(middle[None], size), position)
+
+
+def _thin_edge(site: Site, size: float, position: Position) -> Defect:
+    """Leave a wall of some thickness within 0.17 of the nearer edge; size is the thickness, mm."""
+    u = site.sheet_position[:, 0]
+    edge = u < 0.17 if position[0] < 0.5 else u > 0.83  # noqa: PLR2004 -- the middle
+    middle = site.columns[:, :, site.columns.shape[2] // 2].reshape(-1, 3)
+    return site.erased(site.among(edge) & ~site.within(middle, 0.5 * size))
+
+
+def _half_subfield(site: Site, size: float, position: Position) -> Defect:
+    """Erase the subfields of the nearer edge from the nearer end on; size is the share of v."""
+    edge = MEDIAL_END if position[0] < 0.5 else LATERAL_END  # noqa: PLR2004 -- the middle
+    v = site.v if position[1] < 0.5 else 1 - site.v  # noqa: PLR2004 -- the middle
+    return site.erased(np.isin(site.volume.tissue, edge) & (v > -0.5) & (v < size))  # noqa: PLR2004
+
+
+def _moved_end(site: Site, size: float, position: Position) -> Defect:
+    """Move the border to tail or head inward, or outward if negative; size is the step, mm."""
+    at_tail = position[1] < 0.5  # noqa: PLR2004 -- the middle
+    depth = site.v * site.length if at_tail else (1 - site.v) * site.length
+    labeled, body = site.volume.tissue > 0, site.volume.part == Part.BODY
+    if size > 0:
+        beyond = Part.TAIL if at_tail else Part.HEAD
+        return site.relabeled(body & labeled & (depth < size), Tissue.HIPPOCAMPUS, beyond)
+    nearest = ndimage.distance_transform_edt(
+        ~(body & labeled),
+        sampling=site.voxel_axes()[0],
+        return_distances=False,
+        return_indices=True,
+    )
+    where = ~body & labeled & (depth < 0) & (depth > size)
+    at, old = tuple(nearest), site.volume
+    tissue, part = (
+        np.where(where, old.tissue[at], old.tissue),
+        np.where(where, old.part[at], old.part),
+    )
+    return Defect(volume=replace(old, tissue=tissue, part=part), changed=site.points[where])
+
+
+def _fissure(site: Site, size: float, position: Position) -> Defect:
+    """Label what lies along 6 mm of the interior wall as CA1; size is the layer's thickness, mm."""
+    count = site.columns.shape[0] - 1
+    rows = slice(round((position[0] - 0.12) * count), round((position[0] + 0.12) * count))
+    near = site.within(site.columns[rows, :, 0].reshape(-1, 3), size)
+    where = near & ~site.wall & site.slab(position, 6.0)
+    return site.relabeled(where, Tissue.CA1, Part.BODY)
+
+
 #: Functions by kind of damage; their docstrings say what the size means.
 DEFECTS: Mapping[str, Callable[[Site, float, Position], Defect]] = MappingProxyType(
     {
@@ -414,6 +468,12 @@ DEFECTS: Mapping[str, Callable[[Site, float, Position], Defect]] = MappingProxyT
         "cyst": _cyst,
         "stratum": _stratum,
         "ragged-end": _ragged_end,
+        "ball-interior": partial(_ball, wall=0),
+        "ball-exterior": partial(_ball, wall=-1),
+        "thin-edge": _thin_edge,
+        "half-subfield": _half_subfield,
+        "moved-end": _moved_end,
+        "fissure": _fissure,
         "uncus": partial(_uncus, bridge=0.0),
         "attached-uncus": partial(_uncus, bridge=3.8),
     }

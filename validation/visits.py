@@ -92,7 +92,7 @@ class Person:
     """Whether the visits are also measured on the sheet of the labels before the scans."""
     layers: tuple[float, ...] = ()
     """mm, lost at each visit from all sides of the sheet's labels."""
-    points: tuple[int, int, int] = (1, 1, 1)
+    shares_of: tuple[int, int, int] = (1, 1, 1)
     """Along the axes of each voxel; several give shares, of which separate sheets know nothing."""
 
 
@@ -235,7 +235,7 @@ def draw_posed(person: Person) -> tuple[list[LabelVolume], list[Float], str]:
     poses: list[Float] = []
     if person.voxels:
         scans = [
-            scan(volume, voxel, person.noise, random, person.points)
+            scan(volume, voxel, person.noise, random, person.shares_of)
             for volume, voxel in zip(volumes, person.voxels, strict=True)
         ]
         volumes, poses = [volume for volume, _ in scans], [pose for _, pose in scans]
@@ -397,7 +397,7 @@ def people(full: bool, labels: Path | None) -> dict[str, list[Person]]:
     pairs = revisions(labels, Settings())
     return {
         "real, 0.4 mm": real([*items, *beside][few], true=True),
-        **({SHARES: real([*items, *beside], points=POINTS)} if full else {}),
+        **({SHARES: real([*items, *beside], shares_of=POINTS)} if full else {}),
         "real, 2 mm slices": (
             [
                 replace(person, seed=person.seed + 1000 * draw)

@@ -108,7 +108,7 @@ def load(out_dir: str | Path, *, protocol: str | None = None, region: str = "bod
     {'protocol': 1, 'participant': 10, 'session': 1, 'side': 1, 'x': 41, 'y': 21}
     >>> thickness = maps.thickness.sel(side="L").mean("participant").squeeze()
     >>> print(f"{thickness.mean().item():.2f} {maps.thickness.units}")
-    1.75 mm
+    1.74 mm
     """
     root = Path(out_dir)
     if not root.is_dir():

@@ -152,13 +152,12 @@ def resample_body(body: Body, hemi: str, settings: GridSettings, slices: SliceSe
     cavities = cavities[body.tissue[tuple(cavities.T)] > 0]
     sigma = max(settings.smoothing * in_plane_voxel(body.affine), settings.min_smoothing)
     values = values.reshape(grid.shape)
-    smooth = smooth_body(values, sigma, in_plane_voxel(body.affine), settings.spacing)
+    weight = None
     if body.soft:
         # Less where shares already say where the wall is; as much as ever where they are 0 or 1.
-        sharp = _smooth(values, SHARE_SMOOTHING * sigma / settings.spacing)
         weights = _soft_weights(body.soft.values, np.linalg.norm(body.affine[:3, :3], axis=0))
         weight = _sample(body, points, weights).reshape(grid.shape)
-        smooth += weight * (sharp - smooth)
+    smooth = smooth_body(values, sigma, in_plane_voxel(body.affine), settings.spacing, weight)
     return Field(
         grid=grid,
         beyond=round(settings.beyond / grid.step),
@@ -313,17 +312,27 @@ def _smooth(values: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:
 
 
 def smooth_body(
-    values: NDArray[np.float32], sigma: float, voxel: float, spacing: float
+    values: NDArray[np.float32],
+    sigma: float,
+    voxel: float,
+    spacing: float,
+    weight: NDArray[np.float32] | None = None,
 ) -> NDArray[np.float32]:
     """Smooth a mask (A, B, W) by ``sigma``, mm, and leave the walls of thin sheets where they are.
 
-    The mask was interpolated between voxels with edges ``voxel``, mm; its nodes are ``spacing`` mm
-    apart. Smoothing makes a step at z = 0 to 2 F(z / sigma) - F(z / (sigma 2**0.5)), with the
-    normal distribution function F: below zero beyond two SDs. So the second wall of a thin sheet
-    raises the values at the first, and both would move outward. This is taken off again, by the
-    local thickness: twice the volume over the area of walls in a window.
+    Where ``weight``, 0 to 1, is 1, the mask is known by shares and smoothed less. It was
+    interpolated between voxels with edges ``voxel``, mm; its nodes are ``spacing`` mm apart.
+    Smoothing makes a step at z = 0 to 2 F(z / sigma) - F(z / (sigma 2**0.5)), with the normal
+    distribution function F: below zero beyond two SDs. So the second wall of a thin sheet raises
+    the values at the first, and both would move outward. This is taken off again, by the local
+    thickness: twice the volume over the area of walls in a window.
     """
     smooth = _smooth(values, sigma / spacing)
+    parts: list[tuple[Any, float, float]] = [(1.0, sigma, voxel**2 / 6)]
+    if weight is not None:
+        fine = SHARE_SMOOTHING * sigma
+        smooth += weight * (_smooth(values, fine / spacing) - smooth)
+        parts = [(1 - weight, sigma, voxel**2 / 6), (weight, fine, voxel**2 / 4)]
     window = partial(
         ndimage.gaussian_filter,
         sigma=THICKNESS_WINDOW / spacing,
@@ -334,11 +343,13 @@ def smooth_body(
     sharp = np.clip(sharp / np.maximum(_slope(smooth), 1e-3) + 0.5, 0, 1, dtype=np.float32)
     ratio = window(sharp) / np.maximum(window(_slope(sharp)), 1e-3) * spacing / THICKNESS_WINDOW
     thickness = np.linspace(0.3, 4.0, 75)
-    near, far = (thickness / np.sqrt(times * sigma**2 + voxel**2 / 6) for times in (1, 2))
-    raised = ndtr(-far) - 2 * ndtr(-near)
-    seen = thickness / THICKNESS_WINDOW
-    expected = (ndtr(seen) - 0.5) / ((1 + np.exp(-(seen**2) / 2)) / np.sqrt(2 * np.pi))
-    shift = np.interp(ratio, expected, np.maximum(raised, 0))
+    scaled = thickness / THICKNESS_WINDOW
+    expected = (ndtr(scaled) - 0.5) / ((1 + np.exp(-(scaled**2) / 2)) / np.sqrt(2 * np.pi))
+    shift = 0.0
+    for part, sd, variance in parts:
+        near, far = (thickness / np.sqrt(times * sd**2 + variance) for times in (1, 2))
+        raised = np.maximum(ndtr(-far) - 2 * ndtr(-near), 0)
+        shift = shift + part * np.interp(ratio, expected, raised)
     return np.asarray(smooth - shift * np.clip(4 * smooth * (1 - smooth), 0, 1), dtype=np.float32)
 
 

@@ -117,7 +117,7 @@ def test_alignment_of_one_grid_fades_in_without_a_step(visits, monkeypatch):
     shifted = np.roll(volume.tissue, 1, axis=1), np.roll(volume.part, 1, axis=1)
     pair = [volume, replace(volume, tissue=shifted[0], part=shifted[1])]
     apart = []
-    distances = np.arange(0.0, 0.8, 0.02)
+    distances = np.arange(0.0, 0.8, 0.05)
     for distance in distances:
         monkeypatch.setattr(alignment, "_spread", lambda *_, to=distance: to)
         first, second = align(pair, "L")
@@ -125,7 +125,7 @@ def test_alignment_of_one_grid_fades_in_without_a_step(visits, monkeypatch):
     assert apart[0] == 0
     assert apart[-1] == pytest.approx(0.4, abs=0.05)  # the voxel
     assert np.interp(0.1, distances, apart) < 0.01
-    assert 0 <= np.diff(apart).min() <= np.diff(apart).max() < 0.05
+    assert 0 <= np.diff(apart).min() <= np.diff(apart).max() < 0.1  # the voxel in one step: 0.4
 
 
 def test_visits_that_share_no_space_are_refused(visits):

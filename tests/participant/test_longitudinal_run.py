@@ -93,9 +93,9 @@ def test_each_visit_has_the_files_of_a_visit_alone(data, out, tmp_path):
 
 def test_the_change_is_the_planted_change(out):
     means = [thickness(out, session).mean() for session in THICKNESS]
-    # Each visit alone is off by up to 0.02 mm in voxels of 0.5 mm.
-    assert means[2] - means[0] == pytest.approx(-0.2, abs=0.03)
-    assert means[1] - means[0] == pytest.approx(-0.1, abs=0.03)
+    # Each visit alone is off by up to 0.02 mm in voxels of 0.5 mm, so a change by twice as much.
+    assert means[2] - means[0] == pytest.approx(-0.2, abs=0.04)
+    assert means[1] - means[0] == pytest.approx(-0.1, abs=0.04)
 
 
 def test_the_template_has_mean_and_sd_of_the_visits(out):

@@ -104,7 +104,9 @@ def test_both_protocols_measure_the_same_hippocampi(out):
         - float(results(out, subject, hemi, "ashsABC3T").summary["thickness_mean"])
         for subject, hemi, seg in FREESURFER
     ]
-    assert np.abs(differences).max() < 0.35  # mm; the layer's rule alone moves means by .14 to .23
+    # mm; the layer's rule alone moves means by .14 to .23; slices move a single one by .1 more.
+    assert np.abs(differences).mean() < 0.23
+    assert np.abs(differences).max() < 0.4
 
 
 @pytest.mark.parametrize(("subject", "hemi", "seg"), [FREESURFER[0], ASHS[5]])

@@ -63,7 +63,10 @@ def test_smoothness_is_that_of_the_fields():
         assert width == pytest.approx(fwhm, rel=0.15)
 
 
-@pytest.mark.parametrize("fwhm", [4.0, 8.0, 15.0])
+@pytest.mark.parametrize(
+    "fwhm",
+    [pytest.param(4.0, marks=pytest.mark.long), 8.0, pytest.param(15.0, marks=pytest.mark.long)],
+)
 def test_independent_maps_seldom_correlate(fwhm):
     """With independent points assumed, half of all pairs have p < 0.05; with surrogates, 5 %."""
     maps = smooth(np.random.default_rng(int(fwhm)), fwhm, 600)
