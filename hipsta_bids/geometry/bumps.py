@@ -1,9 +1,11 @@
-"""Bumps of tissue on a wall of the sheet, and leaks at its ends.
+"""Bumps and dents of a wall of the sheet, also at its ends.
 
 Each column is compared with a line through the columns round it but not beside it, along either
 axis of the sheet: folds and subfield borders run along one axis and pass both comparisons. At an
 edge the line is extrapolated. The limit is a multiple of the roughness of the smoother wall.
 """
+
+from dataclasses import replace
 
 import numpy as np
 from scipy import ndimage
@@ -20,45 +22,90 @@ REACH = 2.5
 BAND = 4
 #: Ratio of the standard deviation to the median size of normal deviates.
 _SD = 1.4826
+#: Swellings of an end are averaged over this many rows, and this width along x, mm.
+END_ROWS, END_WIDTH = 2, 4.0
+#: They are compared with rows at these distances from the end, mm.
+END_COURSE = (3.0, 8.0)
 WALLS = ("interior", "exterior")
 #: A patch consists of the columns beyond this share of the limit.
 _PATCH = 0.5
 
 
 def check_bumps(sheet: Sheet, settings: CheckSettings) -> list[Finding]:
-    """Flag patches in which the sheet is thicker than the columns round the patch predict.
+    """Flag patches in which the sheet is thicker or thinner than the columns round them predict.
 
     One finding for each patch with more than half of the limit.
     """
-    points, limit = _filled(sheet), settings.flag_bump
+    points = _filled(sheet)
     middle, walls = points[:, :, sheet.middle], points[:, :, [0, -1]]
-    counts = middle.shape[:2]
-    steps = [float(np.median(np.linalg.norm(np.diff(middle, axis=k), axis=-1))) for k in (0, 1)]
+    counts, steps = middle.shape[:2], _steps(middle)
     if any((n - 1) * step < 3 * GAP for n, step in zip(counts, steps, strict=True)):
         return []
     along_x, along_y = map(predictor, counts, steps)
     stands = _stand_out(walls, along_y)
-    thickness = measure_thickness(Sheet(points=points, valid=sheet.valid))
+    thickness = measure_thickness(replace(sheet, points=points))
     excess = thickness - thickness @ along_y.T
     across = (thickness - along_x @ thickness) / _size(along_x)[:, None]
-    joint = np.sqrt(np.maximum(excess, 0) / _size(along_y) * np.maximum(across, 0))
+    # Zero where the two differ in sign.
+    joint = np.sign(excess) * np.sqrt(np.maximum(excess / _size(along_y) * across, 0))
     score = joint / np.maximum(_roughness(stands).min(axis=-1), settings.smooth_wall)
     findings = []
-    for patch in _patches(score, limit):
-        peak = np.unravel_index(np.where(patch, score, 0).argmax(), score.shape)
-        wall, count = int(stands[peak].argmax()), int(patch.sum())
+    for sign, reason, limit, verb, kind, remedy in (
+        (1, "wall-bump", settings.flag_bump, "stands out", "thicker", "labels that leaked"),
+        (-1, "wall-dent", settings.flag_dent, "recedes", "thinner", "missing labels"),
+    ):
+        for patch in _patches(sign * score, limit):
+            peak = np.unravel_index(np.where(patch, sign * score, 0).argmax(), score.shape)
+            wall, count = int((sign * stands[peak]).argmax()), int(patch.sum())
+            findings.append(
+                Finding(
+                    reason=reason,
+                    value=float(abs(score[peak])),
+                    limit=limit,
+                    text=f"the {WALLS[wall]} wall {verb}: the sheet is {abs(excess[peak]):.1f} mm "
+                    f"{kind} than round about, over {count} grid point{'s' * (count > 1)}",
+                    remedy=f"look for {remedy}",
+                    points=walls[patch, wall],
+                )
+            )
+    return findings
+
+
+def check_swollen_ends(sheet: Sheet, settings: CheckSettings) -> list[Finding]:
+    """Flag an end that is thicker than the sheet farther in, over more than bumps cover.
+
+    The end's rows, averaged over some millimeters along x, are compared with the median of rows
+    farther in.
+    """
+    points = _filled(sheet)
+    middle, thickness = points[:, :, sheet.middle], measure_thickness(replace(sheet, points=points))
+    step_x, step_y = _steps(middle)
+    half = round(END_WIDTH / step_x / 2)
+    inner = slice(*(round(distance / step_y) for distance in END_COURSE))
+    findings = []
+    for end, way in (("posterior", 1), ("anterior", -1)):
+        inward = thickness[:, ::way]
+        above = inward[:, :END_ROWS].mean(axis=1) - np.median(inward[:, inner], axis=1)
+        swelling = ndimage.uniform_filter1d(above, 2 * half + 1)
+        column = int(swelling.argmax())
+        near = slice(max(column - half, 0), column + half + 1)
         findings.append(
             Finding(
-                reason="wall-bump",
-                value=float(score[peak]),
-                limit=limit,
-                text=f"the {WALLS[wall]} wall stands out: the sheet is {excess[peak]:.1f} mm "
-                f"thicker than round about, over {count} grid point{'s' if count > 1 else ''}",
+                reason="end-swollen",
+                value=float(swelling[column]),
+                limit=settings.flag_swollen_end,
+                text=f"the {end} end of the sheet is {swelling[column]:.1f} mm thicker than "
+                "the sheet farther in",
                 remedy="look for labels that leaked",
-                points=walls[patch, wall],
+                points=middle[near, ::way][:, :END_ROWS].reshape(-1, 3),
             )
         )
     return findings
+
+
+def _steps(middle: Float) -> list[float]:
+    """Median distance of neighboring points (Nx, Ny, 3) along x and along y, mm."""
+    return [float(np.median(np.linalg.norm(np.diff(middle, axis=k), axis=-1))) for k in (0, 1)]
 
 
 def _stand_out(walls: Float, along_y: Float) -> Float:

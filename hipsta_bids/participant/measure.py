@@ -16,7 +16,7 @@ from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry import sheet_checks
 from hipsta_bids.geometry.body import Body, check_mask, check_side, extract_body
 from hipsta_bids.geometry.boundaries import Boundaries, find_boundaries
-from hipsta_bids.geometry.bumps import check_bumps
+from hipsta_bids.geometry.bumps import check_bumps, check_swollen_ends
 from hipsta_bids.geometry.catalog import (
     Measured,
     average_profiles,
@@ -219,6 +219,7 @@ def find_all(evidence: Evidence) -> list[Finding]:
         *sheet_checks.check_subfields(sheet, evidence.subfield, checks),
         *sheet_checks.check_ridges(sheet, evidence.thickness, checks),
         *check_bumps(sheet, checks),
+        *check_swollen_ends(sheet, checks),
     ]
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from sheet_cases import grid, sheet_of
 
-from hipsta_bids.geometry.bumps import GAP, REACH, check_bumps, predictor
+from hipsta_bids.geometry.bumps import GAP, REACH, check_bumps, check_swollen_ends, predictor
 from hipsta_bids.settings import CheckSettings
 
 CHECKS = CheckSettings()
@@ -50,6 +50,31 @@ def test_a_bump_is_flagged_where_it_is(wall, x, y):
     assert np.linalg.norm(flag.points.mean(axis=0) - middle) < 0.6
 
 
+@pytest.mark.parametrize("wall", ["interior", "exterior"])
+@pytest.mark.parametrize("y", [1.0, 9.0, 19.0])
+def test_a_dent_is_flagged_where_it_is(wall, y):
+    sheet = pipe(**{wall: -ball(1.0, 10, y)})
+    (flag,) = raised(sheet)
+    assert flag.reason == "wall-dent"
+    assert flag.text.startswith(f"the {wall} wall recedes: the sheet is 1.0 mm thinner")
+    middle = sheet.points[20, round(y), 0 if wall == "interior" else -1]
+    assert np.linalg.norm(flag.points.mean(axis=0) - middle) < 0.6  # mm
+
+
+@pytest.mark.parametrize(("end", "y"), [("posterior", 0.0), ("anterior", 20.0)])
+def test_an_end_swollen_over_more_than_bumps_cover_is_flagged(end, y):
+    sheet = pipe(exterior=ball(3.0, 10, y, radius=5.0))
+    flags = [finding for finding in check_swollen_ends(sheet, CHECKS) if finding.raised]
+    assert [flag.reason for flag in flags] == ["end-swollen"]
+    assert end in flags[0].text
+    middle = sheet.points[20, round(y), sheet.middle]
+    assert np.linalg.norm(flags[0].points.mean(axis=0) - middle) < 1.5  # mm
+    # As thick as that everywhere, or thicker steadily: no swelling.
+    for wall in (2.5, np.linspace(0, 2.5, 21), ball(3.0, 10, 10, radius=5.0)):
+        found = check_swollen_ends(pipe(exterior=wall), CHECKS)
+        assert not any(finding.raised for finding in found)
+
+
 def test_two_bumps_are_two_findings():
     flags = raised(pipe(exterior=ball(1.0, 5, 9) + ball(1.2, 14, 10)))
     assert len(flags) == 2
@@ -66,8 +91,7 @@ def test_two_bumps_are_two_findings():
         pipe(exterior=np.where(np.arange(21) > 9, 0.8, 0.0)),  # a step
         pipe(exterior=0.9 * (np.arange(21) == 9)),  # a band across the axis
         pipe(exterior=ball(1.0, 10, 9), interior=-ball(1.0, 10, 9)),  # a fold of both walls
-        pipe(exterior=ball(2.5, 10, 10, radius=12.0)),  # wide
-        pipe(exterior=-ball(1.0, 10, 9)),
+        pipe(exterior=2.5 * ball(1.0, 10, 10, radius=12.0) ** 2),  # wide
     ],
 )
 def test_what_is_no_bump_passes(sheet):
@@ -77,7 +101,8 @@ def test_what_is_no_bump_passes(sheet):
 def test_a_bump_on_a_rough_sheet_is_none():
     noise = np.random.default_rng(3).normal(scale=0.3, size=(2, 41, 21))
     bump = ball(1.0, 10, 9)
-    assert raised(pipe(exterior=noise[0] + bump, interior=noise[1])) == []
+    flags = raised(pipe(exterior=noise[0] + bump, interior=noise[1]))
+    assert "wall-bump" not in [flag.reason for flag in flags]
     assert raised(pipe(exterior=bump + 0.1 * noise[0], interior=0.1 * noise[1])) != []
 
 
