@@ -217,7 +217,7 @@ def find_all(evidence: Evidence) -> list[Finding]:
         *sheet_checks.check_rows(sheet, checks),
         *sheet_checks.check_edges(evidence.whole, checks),
         *sheet_checks.check_subfields(sheet, evidence.subfield, checks),
-        *sheet_checks.check_ridges(sheet, evidence.thickness, checks),
+        sheet_checks.check_grooves(sheet, evidence.thickness, checks),
         *check_bumps(sheet, checks),
         *check_swollen_ends(sheet, checks),
     ]

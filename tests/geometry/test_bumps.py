@@ -75,6 +75,12 @@ def test_an_end_swollen_over_more_than_bumps_cover_is_flagged(end, y):
         assert not any(finding.raised for finding in found)
 
 
+def test_a_band_over_part_of_the_width_is_a_bump():
+    sheet = pipe(exterior=2.5 * np.outer(np.abs(np.arange(41) - 20) < 6, np.arange(21) == 9))
+    (flag,) = [flag for flag in raised(sheet) if flag.reason == "wall-bump"]
+    assert "2.5 mm thicker" in flag.text
+
+
 def test_two_bumps_are_two_findings():
     flags = raised(pipe(exterior=ball(1.0, 5, 9) + ball(1.2, 14, 10)))
     assert len(flags) == 2
