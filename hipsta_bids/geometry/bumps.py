@@ -68,7 +68,9 @@ def check_bumps(sheet: Sheet, settings: CheckSettings) -> list[Finding]:
                     points=walls[patch, wall],
                 )
             )
-    return findings
+    # Beside a bump, lines through it predict too much: no dents. The same beside a dent.
+    largest = max(findings, key=lambda finding: finding.margin, default=None)
+    return [finding for finding in findings if largest and finding.reason == largest.reason]
 
 
 def check_swollen_ends(sheet: Sheet, settings: CheckSettings) -> list[Finding]:
