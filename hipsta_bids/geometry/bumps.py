@@ -76,14 +76,15 @@ def check_bumps(sheet: Sheet, settings: CheckSettings) -> list[Finding]:
 def check_swollen_ends(sheet: Sheet, settings: CheckSettings) -> list[Finding]:
     """Flag an end that is thicker than the sheet farther in, over more than bumps cover.
 
-    The end's rows, averaged over some millimeters along x, are compared with the median of rows
-    farther in.
+    The outer rows, averaged along x, are compared with the median of rows farther in.
     """
     points = _filled(sheet)
     middle, thickness = points[:, :, sheet.middle], measure_thickness(replace(sheet, points=points))
     step_x, step_y = _steps(middle)
     half = round(END_WIDTH / step_x / 2)
     inner = slice(*(round(distance / step_y) for distance in END_COURSE))
+    if inner.start >= middle.shape[1]:  # too short
+        return []
     findings = []
     for end, way in (("posterior", 1), ("anterior", -1)):
         inward = thickness[:, ::way]

@@ -123,6 +123,7 @@ def test_undefined_columns_are_no_bumps():
 def test_a_sheet_too_short_for_neighbors_is_passed_over():
     points = pipe(exterior=ball(1.0, 10, 9)).points * [1, 1, 0.3]
     assert check_bumps(sheet_of(points), CHECKS) == []
+    assert check_swollen_ends(sheet_of(points * [1, 1, 0.4]), CHECKS) == []
 
 
 def test_lines_are_predicted_exactly_without_what_is_near():
