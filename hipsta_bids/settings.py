@@ -228,10 +228,17 @@ class CheckSettings(toml.SettingsTable):
     """Flag rows without their edge's subfield over more than this, mm (1.2 at most in 128)."""
     flag_edge: toml.Numbers = (1.8, 2.2, 2.7)
     """Flag an edge that recedes behind both by more than this, one per distance, mm."""
-    flag_ridge: toml.Numbers = (1.4, 2.3, 2.15)
-    """Flag a band that is thicker than both by more than this, one per distance, mm."""
     flag_groove: toml.Numbers = (0.62, 0.85, 0.85)
-    """Flag a band that is thinner than both by more than this, one per distance, mm."""
+    """Flag a band that is thinner than both sides by more than this, one per distance, mm."""
+    flag_bump: NonNegativeFloat = 5.8
+    """Flag a patch thicker than round about by more roughnesses of the smoother wall (128 real
+    hemispheres: 2 above it)."""
+    flag_dent: NonNegativeFloat = 5.1
+    """The same for a thinner patch (4.6 at most in them, 4.9 in 156 phantoms)."""
+    flag_swollen_end: NonNegativeFloat = 1.9
+    """Flag an end that is thicker than the sheet farther in by more, mm (1.7 at most in them)."""
+    smooth_wall: PositiveFloat = 0.08
+    """Least roughness of a wall, mm: phantoms, which are smooth, stay below 5 times it."""
     uncus_reach: NonNegativeFloat = 2.0
     """Warn of an uncus that begins farther than this behind the anterior plane, mm."""
     flag_cavity: NonNegativeFloat = 0.03

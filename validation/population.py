@@ -81,8 +81,10 @@ CALIBRATED: Mapping[str, tuple[str, float]] = MappingProxyType(
         "extent-dip": ("flag_row_dip", 0.15),
         "edge-notch": ("flag_edge", 1.0),
         "subfield-gap": ("flag_subfield_gap", 1.5),
-        "thickness-ridge": ("flag_ridge", 0.45),
         "thickness-groove": ("flag_groove", 0.55),
+        "wall-bump": ("flag_bump", 5.0),
+        "wall-dent": ("flag_dent", 5.0),
+        "end-swollen": ("flag_swollen_end", 1.5),
         "thin-gap": ("flag_gap", 60),
     }
 )

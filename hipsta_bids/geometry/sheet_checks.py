@@ -18,9 +18,9 @@ ROW_DIP_REACH = 8.0
 #: Edges are compared with themselves at these distances along the axis on both sides, mm.
 EDGE_REACH = (2.5, 3.5, 5.0)
 #: Thickness is compared with that at these distances along the axis on both sides, mm.
-RIDGE_REACH = (1.0, 2.0, 3.0)
-#: Width over which thickness is averaged before ridges are sought, mm.
-RIDGE_WIDTH = 4.0
+GROOVE_REACH = (1.0, 2.0, 3.0)
+#: Width over which thickness is averaged before grooves are sought, mm.
+GROOVE_WIDTH = 4.0
 #: The way into the sheet goes from an edge to the columns at this distance from it, mm.
 INWARD = 2.5
 
@@ -134,41 +134,32 @@ def _known(points: Float) -> Float:
     return points[np.isfinite(points).all(axis=1)]
 
 
-def check_ridges(sheet: Sheet, thickness: Float, settings: CheckSettings) -> list[Finding]:
-    """Flag a band across the axis where thickness (Nx, Ny), mm, differs from that on both sides.
+def check_grooves(sheet: Sheet, thickness: Float, settings: CheckSettings) -> Finding:
+    """Flag a band across the axis where thickness (Nx, Ny), mm, is less than on both sides.
 
-    Labels that leaked, or that a bar or a dent has changed, show in few cross-sections; thickness
-    of a whole sheet changes more slowly along the axis.
+    A dent, or a bar that was cut, shows in few cross-sections; thickness of a whole sheet changes
+    more slowly along the axis.
     """
-    middle = sheet.points[:, :, sheet.middle]
-    findings = []
-    for reason, sign, limits, description in (
-        ("thickness-ridge", 1, settings.flag_ridge, "thicker"),
-        ("thickness-groove", -1, settings.flag_groove, "thinner"),
-    ):
-        columns = max(round(RIDGE_WIDTH / _step(middle, axis=0)), 1)
-        bands = _bands(sign * thickness, limits, _step(middle, axis=1), columns)
-        excess, size, (column, row) = max(bands, default=(0.0, 0.0, (0, 0)))
-        half = columns // 2
-        findings.append(
-            Finding(
-                reason=reason,
-                value=size,
-                limit=size / excess if excess else limits[0],
-                text=f"a band of the sheet is {size:.1f} mm {description} than the sheet before "
-                "and behind it",
-                remedy="look at the labels there",
-                points=_known(middle[max(column - half, 0) : column + half + 1, row]),
-            )
-        )
-    return findings
+    middle, limits = sheet.points[:, :, sheet.middle], settings.flag_groove
+    columns = max(round(GROOVE_WIDTH / _step(middle, axis=0)), 1)
+    bands = _bands(-thickness, limits, _step(middle, axis=1), columns)
+    excess, size, (column, row) = max(bands, default=(0.0, 0.0, (0, 0)))
+    half = columns // 2
+    return Finding(
+        reason="thickness-groove",
+        value=size,
+        limit=size / excess if excess else limits[0],
+        text=f"a band of the sheet is {size:.1f} mm thinner than the sheet before and behind it",
+        remedy="look at the labels there",
+        points=_known(middle[max(column - half, 0) : column + half + 1, row]),
+    )
 
 
 def _bands(
     thickness: Float, limits: tuple[float, ...], step: float, columns: int
 ) -> Iterator[tuple[float, float, tuple[int, int]]]:
     """Thickest band at each distance: times the limit, mm above both sides, and column."""
-    for reach, limit in zip(RIDGE_REACH, limits, strict=True):
+    for reach, limit in zip(GROOVE_REACH, limits, strict=True):
         k = max(round(reach / step), 1)
         if 2 * k >= thickness.shape[1]:
             continue

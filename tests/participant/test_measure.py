@@ -271,7 +271,10 @@ def test_a_hole_is_filled_and_reported(plain, damage):
 def test_a_bridge_is_cut_and_reported(plain, damage):
     where = damage.bar((0.2, 0.5, -0.8), (0.8, 0.5, -0.8), 0.5)
     maps = measure(damage.relabel(where, Tissue.CA1))
-    assert maps.decision == Decision.USE
+    (flag,) = maps.flags  # a stump of the bar, where the map is wrong
+    assert flag.reason == "wall-bump"
+    near = np.linalg.norm(maps.sheet.points[:, :, 0, None] - flag.points, axis=-1).min(axis=2) < 0.1
+    assert (maps.thickness - plain.maps.thickness)[near].max() > 0.5
     (repair,) = maps.repairs
     assert repair.startswith("a bridge of")
     assert maps.qc["euler_before"] == 0
