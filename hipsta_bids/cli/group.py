@@ -147,6 +147,11 @@ def _add_sheets(parser: Parser) -> None:
         "exclude hemispheres to look at first, unless --ratings has use",
     )
     add(
+        "--exclude-outliers",
+        "",
+        "exclude hemispheres with a cohort_outlier in measures.tsv, unless --ratings has use",
+    )
+    add(
         "--exclude-qc",
         "CONDITION...",
         "exclude by quality metrics, as 'filled_fraction > 0.01' 'voxels_across < 3'; one "

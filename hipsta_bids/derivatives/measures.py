@@ -4,7 +4,7 @@ It follows ``status.tsv``: a row is read from the quality record and the summary
 the status has changed. Whoever ends last, a shard or the run itself, finds all rows there.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -12,9 +12,11 @@ from typing import Any
 from hipsta_bids.derivatives import dataset
 from hipsta_bids.derivatives.hemisphere import summary_definition
 from hipsta_bids.derivatives.names import DATASET_FILES, HemisphereName
+from hipsta_bids.derivatives.outliers import SIZE, TEXT, compare
 from hipsta_bids.derivatives.results import ResultPlace, read_record, read_summary_cells
 from hipsta_bids.errors import InputError
 from hipsta_bids.io import files
+from hipsta_bids.types import Decision
 
 #: Cells that identify a hemisphere, as in ``ratings.tsv``.
 _KEY = ("participant_id", "session_id", "hemi", "protocol", "region")
@@ -22,6 +24,7 @@ _ORIGIN = "labels_"
 _MEANINGS = dataset.TABLES["status"] | dataset.TABLES["measures"]
 _COLUMNS = {
     **{name: _MEANINGS[name] for name in (*_KEY, "decision", "reason", "rating", "repairs")},
+    **{name: _MEANINGS[name] for name in (SIZE, TEXT)},
     **{f"{_ORIGIN}{name}": about for name, about in dataset.TABLES["provenance"].items()},
     **{name: _MEANINGS[name] for name in ("version", "settings_hash", "input_hash")},
 }
@@ -39,14 +42,19 @@ def origin(record: Mapping[str, Any]) -> dict[str, str]:
     return {f"{_ORIGIN}{name}": cell for name, cell in dataset.provenance_of(record).items()}
 
 
-def write_measures(root: Path) -> None:
-    """Bring the table of a dataset and its sidecar up to date."""
+def write_measures(root: Path, *, complete: bool = False) -> None:
+    """Bring the table of a dataset and its sidecar up to date.
+
+    ``complete`` compares hemispheres that are new with the others, which reads all sheets.
+    """
     path = root / DATASET_FILES["measures"]
     with files.locked(root, path.name):
         earlier = {_key(row): row for row in dataset.read_table(path, _KEY)}
         ratings = dataset.read_table(root / DATASET_FILES["ratings"], _KEY)
         rated = {_key(row): row for row in ratings}
         rows = [row | {"rating": _rating(row, rated)} for row in _current_rows(root, earlier)]
+        if complete:
+            _compare_rows(root, rows)
         numbers = dict.fromkeys(name for row in rows for name in row if name not in _COLUMNS)
         columns = (*_COLUMNS, *numbers)
         cells = ([row.get(column, files.MISSING) for column in columns] for row in rows)
@@ -56,6 +64,19 @@ def write_measures(root: Path) -> None:
             dataset.describe_columns(_COLUMNS)
             | {name: summary_definition(name) for name in numbers},
         )
+
+
+def _compare_rows(root: Path, rows: Sequence[dict[str, str]]) -> None:
+    """Add what differs from other hemispheres, to all of a protocol and region if any is new."""
+    measured = {
+        ResultPlace(root=root, name=_name(row)): row
+        for row in rows
+        if row["decision"] != Decision.FAILED
+    }
+    new = [p.name.protocol for p, row in measured.items() if files.is_missing(row.get(SIZE, ""))]
+    for protocol in set(new):
+        for place, cells in compare([p for p in measured if p.name.protocol == protocol]):
+            measured[place].update(cells)
 
 
 def _current_rows(
@@ -72,6 +93,12 @@ def _current_rows(
                 row = identity | read_row(ResultPlace(root=root, name=name))
         if row:
             yield dict(row)
+
+
+def read_compared(root: Path) -> dict[str, dataset.Row]:
+    """Read rows of hemispheres that were compared with others, by title of the hemisphere."""
+    rows = dataset.read_table(root / DATASET_FILES["measures"], (*_KEY, SIZE, TEXT))
+    return {_name(row).title: row for row in rows if not files.is_missing(row[SIZE])}
 
 
 def read_row(result: ResultPlace) -> dict[str, str]:
@@ -91,6 +118,11 @@ def read_row(result: ResultPlace) -> dict[str, str]:
 
 def _key(row: dataset.Row) -> tuple[str, ...]:
     return tuple(row[column] for column in _KEY)
+
+
+def _name(row: dataset.Row) -> HemisphereName:
+    names = {"subject": row["participant_id"], "session": row["session_id"]}
+    return dataset.name_of({**row, **names, "seg": row["protocol"]})
 
 
 def _rating(row: dataset.Row, rated: Mapping[tuple[str, ...], dataset.Row]) -> str:

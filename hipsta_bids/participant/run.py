@@ -229,7 +229,7 @@ def _run(
             _write_inputs(out_dir, options, outcomes)
             table.close()
             if not any(isinstance(outcome.error, OutputError) for outcome in outcomes):
-                write_measures(out_dir)
+                write_measures(out_dir, complete=shard is None)
             if pages.enabled and shard is None:
                 copies += _find_copies(jobs, out_dir)
         result = RunResult(

@@ -14,12 +14,14 @@ import numpy as np
 
 from hipsta_bids.derivatives.copies import describe_copies, same_labels
 from hipsta_bids.derivatives.dataset import container_of_process
+from hipsta_bids.derivatives.measures import read_compared
 from hipsta_bids.derivatives.names import (
     DATASET_FILES,
     HemisphereName,
     output_name,
     participant_report,
 )
+from hipsta_bids.derivatives.outliers import FEWEST, SIZE, TEXT
 from hipsta_bids.errors import InputError
 from hipsta_bids.geometry.catalog import SUMMARY
 from hipsta_bids.io import files
@@ -33,14 +35,6 @@ from hipsta_bids.types import Decision, Float
 
 #: Least number of hemispheres whose range is shown.
 SMALLEST_COHORT = 5
-
-#: Least number among which outliers are sought: with fewer, the spread is too uncertain.
-SMALLEST_COMPARED = 10
-
-#: Robust z-scores beyond this are rare without a cause (Iglewicz and Hoaglin 1993).
-OUTLIER = 3.5
-
-_MAD_TO_SD = 1.4826  # of a normal distribution
 
 #: Columns of the table, with shorter titles than those of the measures.
 _SUMMARY = {
@@ -88,6 +82,8 @@ class Cohort:
     hemispheres: tuple[Hemisphere, ...]
     settings: Mapping[str, Any]
     """Resolved, by stage."""
+    compared: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+    """Cells of ``measures.tsv`` of hemispheres that were compared with others, by title."""
     origins: Mapping[str, tuple[str | None, str]] = field(default_factory=dict)
     """Command and time of the run that measured a hemisphere, by its title; from the logs."""
 
@@ -130,7 +126,12 @@ def read_cohort(root: Path) -> Cohort:
     except InputError:
         settings = {}
     hemispheres = tuple(hemisphere for hemisphere in find_results(root) if _is_readable(hemisphere))
-    return Cohort(hemispheres=hemispheres, settings=settings, origins=_read_origins(root))
+    return Cohort(
+        hemispheres=hemispheres,
+        settings=settings,
+        compared=read_compared(root),
+        origins=_read_origins(root),
+    )
 
 
 def _is_readable(hemisphere: Hemisphere) -> bool:
@@ -160,69 +161,15 @@ def _read_origins(root: Path) -> dict[str, tuple[str | None, str]]:
     return origins
 
 
-def robust_scores(values: Float) -> Float:
-    """Robust z-scores: distance from the median over the scaled median absolute deviation.
-
-    NaN where values are missing, 0 where nothing varies.
-    """
-    differences = values - np.nanmedian(values, axis=0)
-    spread = _MAD_TO_SD * np.nanmedian(np.abs(differences), axis=0)
-    return np.where(spread > 0, differences / np.where(spread > 0, spread, 1.0), 0.0 * differences)
-
-
-def distances(cohort: Cohort, thickness: Mapping[str, Float]) -> dict[str, tuple[float, str]]:
-    """Compute how far each hemisphere is from others of its side, protocol and region.
-
-    Returns its largest robust z-score and the title of that number; nothing of few hemispheres.
-    """
-    kinds: dict[tuple[str, str, str], list[Hemisphere]] = {}
-    for hemisphere in cohort.hemispheres:
-        if hemisphere.measured:
-            kinds.setdefault(_kind(hemisphere.result.name), []).append(hemisphere)
-    farthest_of = {}
-    for members in kinds.values():
-        if len(members) < SMALLEST_COMPARED:
-            continue
-        table = np.array([[h.summary.get(name, np.nan) for name in MEASURES] for h in members])
-        titles = [measure["title"] for measure in MEASURES.values()]
-        maps = [thickness.get(h.result.name.title, np.empty((0, 0))) for h in members]
-        scores = np.abs(np.nan_to_num(robust_scores(table)))
-        if maps[0].size and len({m.shape for m in maps}) == 1:
-            # A map much like the median map is no outlier.
-            departure = np.maximum(robust_scores(_departure(np.array(maps))), 0)
-            scores = np.column_stack([scores, departure])
-            titles.append("Map of thickness")
-        for row, hemisphere in zip(scores, members, strict=True):
-            farthest = int(np.argmax(row))
-            farthest_of[hemisphere.result.name.title] = float(row[farthest]), titles[farthest]
-    return farthest_of
-
-
-def _departure(maps: Float) -> Float:
-    """(N,) root mean square over the sheet of each map's difference from the median map, mm."""
-    maps = np.where(np.isfinite(maps).any(axis=0), maps, 0.0)  # none departs where none is known
-    differences = maps - np.nanmedian(maps, axis=0)
-    return np.asarray(np.sqrt(np.nanmean(differences**2, axis=(1, 2))), dtype=np.float64)
-
-
 def cohort_page(cohort: Cohort) -> str | None:
     """Make the page about all hemispheres of an output dataset."""
     hemispheres = cohort.ranking
     if not hemispheres:
         return None
     maps = [read_maps(h) if h.measured else {} for h in hemispheres]
-    thickness = {
-        h.result.name.title: found["thickness"]
-        for h, found in zip(hemispheres, maps, strict=True)
-        if found
-    }
-    outliers = distances(cohort, thickness)
     sprites, columns, tiles = make_sprites(maps)
     counts = Counter(h.decision for h in hemispheres)
-    rows = [
-        _row(h, cohort, outliers.get(h.result.name.title), tiles.get(n))
-        for n, h in enumerate(hemispheres)
-    ]
+    rows = [_row(h, cohort, tiles.get(n)) for n, h in enumerate(hemispheres)]
     return render(
         "cohort.html",
         title="All hemispheres",
@@ -233,16 +180,14 @@ def cohort_page(cohort: Cohort) -> str | None:
             describe_copies(names)
             for names in same_labels((h.result.name, h.record) for h in hemispheres)
         ],
-        n_apart=sum(score > OUTLIER for score, _ in outliers.values()),
-        apart=OUTLIER,
-        smallest=SMALLEST_COMPARED,
-        compared=bool(outliers),
+        n_apart=sum(bool(row["farthest"]) for row in rows),
+        smallest=FEWEST,
+        compared=bool(cohort.compared),
         sprites=sprites,
         ratings=RATINGS,
         data={
-            "columns": _columns(hemispheres, compared=bool(outliers)),
+            "columns": _columns(hemispheres, compared=bool(cohort.compared)),
             "rows": rows,
-            "apart": OUTLIER,
             "ratings": RATINGS,
             "grid": {
                 "columns": columns,
@@ -286,9 +231,9 @@ def _columns(hemispheres: Sequence[Hemisphere], *, compared: bool) -> list[Mappi
         },
     ]
     if compared:
-        score = {"title": "Outlier score", "digits": 1, "help": "largest robust z-score"}
-        columns.append({"key": "distance", **score})
-        columns.append({"key": "farthest", "title": "Outlier measure"})
+        about = "step of thickness at the patch that differs most from the other hemispheres"
+        patch = {"title": "Largest step", "unit": "mm", "digits": 2, "help": about}
+        columns += [{"key": "distance", **patch}, {"key": "farthest", "title": "Outlier"}]
     for key, title in _SUMMARY.items():
         columns.append({"key": key, **MEASURES[key], "title": title})
     for key, title in _QUALITY.items():
@@ -297,11 +242,9 @@ def _columns(hemispheres: Sequence[Hemisphere], *, compared: bool) -> list[Mappi
     return columns
 
 
-def _row(
-    hemisphere: Hemisphere, cohort: Cohort, distance: tuple[float, str] | None, tile: int | None
-) -> dict[str, Any]:
+def _row(hemisphere: Hemisphere, cohort: Cohort, tile: int | None) -> dict[str, Any]:
     name, record = hemisphere.result.name, hemisphere.record
-    verdict = cohort.verdicts[name.title]
+    verdict, compared = cohort.verdicts[name.title], cohort.compared.get(name.title, {})
     numbers = {key: hemisphere.summary.get(key, np.nan) for key in _SUMMARY}
     numbers |= {key: number(hemisphere.metrics, key) for key in _QUALITY}
     numbers |= {"change": abs(verdict.change), "share": verdict.share}
@@ -319,8 +262,8 @@ def _row(
         "because": f"{verdict.reason} {verdict.consequence}",
         "reason": record.get("reason") or "",
         "message": hemisphere.message,
-        "distance": round(distance[0], 2) if distance else None,
-        "farthest": distance[1].partition(",")[0] if distance else "",
+        "distance": float(compared[SIZE]) if compared else None,
+        "farthest": compared.get(TEXT, "").replace(files.MISSING, ""),
         "tile": tile,
         **{key: float(f"{v:.6g}") if np.isfinite(v) else None for key, v in numbers.items()},
     }

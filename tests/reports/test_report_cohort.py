@@ -1,19 +1,20 @@
-"""Ranges and distances, with hemispheres made up for it."""
+"""Ranges and outliers, with hemispheres made up for it."""
 
 import json
+import re
 
 import numpy as np
 import pytest
 
 from hipsta_bids.derivatives.names import HemisphereName, name_of_record, output_name
+from hipsta_bids.derivatives.outliers import SIZE, TEXT
 from hipsta_bids.derivatives.results import ResultPlace
+from hipsta_bids.io import files
 from hipsta_bids.reports.cohort import (
     MEASURES,
-    SMALLEST_COMPARED,
     Cohort,
-    distances,
+    cohort_page,
     read_cohort,
-    robust_scores,
 )
 from hipsta_bids.reports.results import Hemisphere, find_results
 
@@ -33,49 +34,30 @@ def make(root, subject, values, *, hemi="L", decision="use", **record):
     return result
 
 
-def test_scores_are_those_of_a_normal_distribution_and_missing_values_stay():
-    values = np.random.default_rng(0).normal(3.0, 2.0, 4001)
-    # The standard error of a robust SD of 4000 values is about 2 %.
-    np.testing.assert_allclose(robust_scores(values), (values - 3) / 2, atol=0.25)
-    values[7] = np.nan
-    scores = robust_scores(values)
-    assert np.isnan(scores[7])
-    assert np.isfinite(scores).sum() == 4000
-
-
-def test_what_does_not_vary_has_no_distance():
-    assert robust_scores(np.ones(9)).tolist() == [0.0] * 9
-
-
-def test_one_who_stands_apart_is_found_and_named(tmp_path):
-    rng = np.random.default_rng(1)
-    usual = rng.normal(1.0, 0.01, (SMALLEST_COMPARED, len(MEASURES)))
-    usual[3, 2] += 1.0
-    for n, values in enumerate(usual):
-        make(tmp_path, f"{n:02d}", values)
+def test_outliers_come_from_the_table_of_measures(tmp_path):
+    for n in range(3):
+        make(tmp_path, f"{n:02d}", np.ones(len(MEASURES)))
+    text = "thickness 0.50 mm above its surroundings, unlike in the others: CA1, RAS -30 -12 4 mm"
+    columns = ("participant_id", "session_id", "hemi", "protocol", "region", SIZE, TEXT)
+    rows = [(f"sub-{n:02d}", "n/a", "L", "P", "body", "0.21", "n/a") for n in range(3)]
+    rows[1] = (*rows[1][:5], "0.50", text)
+    rows[2] = (*rows[2][:5], "n/a", "n/a")
+    files.write_tsv(tmp_path / "measures.tsv", columns, rows)
     cohort = read_cohort(tmp_path)
-    found = distances(cohort, {})
-    farthest = max(found, key=lambda title: found[title][0])
-    assert farthest == "sub-03_hemi-L_seg-P"
-    assert found[farthest][1] == list(MEASURES.values())[2]["title"]
-    assert found[farthest][0] > 30  # 1.0 away where the SD is 0.01, known to a third
+    assert set(cohort.compared) == {"sub-00_hemi-L_seg-P", "sub-01_hemi-L_seg-P"}
+    page = cohort_page(cohort)
+    assert "1 outlier among hemispheres" in page
+    assert f">sub-01 L</a>: {text}." in page
+    data = json.loads(re.search(r'id="data">(.*?)</script>', page, re.DOTALL)[1])
+    cells = {row["participant"]: (row["distance"], row["farthest"]) for row in data["rows"]}
+    assert cells == {"sub-00": (0.21, ""), "sub-01": (0.5, text), "sub-02": (None, "")}
 
 
-def test_a_map_that_differs_is_found_where_all_numbers_agree(tmp_path):
-    rng = np.random.default_rng(2)
-    maps = {}
-    for n in range(SMALLEST_COMPARED):
-        result = make(tmp_path, f"{n:02d}", rng.normal(1.0, 0.01, len(MEASURES)))
-        maps[result.name.title] = rng.normal(2.0, 0.1, (5, 4))
-    maps["sub-04_hemi-L_seg-P"][:2] += 1.0
-    found = distances(read_cohort(tmp_path), maps)
-    assert found["sub-04_hemi-L_seg-P"][1] == "Map of thickness"
-
-
-def test_few_hemispheres_are_not_compared(tmp_path):
-    for n in range(SMALLEST_COMPARED - 1):
-        make(tmp_path, f"{n:02d}", np.arange(len(MEASURES)) + n)
-    assert distances(read_cohort(tmp_path), {}) == {}
+def test_a_page_without_comparison_has_no_outliers(tmp_path):
+    make(tmp_path, "01", np.ones(len(MEASURES)))
+    page = cohort_page(read_cohort(tmp_path))
+    assert "With 10 or more hemispheres" in page
+    assert "Largest step" not in page
 
 
 def test_failed_ones_and_other_sides_are_not_in_the_range(tmp_path):

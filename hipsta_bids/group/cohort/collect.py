@@ -11,11 +11,14 @@ import pandas as pd
 
 from hipsta_bids.derivatives import dataset
 from hipsta_bids.derivatives.dataset import NOT_FINISHED, name_of, provenance_of, read_status
+from hipsta_bids.derivatives.measures import read_compared
 from hipsta_bids.derivatives.names import DATASET_FILES, HemisphereName, natural_order
+from hipsta_bids.derivatives.outliers import FEWEST, TEXT
 from hipsta_bids.derivatives.results import ResultPlace, list_results, read_record
 from hipsta_bids.errors import InputError, MissingFileError, NothingToDoError
 from hipsta_bids.group.cohort.covariates import relocate
 from hipsta_bids.group.cohort.exclusions import SHOWN, Choices, Condition, fulfilled
+from hipsta_bids.group.cohort.quality import OUTLIER
 from hipsta_bids.group.design.formula import listed
 from hipsta_bids.io import files
 from hipsta_bids.io.files import checked_foreign
@@ -41,6 +44,7 @@ class GroupRequest:
     sessions: tuple[str, ...] = ()
     """Labels without ``ses-``; empty is all."""
     exclude_look: bool = False
+    exclude_outliers: bool = False
     exclude_qc: tuple[Condition, ...] = ()
     exclude_table: Path | None = None
     """Participants, or single sessions and hemispheres, to leave out."""
@@ -148,13 +152,16 @@ def collect_sheets(request: GroupRequest, *, may_lack: bool = False) -> Collecti
     _refuse_twice(places)
     visits = [(result.name.subject, result.name.session) for result in results]
     choices = Choices(request.exclude_table, request.ratings, visits)
+    compared = {root: read_compared(root) for root in roots}
     records: list[SheetRecord] = []
     left_out = [exclusion for root in roots for exclusion in _excluded_labels(root, request)]
     quality, digests = [], []
     for result in sorted(places, key=_key):
         record = read_record(result)
-        entry = _judge(result, record, request, choices)
-        quality.append(_quality(result.name, record, choices))
+        row = compared[result.root].get(result.name.title)
+        outlier = None if row is None else row[TEXT].replace(files.MISSING, "")
+        entry = _judge(result, record, request, choices, outlier)
+        quality.append(_quality(result.name, record, choices, outlier))
         digests.append((result.name, _digest(record)))
         if isinstance(entry, Exclusion):
             left_out.append(entry)
@@ -166,6 +173,11 @@ def collect_sheets(request: GroupRequest, *, may_lack: bool = False) -> Collecti
         raise NothingToDoError(
             f"{request.roots[0]}: no hemisphere is left for the group level ({reasons})"
         )
+    count = sum(q["outlier status"] is None and q["decision"] != Decision.FAILED for q in quality)
+    unknown = (
+        f"--exclude-outliers: {count} hemispheres were not compared with {FEWEST} or more others;"
+        " run the participant level without --shard to compare"
+    )
     digest, grid = _one_settings(records), grid_of(records[0].result.root)
     _refuse_several_sheets(records)
     return Collection(
@@ -179,6 +191,7 @@ def collect_sheets(request: GroupRequest, *, may_lack: bool = False) -> Collecti
         notes=(
             *notes,
             *_shared_sheets(grid),
+            *[unknown] * bool(count and request.exclude_outliers),
             *choices.excluded.notes(_with_digests(results)),
             *choices.rated.notes(_with_digests(results)),
         ),
@@ -187,15 +200,16 @@ def collect_sheets(request: GroupRequest, *, may_lack: bool = False) -> Collecti
 
 
 def _quality(
-    name: HemisphereName, record: Mapping[str, Any], choices: Choices
+    name: HemisphereName, record: Mapping[str, Any], choices: Choices, outlier: str | None
 ) -> dict[str, str | None]:
-    """Return who, which side, the decision and the rating of a hemisphere."""
+    """Return who, which side, the decision, the rating, and whether it is an outlier, if known."""
     return {
         PARTICIPANT: f"sub-{name.subject}",
         SESSION: f"ses-{name.session}" if name.session else None,
         "side": name.hemi,
         "decision": str(record.get("decision")),
         "rating": choices.rating(name, _digest(record)),
+        "outlier status": None if outlier is None else OUTLIER[bool(outlier)],
     }
 
 
@@ -321,7 +335,9 @@ def _judge(
     record: Mapping[str, Any],
     request: GroupRequest,
     choices: Choices,
+    outlier: str | None,
 ) -> SheetRecord | Exclusion:
+    """Choose or exclude a hemisphere, given what makes it an outlier, if anything does."""
     decision = record.get("decision")
     reason, message = record.get("reason") or str(decision), record.get("message") or ""
     rated = result.name, _digest(record)
@@ -332,6 +348,8 @@ def _judge(
         reason = f"failed: {reason}"
     elif request.exclude_look and decision == Decision.LOOK and not choices.approves(*rated):
         reason = f"look: {reason}"
+    elif request.exclude_outliers and outlier and not choices.approves(*rated):
+        reason, message = "outlier", outlier
     elif request.exclude_qc and (condition := fulfilled(request.exclude_qc, _metrics(record))):
         reason, message = "quality", condition
     else:

@@ -1,4 +1,4 @@
-"""Decisions and ratings of hemispheres by group, with a test: failures may bias a comparison."""
+"""Decisions, ratings and outliers by group, with a test: exclusions may bias a comparison."""
 
 from collections.abc import Iterator
 
@@ -10,8 +10,14 @@ from hipsta_bids.group.design.formula import level_labels
 from hipsta_bids.reports.verdict import RATINGS
 from hipsta_bids.types import PARTICIPANT, Decision
 
+#: Whether a hemisphere is an outlier of the cohort.
+OUTLIER = ("no", "yes")
 #: Values from best to worst; a participant has that of the worst hemisphere.
-ORDERS = {"decision": [str(decision) for decision in Decision], "rating": ["unrated", *RATINGS]}
+ORDERS = {
+    "decision": [str(decision) for decision in Decision],
+    "rating": ["unrated", *RATINGS],
+    "outlier status": OUTLIER,
+}
 #: Level of the test, for a note only.
 _LEVEL = 0.05
 
@@ -23,10 +29,10 @@ def exact_p(table: np.ndarray[tuple[int, ...], np.dtype[np.int64]]) -> float:
 
 
 def quality_table(quality: pd.DataFrame, column: str) -> pd.DataFrame:
-    """Count participants and hemispheres by decision, rating and group, with a test of each.
+    """Count participants and hemispheres by decision, rating, outlier and group, with tests.
 
-    ``quality`` has a row per hemisphere with participant, decision, rating and the groups'
-    ``column``. The unit of the test is the participant, with the worst value of all hemispheres.
+    ``quality`` has a row per hemisphere with participant, these three and the groups' ``column``.
+    The unit of the test is the participant, with the worst value of all hemispheres.
     """
     if column not in quality:  # there are maps of other programs only
         return pd.DataFrame()

@@ -1,7 +1,7 @@
 "use strict";
 // The table of all hemispheres and their maps: one list of rows, sorted and filtered together.
 (() => {
-  const { columns, rows, grid, apart, ratings } = JSON.parse(document.getElementById("data").textContent);
+  const { columns, rows, grid, ratings } = JSON.parse(document.getElementById("data").textContent);
   const $ = (id) => document.getElementById(id);
   const make = (name, properties = {}, ...children) => {
     const element = Object.assign(document.createElement(name), properties);
@@ -45,7 +45,7 @@
         else if (column.key === "rating") cell.append(row.rate, row.remark);
         else if (column.key === "reason") cell.append(make("span", { className: "reason", textContent: row.reason, title: row.message }));
         else cell.textContent = words(row, column);
-        if (column.key === "distance" && row.distance > apart) cell.classList.add("unusual");
+        if (column.key === "distance" && row.farthest) cell.classList.add("unusual");
         return cell;
       });
       row.line = make("tr", {}, ...cells);
@@ -62,7 +62,7 @@
       else tile.style.backgroundPosition = `${-(row.tile % grid.columns) * width}px ${-Math.floor(row.tile / grid.columns) * height}px`;
       const title = make("span", { className: "name", textContent: `${row.participant.slice(4)}${row.session ? ` ${row.session.slice(4)}` : ""} ${row.hemi}${several ? ` ${row.seg}` : ""}` });
       const link = make("a", { href: `${row.page}#${row.key}`, title: `${whose(row)}: ${row.verdict}`, ariaLabel: `${tile.textContent}${title.textContent}: ${whose(row)}, ${row.verdict}` }, tile, title);
-      const far = row.distance > apart ? " apart" : "";
+      const far = row.farthest ? " apart" : "";
       row.item = make("li", { className: row.decision + far }, link);
     }
     for (const radio of document.querySelectorAll("[name=map]")) radio.addEventListener("change", showMaps);
@@ -105,7 +105,7 @@
     shown = rows.filter((row) =>
       states.has(row.decision) && (!$("hemi").value || row.hemi === $("hemi").value) && (!$("seg").value || row.seg === $("seg").value)
       && (!$("rating").value || (row.earlier ? "earlier" : row.rating || "none") === $("rating").value)
-      && (!$("apart").checked || row.distance > apart)
+      && (!$("apart").checked || row.farthest)
       && (!text || [row.participant, row.session, row.reason, row.message, row.farthest, row.note].join(" ").toLowerCase().includes(text)));
     if (order.key) shown = [...shown].sort(compare);
     fill();

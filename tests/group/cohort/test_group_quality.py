@@ -9,6 +9,7 @@ from scipy import stats
 from small_cohorts import place_of, read_participants, table, write_dataset
 
 from hipsta_bids.cli.main import main
+from hipsta_bids.derivatives.outliers import SIZE, TEXT
 from hipsta_bids.group.cohort.quality import exact_p, quality_notes, quality_table
 from hipsta_bids.io import files
 
@@ -22,8 +23,9 @@ def hemispheres(failed_cn, failed_ad, n=40):
         for i in range(n):
             for side in "LR":
                 decision = "failed" if side == "L" and i < failed else "use"
-                rows.append([f"sub-{group}{i}", side, decision, "unrated", group])
-    return pd.DataFrame(rows, columns=["participant_id", "side", "decision", "rating", "group"])
+                rows.append([f"sub-{group}{i}", side, decision, "unrated", None, group])
+    columns = ["participant_id", "side", "decision", "rating", "outlier status", "group"]
+    return pd.DataFrame(rows, columns=columns)
 
 
 def test_counts_and_test_are_of_participants():
@@ -63,6 +65,36 @@ def test_false_alarms():
         for _ in range(300)
     ]
     assert sum(alarms) <= 15
+
+
+def test_outliers_that_differ_between_groups_are_noted_and_excluded(tmp_path):
+    data, out = write_dataset(tmp_path)
+    participants = read_participants(data)
+    patients = [row[0] for row in participants if row[1] == "AD"][:7]
+    identity = ("participant_id", "session_id", "hemi", "protocol", "region")
+    rows = [
+        (name, "n/a", hemi, "demo", "body", "0.50", text if name in patients else "n/a")
+        for name, *_ in participants
+        for hemi, text in (("L", "thickness 0.50 mm above"), ("R", "n/a"))
+    ]
+    files.write_tsv(out / "measures.tsv", (*identity, SIZE, TEXT), rows)
+    options = [str(data), str(out), "group", *FAST, "--exclude-outliers", "--name"]
+    assert main([*options, "q"]) == 0
+    folder = out / "group" / "q"
+    excluded = table(folder / "excluded.tsv")
+    assert set(excluded.participant_id) == set(patients)
+    assert set(excluded.hemi) == {"L"}
+    assert set(excluded.reason) == {"outlier"}
+    counts = table(folder / "quality.tsv").set_index(["field", "value", "group"])["participants"]
+    assert counts["outlier status", "yes", "AD"] == 7
+    assert counts["outlier status", "yes", "CN"] == 0
+    notes = json.loads((folder / "analysis.json").read_text())["notes"]
+    assert any("the outlier status differs between groups" in note for note in notes)
+    assert not any("not compared" in note for note in notes)
+    (out / "measures.tsv").unlink()
+    assert main([*options, "without"]) == 0
+    notes = json.loads((out / "group" / "without" / "analysis.json").read_text())["notes"]
+    assert any(f"{len(rows)} hemispheres were not compared" in note for note in notes)
 
 
 @pytest.mark.parametrize("counts", [[[5, 1], [2, 9]], [[5, 1, 3], [2, 9, 1]]])
