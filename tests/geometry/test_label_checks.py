@@ -154,7 +154,7 @@ def test_a_refusal_names_the_border_that_may_cut_the_labels(body, sides, signs, 
     with pytest.raises(GeometryError, match="needed by the") as caught, naming_causes(volume):
         check_label_image(lacking, "L", CHECKS)
     assert caught.value.reason == "tissue-missing"
-    start = f"the labels touch the {names} border of the image (use" if names else "no label of CA1"
+    start = f"the labels touch the {names} border of the image (if" if names else "no label of CA1"
     assert str(caught.value).startswith(start)
 
 

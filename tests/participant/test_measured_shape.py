@@ -1,5 +1,6 @@
 """Every shape measure, from labels to numbers, against the phantom's analytic value."""
 
+from collections import Counter
 from dataclasses import replace
 
 import numpy as np
@@ -220,10 +221,10 @@ def test_folding_layers_are_one_flag_and_the_rest_is_unharmed(monkeypatch):
     assert dict(moved.summary) == pytest.approx(dict(plain.summary), nan_ok=True, rel=1e-12)
     for row in MAPS:
         np.testing.assert_array_equal(moved.maps[row.name], plain.maps[row.name])
-    assert [flag.reason for flag in moved.flags] == [
-        *(flag.reason for flag in plain.flags),
-        "layers-fold",
-    ]
+    # The fold is a bump of the walls, too.
+    assert Counter(flag.reason for flag in moved.flags) == Counter(
+        [*(flag.reason for flag in plain.flags), "layers-fold"]
+    )
     assert np.isfinite(moved.layers.points).all()
     # The fold's columns keep their layers, all others have moved.
     np.testing.assert_array_equal(moved.layers.points[20, 10], plain.sheet.points[20, 10])

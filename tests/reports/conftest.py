@@ -47,7 +47,7 @@ def bridge(codes, index):
     gaps = np.linalg.norm(ends[0][:, None] - ends[1][None], axis=-1)
     a, b = np.unravel_index(gaps.argmin(), gaps.shape)
     line = np.linspace(ends[0][a], ends[1][b], 60)
-    near = np.linalg.norm(index[..., None, :] - line, axis=-1).min(axis=-1) < 1.5
+    near = np.linalg.norm(index[..., None, :] - line, axis=-1).min(axis=-1) < 1.1
     codes[near & ~np.isin(codes, SHEET)] = CA1
 
 
