@@ -207,9 +207,12 @@ def _protrusion(site: Site, size: float, position: Position) -> Defect:
     return site.added(site.within(spike, size), position)
 
 
-def _leak(site: Site, size: float, position: Position) -> Defect:
-    """Let the label leak out of the exterior wall as a ball; size is its radius."""
-    return site.added(site.within(site.beside(position, 0.6 * size)[None], size), position)
+def _leak(site: Site, size: float, position: Position, *, interior: bool = False) -> Defect:
+    """Let the label leak out of a wall as a ball; size is its radius."""
+    middle = site.beside(position, 0.6 * size)
+    if interior:
+        middle = site.column(position)[0] - 0.6 * size * site.normal(position)
+    return site.added(site.within(middle[None], size), position)
 
 
 def _slit(site: Site, size: float, position: Position) -> Defect:
@@ -384,13 +387,6 @@ def _uncus(site: Site, size: float, _: Position, *, bridge: float) -> Defect:
     return Defect(volume=volume, changed=site.points[both])
 
 
-def _ball(site: Site, size: float, position: Position, *, wall: int) -> Defect:
-    """Let a ball of the sheet's label stand on a wall, over other labels; size is its radius."""
-    outward = site.normal(position) * (1 if wall else -1)
-    middle = site.column(position)[wall] + 0.6 * size * outward
-    return site.added(site.within(middle[None], size), position)
-
-
 def _thin_edge(site: Site, size: float, position: Position) -> Defect:
     """Leave a wall of some thickness within 0.17 of the nearer edge; size is the thickness, mm."""
     u = site.sheet_position[:, 0]
@@ -449,6 +445,7 @@ DEFECTS: Mapping[str, Callable[[Site, float, Position], Defect]] = MappingProxyT
         "salt": _salt,
         "protrusion": _protrusion,
         "leak": _leak,
+        "leak-interior": partial(_leak, interior=True),
         "slit": _slit,
         "gap": _gap,
         "missing-subfield": _missing_subfield,
@@ -468,8 +465,6 @@ DEFECTS: Mapping[str, Callable[[Site, float, Position], Defect]] = MappingProxyT
         "cyst": _cyst,
         "stratum": _stratum,
         "ragged-end": _ragged_end,
-        "ball-interior": partial(_ball, wall=0),
-        "ball-exterior": partial(_ball, wall=-1),
         "thin-edge": _thin_edge,
         "half-subfield": _half_subfield,
         "moved-end": _moved_end,

@@ -47,13 +47,11 @@ class Kind:
 _MIDDLE, _EDGES = (0.15, 0.85), ((0.0, 0.0), (1.0, 1.0))
 KINDS: Mapping[str, Kind] = MappingProxyType(
     {
-        "ball, exterior wall": Kind(injury="ball-exterior", size=(0.8, 2.0), u=_MIDDLE, v=_MIDDLE),
-        "ball, interior wall": Kind(injury="ball-interior", size=(0.8, 2.0), u=_MIDDLE, v=_MIDDLE),
-        "leak, posterior end": Kind(
-            injury="ball-exterior", size=(1.0, 3.0), u=_MIDDLE, v=(0.0, 0.05)
-        ),
+        "ball, exterior wall": Kind(injury="leak", size=(0.8, 2.0), u=_MIDDLE, v=_MIDDLE),
+        "ball, interior wall": Kind(injury="leak-interior", size=(0.8, 2.0), u=_MIDDLE, v=_MIDDLE),
+        "leak, posterior end": Kind(injury="leak", size=(1.0, 3.0), u=_MIDDLE, v=(0.0, 0.05)),
         "leak, anterior end": Kind(
-            injury="ball-interior", size=(1.0, 3.0), u=_MIDDLE, v=(0.95, 1.0)
+            injury="leak-interior", size=(1.0, 3.0), u=_MIDDLE, v=(0.95, 1.0)
         ),
         "thin medial edge": Kind(
             injury="thin-edge", size=(1.0, 1.5), u=_EDGES[0], v=_MIDDLE, voxels=True

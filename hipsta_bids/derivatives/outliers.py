@@ -29,13 +29,12 @@ from hipsta_bids.derivatives.dataset import Row
 from hipsta_bids.derivatives.results import ResultPlace, read_sheet, read_summary
 from hipsta_bids.errors import InputError
 from hipsta_bids.io import files
-from hipsta_bids.types import Bool, Float
+from hipsta_bids.types import MAD_TO_SD, Bool, Float
 
 #: Least number of hemispheres that are compared: with fewer, the spread is too uncertain.
 FEWEST = 10
 #: More are compared in parts, which bounds the memory.
 _PART = 1000
-_MAD_TO_SD = 1.4826  # of a normal distribution
 #: Least score of an outlier: of a patch of the map, and of a width or an extent. Chosen on drawn
 #: cohorts, judged on others (tests/derivatives/test_outliers.py).
 _PATCH, _NUMBER = 4.5, 4.2
@@ -79,7 +78,7 @@ class Departures:
     def outliers(self, least: float, smallest: float) -> Bool:
         """(N,) whose score is beyond a limit and usual scores here, and whose size matters."""
         center = np.median(self.score)
-        spread = _MAD_TO_SD * np.median(np.abs(self.score - center))
+        spread = MAD_TO_SD * np.median(np.abs(self.score - center))
         limit = max(least, center + _BEYOND * spread)
         return np.asarray((self.score > limit) & (np.abs(self.size) >= smallest))
 
@@ -100,7 +99,7 @@ def _differences(values: Float) -> tuple[Float, Float]:
     middle = np.nanmedian(np.where(present.any(axis=0), values, 0.0), axis=0)
     complete = np.where(present, values, middle)
     differences = complete - left_out_median(complete)
-    return differences, _MAD_TO_SD * left_out_median(np.abs(differences))
+    return differences, MAD_TO_SD * left_out_median(np.abs(differences))
 
 
 def find_patches(maps: Float) -> Departures:
@@ -117,7 +116,7 @@ def find_patches(maps: Float) -> Departures:
     transform = partial(dctn, axes=(1, 2), norm="ortho")
     inverse = partial(idctn, axes=(1, 2), norm="ortho")
     local = inverse(transform(_differences(maps)[0]) * local_part)
-    squares = (_MAD_TO_SD * left_out_median(np.abs(local))) ** 2
+    squares = (MAD_TO_SD * left_out_median(np.abs(local))) ** 2
     sd = np.sqrt(gaussian_filter(squares, (0, 3, 3)) + _LEAST_SD**2)
     power = transform(np.clip(local / sd, -_CLIP, _CLIP)) ** 2
     power = gaussian_filter((power.sum(axis=0) - power) / (count - 1), (0, 0.5, 0.5))

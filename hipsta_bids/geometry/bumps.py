@@ -11,8 +11,9 @@ import numpy as np
 from scipy import ndimage
 
 from hipsta_bids.geometry.measures import measure_thickness
+from hipsta_bids.geometry.sheet_checks import node_step
 from hipsta_bids.settings import CheckSettings
-from hipsta_bids.types import Bool, Finding, Float, Sheet
+from hipsta_bids.types import MAD_TO_SD, Bool, Finding, Float, Sheet
 
 #: Columns nearer than this do not predict a column, mm: a bump may cover them.
 GAP = 2.2
@@ -20,8 +21,6 @@ GAP = 2.2
 REACH = 2.5
 #: Roughness is measured within this many columns on both sides, along x.
 BAND = 4
-#: Ratio of the standard deviation to the median size of normal deviates.
-_SD = 1.4826
 #: Swellings of an end are averaged over this many rows, and this width along x, mm.
 END_ROWS, END_WIDTH = 2, 4.0
 #: They are compared with rows at these distances from the end, mm.
@@ -38,7 +37,7 @@ def check_bumps(sheet: Sheet, settings: CheckSettings) -> list[Finding]:
     """
     points = _filled(sheet)
     middle, walls = points[:, :, sheet.middle], points[:, :, [0, -1]]
-    counts, steps = middle.shape[:2], _steps(middle)
+    counts, steps = middle.shape[:2], [node_step(middle, axis) for axis in (0, 1)]
     if any((n - 1) * step < 3 * GAP for n, step in zip(counts, steps, strict=True)):
         return []
     along_x, along_y = map(predictor, counts, steps)
@@ -80,7 +79,7 @@ def check_swollen_ends(sheet: Sheet, settings: CheckSettings) -> list[Finding]:
     """
     points = _filled(sheet)
     middle, thickness = points[:, :, sheet.middle], measure_thickness(replace(sheet, points=points))
-    step_x, step_y = _steps(middle)
+    step_x, step_y = (node_step(middle, axis) for axis in (0, 1))
     half = round(END_WIDTH / step_x / 2)
     inner = slice(*(round(distance / step_y) for distance in END_COURSE))
     if inner.start >= middle.shape[1]:  # too short
@@ -104,11 +103,6 @@ def check_swollen_ends(sheet: Sheet, settings: CheckSettings) -> list[Finding]:
             )
         )
     return findings
-
-
-def _steps(middle: Float) -> list[float]:
-    """Median distance of neighboring points (Nx, Ny, 3) along x and along y, mm."""
-    return [float(np.median(np.linalg.norm(np.diff(middle, axis=k), axis=-1))) for k in (0, 1)]
 
 
 def _stand_out(walls: Float, along_y: Float) -> Float:
@@ -150,7 +144,7 @@ def _roughness(departure: Float) -> Float:
     bands = [size[max(i - BAND, 0) : i + BAND + 1] for i in range(len(size))]
     band = np.array([np.median(part, axis=(0, 1)) for part in bands])
     wall = np.median(size, axis=(0, 1))
-    return np.asarray(_SD * np.sqrt((band**2 + wall**2) / 2))[:, None]
+    return np.asarray(MAD_TO_SD * np.sqrt((band**2 + wall**2) / 2))[:, None]
 
 
 def _filled(sheet: Sheet) -> Float:

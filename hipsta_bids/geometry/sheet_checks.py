@@ -64,8 +64,8 @@ def check_edges(whole: Sheet, settings: CheckSettings) -> list[Finding]:
     move the columns of their rows. ``whole`` reaches from edge to edge.
     """
     middle = whole.points[:, :, whole.middle]
-    step, count = _step(middle, axis=1), middle.shape[1]
-    inner = min(max(round(INWARD / _step(middle, axis=0)), 1), middle.shape[0] - 1)
+    step, count = node_step(middle, axis=1), middle.shape[1]
+    inner = min(max(round(INWARD / node_step(middle, axis=0)), 1), middle.shape[0] - 1)
     findings = []
     for name, edge, beside in (("medial", 0, inner), ("lateral", -1, -1 - inner)):
         outline, inward = middle[edge], middle[beside] - middle[edge]
@@ -106,7 +106,7 @@ def check_subfields(
     missing, the other columns hardly move.
     """
     middle = sheet.points[:, :, sheet.middle]
-    step, lengths = _step(middle, axis=1), np.linalg.norm(np.gradient(middle, axis=0), axis=-1)
+    step, lengths = node_step(middle, axis=1), np.linalg.norm(np.gradient(middle, axis=0), axis=-1)
     gaps = [(0.0, Tissue.BACKGROUND, 0, 0, 0)]
     for edge in (0, -1):
         for tissue in map(Tissue, np.unique(subfield[edge]).tolist()):
@@ -141,8 +141,8 @@ def check_grooves(sheet: Sheet, thickness: Float, settings: CheckSettings) -> Fi
     more slowly along the axis.
     """
     middle, limits = sheet.points[:, :, sheet.middle], settings.flag_groove
-    columns = max(round(GROOVE_WIDTH / _step(middle, axis=0)), 1)
-    bands = _bands(-thickness, limits, _step(middle, axis=1), columns)
+    columns = max(round(GROOVE_WIDTH / node_step(middle, axis=0)), 1)
+    bands = _bands(-thickness, limits, node_step(middle, axis=1), columns)
     excess, size, (column, row) = max(bands, default=(0.0, 0.0, (0, 0)))
     half = columns // 2
     return Finding(
@@ -171,7 +171,7 @@ def _bands(
         yield size / limit, size, (int(at[0]), int(at[1]) + k)
 
 
-def _step(middle: Float, axis: int) -> float:
+def node_step(middle: Float, axis: int) -> float:
     """Median distance of neighboring nodes of the mid-surface (Nx, Ny, 3) along an axis, mm."""
     return float(np.nanmedian(np.linalg.norm(np.diff(middle, axis=axis), axis=-1)))
 
@@ -180,7 +180,7 @@ def _wider(lengths: Float, middle: Float, reach: float) -> Float:
     """Width (Ny,) that rows within ``reach`` mm attain on both sides of each row."""
     rows = np.arange(len(lengths))
     offset = rows[None, :] - rows[:, None]
-    near = np.abs(offset) <= max(round(reach / _step(middle, axis=1)), 1)
+    near = np.abs(offset) <= max(round(reach / node_step(middle, axis=1)), 1)
     before = np.where(near & (offset <= 0), lengths, -np.inf).max(axis=1)
     after = np.where(near & (offset >= 0), lengths, -np.inf).max(axis=1)
     return np.asarray(np.minimum(before, after))

@@ -31,7 +31,7 @@ def test_all_kinds_are_drawn_in_both_kinds_of_voxels():
 
 
 def test_damage_is_where_it_is_said_to_be(site):
-    ball = make_defect(site, "ball-interior", 1.2, (0.5, 0.4))
+    ball = make_defect(site, "leak-interior", 1.2, (0.5, 0.4))
     wall = site.column((0.5, 0.4))[0]
     assert np.linalg.norm(ball.changed - wall, axis=1).max() <= 1.2 * 1.6 + 0.01
     thin = make_defect(site, "thin-edge", 0.6, (0.0, 0.5))
