@@ -13,6 +13,7 @@ from measured_phantoms import (
 )
 
 from hipsta_bids.errors import GeometryError
+from hipsta_bids.geometry.checks import FLAG_REACH, columns_near
 from hipsta_bids.phantom import Phantom, PhantomSpec
 from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.protocols.protocol import Part, Tissue
@@ -79,7 +80,11 @@ def test_columns_at_a_filled_hole_are_marked(plain, damage):
     assert not maps.repaired[distance > 0.5 + 0.4 + 0.35 + 0.6].any()
     assert maps.qc["repaired_fraction"] == pytest.approx(maps.repaired.mean())
     assert not plain.maps.repaired.any()
-    assert not maps.doubtful[distance > 0.5 + 0.4 + 0.35 + 0.6 + 1.0].any()  # reach of a flag
+    # Filled a little too thin, which is flagged.
+    (flag,) = maps.flags
+    assert flag.reason == "wall-dent"
+    flagged = columns_near(maps.sheet, flag.points, FLAG_REACH)
+    assert not maps.doubtful[~maps.repaired & ~flagged].any()
     assert maps.qc["doubtful_fraction"] == pytest.approx(maps.doubtful.mean())
     assert sum(maps.qc["repair_kinds"].values()) == len(maps.repairs)
     assert not plain.maps.doubtful.any()
