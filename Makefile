@@ -64,7 +64,7 @@ layers: $(STAMP)
 # A thread each: the two processes would wait for each other's.
 THREADS = OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
 PYTEST = $(THREADS) "$(BIN)/python" -m pytest -n 2 --dist loadfile
-QUICK = geometry io protocols group/design group/stats
+QUICK = geometry io protocols stats
 # The wheel as users get it, tested from a folder that is not the checkout.
 INSTALLED := $(VENV)/installed
 unit: $(STAMP)

@@ -14,16 +14,17 @@ from pydantic import Field, model_validator
 from pydantic.types import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
 from hipsta_bids.protocols import toml
+from hipsta_bids.types import tables
 
 
-class BodySettings(toml.SettingsTable):
+class BodySettings(tables.SettingsTable):
     """From labels to the body's mask and end planes."""
 
     region: Literal["body", "extended", "entorhinal", "headbody", "whole"] = "body"
     """Region: ``body`` (subfields between the end planes), ``extended`` (with neighboring
     cortex), ``entorhinal`` (that cortex alone). Experimental: ``headbody``, and ``whole`` (with
     the tail)."""
-    min_cortex_reach: toml.PositiveFraction = 0.9
+    min_cortex_reach: tables.PositiveFraction = 0.9
     """Refuse cortex with labels along less than this share of the body."""
     layer_rule: Literal["nearest-sheet", "nearest-label"] = "nearest-sheet"
     """The molecular layer belongs to the nearest subfield of the sheet (``nearest-sheet``; Diers et
@@ -50,7 +51,7 @@ class BodySettings(toml.SettingsTable):
     """Gaps through the sheet are filled if they are larger than this, mm2."""
     slit_voxel: NonNegativeFloat = 0.8
     """Gaps are filled if no voxel edge is longer, mm: folds between thick slices look alike."""
-    end_fullness: toml.OpenFraction = 0.9
+    end_fullness: tables.OpenFraction = 0.9
     """Cross-sections in oblique ends of labels are smaller than this share of the cross-sections
     behind them."""
     end_reach: NonNegativeFloat = 3.0
@@ -61,7 +62,7 @@ class BodySettings(toml.SettingsTable):
     """Flag an edited mask that adds and removes more than this share of the body."""
 
 
-class GridSettings(toml.SettingsTable):
+class GridSettings(tables.SettingsTable):
     """The working grid on which the surface is made."""
 
     spacing: Annotated[float, Field(ge=0.1, le=1)] = 0.35
@@ -76,7 +77,7 @@ class GridSettings(toml.SettingsTable):
     cuts the sheet obliquely would be oblique, and too long."""
 
 
-class SliceSettings(toml.SettingsTable):
+class SliceSettings(tables.SettingsTable):
     """Shapes between thick slices."""
 
     min_ratio: NonNegativeFloat = 1.8
@@ -89,7 +90,7 @@ class SliceSettings(toml.SettingsTable):
     """Smaller holes in a slice are filled, mm2."""
 
 
-class TopologySettings(toml.SettingsTable):
+class TopologySettings(tables.SettingsTable):
     """Repair of holes, bridges, islands and cavities."""
 
     flag_cut_cost: NonNegativeFloat = 2.0
@@ -104,14 +105,14 @@ class TopologySettings(toml.SettingsTable):
     """Flag a repair, or all together, beyond this fraction of the body."""
 
 
-class SurfaceSettings(toml.SettingsTable):
+class SurfaceSettings(tables.SettingsTable):
     """The closed surface of the body."""
 
     taubin_iterations: NonNegativeInt = 16
     """Pairs of shrinking and inflating steps."""
 
 
-class TetraSettings(toml.SettingsTable):
+class TetraSettings(tables.SettingsTable):
     """The tetrahedral mesh."""
 
     radius_edge_ratio: Annotated[float, Field(ge=1)] = 2.0
@@ -120,7 +121,7 @@ class TetraSettings(toml.SettingsTable):
     """Give up after this time, s."""
 
 
-class BoundarySettings(toml.SettingsTable):
+class BoundarySettings(tables.SettingsTable):
     """Medial and lateral boundary strips, and which side is interior."""
 
     solver: Literal["two-level", "lapy"] = "two-level"
@@ -139,7 +140,7 @@ class BoundarySettings(toml.SettingsTable):
     which grow with the mesh's edges. Hipsta takes 40."""
 
 
-class SheetSettings(toml.SettingsTable):
+class SheetSettings(tables.SettingsTable):
     """The grid of the sheet, in coordinates from -1 to 1 along each axis.
 
     The grid of Hipsta (Diers et al. 2023) is x_extent 0.9, y_extent 0.975, z_extent 0.9.
@@ -149,17 +150,17 @@ class SheetSettings(toml.SettingsTable):
     """Nodes from medial to lateral."""
     y_nodes: Annotated[int, Field(ge=3, le=1000)] = 21
     """Nodes from posterior to anterior."""
-    z_nodes: toml.Odd = 9
+    z_nodes: tables.Odd = 9
     """Nodes from interior to exterior, odd so that the middle one is the mid-surface."""
     x_coordinate: Literal["midsurface", "volume"] = "midsurface"
     """What x is: harmonic on the mid-surface, or in the volume (Diers et al. 2023)."""
-    x_extent: toml.PositiveFraction = 0.9
+    x_extent: tables.PositiveFraction = 0.9
     """The grid spans plus and minus this along x."""
-    y_extent: toml.PositiveFraction = 1.0
+    y_extent: tables.PositiveFraction = 1.0
     """The grid spans plus and minus this along y."""
-    z_extent: toml.PositiveFraction = 1.0
+    z_extent: tables.PositiveFraction = 1.0
     """The grid spans plus and minus this along z; 1 is the whole wall."""
-    max_filled: toml.Fraction = 0.2
+    max_filled: tables.Fraction = 0.2
     """Refuse a sheet with a larger fraction of columns that could not be measured."""
     frame: Literal["visit", "person", "shared"] = "visit"
     """Each ``visit`` has its own sheet, or all visits of a ``person`` lie on one sheet
@@ -169,14 +170,14 @@ class SheetSettings(toml.SettingsTable):
     1929, Leprince et al. 2015). The measures do not depend on it."""
 
 
-class MeasureSettings(toml.SettingsTable):
+class MeasureSettings(tables.SettingsTable):
     """Measures on the sheet."""
 
-    curvature_window: toml.Odd = 9
+    curvature_window: tables.Odd = 9
     """Grid nodes over which a local polynomial is fitted, odd."""
     curvature_order: Annotated[int, Field(ge=2)] = 3
     """Order of the local polynomials."""
-    gaussian_window: toml.Odd = 21
+    gaussian_window: tables.Odd = 21
     """Grid nodes along y of the fit for the Gaussian curvature, odd. That curvature multiplies
     noise along the axis with the curvature across it."""
     max_curvature: PositiveFloat = 2.5
@@ -189,7 +190,7 @@ class MeasureSettings(toml.SettingsTable):
         return self
 
 
-class CheckSettings(toml.SettingsTable):
+class CheckSettings(tables.SettingsTable):
     """What makes a map doubtful (flag) or wrong (refusal)."""
 
     max_voxel: PositiveFloat = 0.9
@@ -214,7 +215,7 @@ class CheckSettings(toml.SettingsTable):
     """The report marks sides whose lengths differ by more, mm (2.8 at most in real labels)."""
     end_label_share: NonNegativeFloat = 0.005
     """Flag them if they are more than this share of the body's voxels."""
-    notch_share: toml.Numbers = (0.12, 0.3, 0.35)
+    notch_share: tables.Numbers = (0.12, 0.3, 0.35)
     """Flag if more than this share of what both sides have is missing, one per distance."""
     bump_contrast: NonNegativeFloat = 4.5
     """Flag a section with more of what others lack than so often the usual (suite population)."""
@@ -226,9 +227,9 @@ class CheckSettings(toml.SettingsTable):
     """Flag rows narrower than the widest on both sides by more than this (from the population)."""
     flag_subfield_gap: NonNegativeFloat = 1.5
     """Flag rows without their edge's subfield over more than this, mm (1.2 at most in 128)."""
-    flag_edge: toml.Numbers = (1.8, 2.2, 2.7)
+    flag_edge: tables.Numbers = (1.8, 2.2, 2.7)
     """Flag an edge that recedes behind both by more than this, one per distance, mm."""
-    flag_groove: toml.Numbers = (0.62, 0.85, 0.85)
+    flag_groove: tables.Numbers = (0.62, 0.85, 0.85)
     """Flag a band that is thinner than both sides by more than this, one per distance, mm."""
     flag_bump: NonNegativeFloat = 5.8
     """Flag a patch thicker than round about by more roughnesses of the smoother wall (128 real
@@ -254,21 +255,21 @@ class CheckSettings(toml.SettingsTable):
     map by more (RMS), mm."""
 
 
-class MapSettings(toml.SettingsTable):
+class MapSettings(tables.SettingsTable):
     """Other volumes on the sheet (``--map``)."""
 
-    min_known: toml.Fraction = 0.5
+    min_known: tables.Fraction = 0.5
     """A value is missing if less than this share of its voxels, or of the depth, is known."""
     flag_outside: NonNegativeFloat = 0.05
     """Flag if a larger share of the points lies outside the volume's field of view."""
 
 
-class UncertaintySettings(toml.SettingsTable):
+class UncertaintySettings(tables.SettingsTable):
     """Perturbed copies of the labels; their spread is the uncertainty of maps (--uncertainty)."""
 
     relabeling: NonNegativeFloat = 0.3
     """Boundaries are drawn elsewhere by this in all, mm: SD along each axis."""
-    correlation: toml.Lengths = (1.0, 3.0)
+    correlation: tables.Lengths = (1.0, 3.0)
     """Distances over which these errors correlate by 1/e, mm, in equal shares of the variance that
     ``jitter`` leaves."""
     end_shift: NonNegativeFloat = 0.5
@@ -282,10 +283,10 @@ class UncertaintySettings(toml.SettingsTable):
     It simulates another position in the scanner."""
 
 
-class SurrogateSettings(toml.SettingsTable):
+class SurrogateSettings(tables.SettingsTable):
     """Thickness from the medial axis of single slices (``hipsta-bids surrogate``)."""
 
-    positions: toml.OpenFractions = (0.5,)
+    positions: tables.OpenFractions = (0.5,)
     """Where the slices are, fractions of the body's length from its posterior end."""
 
 
@@ -300,7 +301,7 @@ PUBLISHED: Mapping[str, Mapping[str, str | float]] = MappingProxyType(
 )
 
 
-class Settings(toml.SettingsTable):
+class Settings(tables.SettingsTable):
     """All settings of the participant level."""
 
     body: BodySettings = Field(default_factory=BodySettings)

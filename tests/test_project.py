@@ -15,7 +15,7 @@ from reference_pages import CHANGED, PAGES
 
 import hipsta_bids
 from hipsta_bids.errors import ExitCode
-from hipsta_bids.group.design.settings import GroupSettings
+from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.settings import Settings
 
 ROOT = Path(__file__).parents[1]

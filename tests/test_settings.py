@@ -6,18 +6,10 @@ import pytest
 from pydantic import Field, NonNegativeFloat, PositiveFloat, model_validator
 
 from hipsta_bids.errors import SettingsError
-from hipsta_bids.group.design.settings import GroupSettings
-from hipsta_bids.protocols.toml import (
-    Numbers,
-    Odd,
-    SettingsTable,
-    flatten,
-    resolve,
-    settings_from,
-    settings_hash,
-    settings_toml,
-)
+from hipsta_bids.group.settings import GroupSettings
+from hipsta_bids.protocols.toml import flatten, resolve, settings_hash, settings_toml
 from hipsta_bids.settings import Settings, load_settings
+from hipsta_bids.types.tables import Numbers, Odd, SettingsTable, settings_from
 
 
 class Inner(SettingsTable):

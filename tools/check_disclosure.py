@@ -32,12 +32,13 @@ from scipy import optimize, sparse
 
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.cohort.data import Cohort, Measures
-from hipsta_bids.group.design.formula import model_from_shortcut, parse_model
-from hipsta_bids.group.design.model import Design
-from hipsta_bids.group.design.settings import GroupSettings, RegistrationSettings
 from hipsta_bids.group.questions import exchange
 from hipsta_bids.group.questions.analysis import analyze_cohort
-from hipsta_bids.group.stats.arrays import SideMaps
+from hipsta_bids.group.settings import GroupSettings
+from hipsta_bids.stats.arrays import SideMaps
+from hipsta_bids.stats.design import Design
+from hipsta_bids.stats.formula import model_from_shortcut, parse_model
+from hipsta_bids.stats.settings import RegistrationSettings
 
 exchange_model = exchange._model  # noqa: SLF001  (its result gets coefficients)
 FEWEST = 5  # participants that a number has to be about

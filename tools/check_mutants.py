@@ -2,7 +2,7 @@
 
     tools/check_mutants.py --count 200      try mutants, list the survivors
 
-A mutant has one comparison or operator of ``geometry/`` or ``group/stats/`` replaced. It is killed
+A mutant has one comparison or operator of ``geometry/`` or ``stats/`` replaced. It is killed
 if one of its module's own tests fails, or takes far too long. These are ``test_<module>*.py`` in
 the folder of the same name. A module without such a file is tested by the files that import
 it, there or elsewhere, or else by those of the modules that import it.
@@ -29,7 +29,7 @@ from types import CodeType
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
-FOLDERS = ("geometry", "group/stats")
+FOLDERS = ("geometry", "stats")
 RECORD = ROOT / "build" / "mutants"
 PATIENCE = 240  # s for the tests of one mutant
 LEAST = 0.85  # of the mutants have to be killed

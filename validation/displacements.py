@@ -7,8 +7,8 @@ from typing import Literal
 import numpy as np
 from scipy import ndimage
 
-from hipsta_bids.group.design.settings import RegistrationSettings
-from hipsta_bids.group.stats import registration, warps
+from hipsta_bids.stats import registration, warps
+from hipsta_bids.stats.settings import RegistrationSettings
 from hipsta_bids.types import Bool, Float
 
 STIFFNESS = 3.0

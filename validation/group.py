@@ -7,22 +7,18 @@ import numpy as np
 import pandas as pd
 from scipy import ndimage
 
-from hipsta_bids.group.design.contrasts import Contrast
-from hipsta_bids.group.design.model import Design
-from hipsta_bids.group.design.settings import (
-    CORRECTIONS,
-    GroupSettings,
-    LongitudinalSettings,
-    MultiplicitySettings,
-)
-from hipsta_bids.group.stats.arrays import SideMaps
-from hipsta_bids.group.stats.clusters import sheet_edges
-from hipsta_bids.group.stats.exchangeability import Visits
-from hipsta_bids.group.stats.glm import RowModel, fit_maps
-from hipsta_bids.group.stats.inference import MapKey, PermutationPart, correct, permute
-from hipsta_bids.group.stats.mixed import fit_mixed
-from hipsta_bids.group.stats.registration import mean_profiles, register
-from hipsta_bids.group.stats.warps import warp_values
+from hipsta_bids.group.settings import GroupSettings
+from hipsta_bids.stats.arrays import SideMaps
+from hipsta_bids.stats.clusters import sheet_edges
+from hipsta_bids.stats.contrasts import Contrast
+from hipsta_bids.stats.design import Design
+from hipsta_bids.stats.exchangeability import Visits
+from hipsta_bids.stats.glm import RowModel, fit_maps
+from hipsta_bids.stats.inference import MapKey, PermutationPart, correct, permute
+from hipsta_bids.stats.mixed import fit_mixed
+from hipsta_bids.stats.registration import mean_profiles, register
+from hipsta_bids.stats.settings import CORRECTIONS, LongitudinalSettings, MultiplicitySettings
+from hipsta_bids.stats.warps import warp_values
 from hipsta_bids.types import Bool, Float
 from validation.report import Cells, Content, suite, table
 

@@ -6,12 +6,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import ndimage
 
-from hipsta_bids.group.design.contrasts import Contrast
-from hipsta_bids.group.design.settings import GroupSettings
-from hipsta_bids.group.stats.arrays import Float, Int
-from hipsta_bids.group.stats.combat import Visits, fit_effects, harmonize
-from hipsta_bids.group.stats.glm import fit_points
-from hipsta_bids.group.stats.mixed import fit_mixed
+from hipsta_bids.group.settings import GroupSettings
+from hipsta_bids.stats.arrays import Float, Int
+from hipsta_bids.stats.combat import Visits, fit_effects, harmonize
+from hipsta_bids.stats.contrasts import Contrast
+from hipsta_bids.stats.glm import fit_points
+from hipsta_bids.stats.mixed import fit_mixed
 from validation.report import Cell, Cells, Content, suite, table
 
 COHORTS, FEW_COHORTS = 40, 10

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import special, stats
 
-from hipsta_bids.group.design.settings import NormSettings
-from hipsta_bids.group.stats.arrays import Float
-from hipsta_bids.group.stats.norms import LEVELS, Norms, People, fit_norms
+from hipsta_bids.stats.arrays import Float
+from hipsta_bids.stats.norms import LEVELS, Norms, People, fit_norms
+from hipsta_bids.stats.settings import NormSettings
 from validation.report import Cell, Cells, Content, suite, table
 
 #: Target: shares below centiles differ from these by at most this, percentage points.

@@ -10,12 +10,12 @@ from scipy import stats
 from statsmodels.stats.multitest import multipletests
 
 from hipsta_bids.group.cohort.data import SHEET, Cohort, layers
-from hipsta_bids.group.design.contrasts import Contrast
-from hipsta_bids.group.design.model import ModelRequest, VisitTime
-from hipsta_bids.group.design.settings import GroupSettings
+from hipsta_bids.group.model import ModelRequest, VisitTime
 from hipsta_bids.group.questions.trials import Modeled, Retested
-from hipsta_bids.group.stats.mixed import fit_mixed
-from hipsta_bids.group.stats.trials import (
+from hipsta_bids.group.settings import GroupSettings
+from hipsta_bids.stats.contrasts import Contrast
+from hipsta_bids.stats.mixed import fit_mixed
+from hipsta_bids.stats.trials import (
     SLOWING,
     THINNING,
     Reference,

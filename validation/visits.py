@@ -19,13 +19,13 @@ from hipsta_bids.geometry.columns import SMOOTHING
 from hipsta_bids.geometry.digital import box_around, low_corner, positions
 from hipsta_bids.geometry.ends import long_axis
 from hipsta_bids.geometry.measures import column_area
-from hipsta_bids.group.stats.trials import participants_needed
 from hipsta_bids.inputs.search import HemisphereInput
 from hipsta_bids.participant.job import peak_memory, reset_peak_memory
 from hipsta_bids.participant.longitudinal import Frame, lay_visit, make_frame, measure_laid
 from hipsta_bids.phantom import PhantomSpec, Thinning
 from hipsta_bids.protocols.protocol import Part, Tissue
 from hipsta_bids.settings import BodySettings, Settings
+from hipsta_bids.stats.trials import participants_needed
 from hipsta_bids.types import Bool, Float, HemisphereMaps, LabelVolume, Sheet
 from validation import cases
 from validation.hippunfold import draw_template

@@ -146,7 +146,7 @@ def print_settings(arguments: Sequence[str]) -> ExitCode:
     parser, add = parser_of("settings")
     add("level", nargs="?", choices=["group"])
     group = parser.parse_args(arguments).level == "group"
-    from hipsta_bids.group.design.settings import GroupSettings  # noqa: PLC0415  (start-up time)
+    from hipsta_bids.group.settings import GroupSettings  # noqa: PLC0415  (start-up time)
     from hipsta_bids.protocols.toml import settings_toml  # noqa: PLC0415  (start-up time)
     from hipsta_bids.settings import Settings  # noqa: PLC0415  (start-up time)
 
@@ -259,8 +259,8 @@ def run_surrogate(arguments: Sequence[str]) -> ExitCode:
 def run_meta_analysis(arguments: Sequence[str]) -> ExitCode:
     """Combine summaries of sites."""
     options = meta_parser().parse_intermixed_args(arguments)
-    from hipsta_bids.group.design.settings import load_group_settings  # noqa: PLC0415  (start-up time)
     from hipsta_bids.group.questions.consortium import run_meta  # noqa: PLC0415  (heavy)
+    from hipsta_bids.group.settings import load_group_settings  # noqa: PLC0415  (start-up time)
 
     choices = {
         "meta": {"random": options.random},

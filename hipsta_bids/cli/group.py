@@ -25,8 +25,8 @@ from hipsta_bids.errors import ExitCode, NothingToDoError, UsageError
 from hipsta_bids.participant.pool import processors
 
 if TYPE_CHECKING:
-    from hipsta_bids.group.design.settings import GroupSettings
     from hipsta_bids.group.questions.study import GroupOptions
+    from hipsta_bids.group.settings import GroupSettings
 
 LEVEL = "group"
 
@@ -399,7 +399,7 @@ def _run(parsed: argparse.Namespace, arguments: Sequence[str]) -> ExitCode:
     from hipsta_bids.io.files import check_scratch  # noqa: PLC0415  (heavy)
 
     check_scratch()
-    from hipsta_bids.group.stats.inference import PROCESSORS  # noqa: PLC0415  (heavy)
+    from hipsta_bids.stats.inference import PROCESSORS  # noqa: PLC0415  (heavy)
 
     PROCESSORS.set(parsed.n_procs)
     settings = _settings(parsed)
@@ -448,7 +448,7 @@ def _rebuild_reports(root: Path, name: str | None) -> ExitCode:
 
 def _settings(parsed: argparse.Namespace) -> "GroupSettings":
     """Read the settings, and put those in that have an option of their own."""
-    from hipsta_bids.group.design.settings import load_group_settings  # noqa: PLC0415  (start-up time)
+    from hipsta_bids.group.settings import load_group_settings  # noqa: PLC0415  (start-up time)
 
     choices = {
         "registration": {"align": parsed.align},
@@ -488,7 +488,7 @@ def _settings(parsed: argparse.Namespace) -> "GroupSettings":
 
 def _options(parsed: argparse.Namespace, arguments: Sequence[str]) -> "GroupOptions":
     from hipsta_bids.group.cohort.collect import GroupRequest  # noqa: PLC0415  (heavy)
-    from hipsta_bids.group.design.model import Comparison, ModelRequest  # noqa: PLC0415  (heavy)
+    from hipsta_bids.group.model import Comparison, ModelRequest  # noqa: PLC0415  (heavy)
     from hipsta_bids.group.questions.study import GroupOptions  # noqa: PLC0415  (heavy)
 
     sheets = from_namespace(

@@ -9,8 +9,8 @@ from hipsta_bids.cli.parser import Parser, adder, factor_level
 from hipsta_bids.errors import UsageError, did_you_mean
 
 if TYPE_CHECKING:
-    from hipsta_bids.group.design.settings import GroupSettings
     from hipsta_bids.group.questions.study import GroupOptions, GroupResult
+    from hipsta_bids.group.settings import GroupSettings
 
 #: Options that only sample sizes have; questions; and options that only comparisons have.
 _POWER_ONLY = ("power_level", "dropout", "allocation", "visits")
@@ -184,7 +184,7 @@ def run_question(
         among, controls = parsed.among, parsed.controls
         return run_norms(options, settings, path=parsed.norms, among=among, controls=controls)
     from hipsta_bids.group.questions.trials import run_trial  # noqa: PLC0415  (heavy)
-    from hipsta_bids.group.stats.trials import TrialEffect  # noqa: PLC0415  (heavy)
+    from hipsta_bids.stats.trials import TrialEffect  # noqa: PLC0415  (heavy)
 
     effect = None
     if parsed.power is not None:

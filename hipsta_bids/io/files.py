@@ -25,14 +25,14 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import AfterValidator, Field, ValidationError
 
-from hipsta_bids import opening
+from hipsta_bids import opening, types
 from hipsta_bids.errors import InputError, MissingFileError, OutputError
-from hipsta_bids.protocols.toml import Table, first_mistake
+from hipsta_bids.types.tables import Table, first_mistake
 
 LOGS = "logs"
 """Folder of an output dataset that holds the run logs, and the file whose bytes are the locks."""
 
-MISSING = "n/a"
+MISSING = types.MISSING
 """A missing value in BIDS tables."""
 
 #: Spellings of a missing value, without capitals, blanks and signs; Excel's errors begin with #.

@@ -23,7 +23,7 @@ from hipsta_bids.protocols.protocol import (
     Protocol,
     Tissue,
 )
-from hipsta_bids.protocols.toml import did_you_mean, first_mistake
+from hipsta_bids.types.tables import did_you_mean, first_mistake
 
 #: What laboratories call the tissues, after :func:`identify_tissue` has reduced a name.
 _NAMES = {

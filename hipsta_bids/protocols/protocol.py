@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pydantic import AfterValidator, BeforeValidator, NonNegativeInt, PositiveInt, Strict
 
 from hipsta_bids.errors import ProtocolError
-from hipsta_bids.protocols.toml import TomlTable, did_you_mean
+from hipsta_bids.types.tables import TomlTable, did_you_mean
 
 
 class Tissue(IntEnum):

@@ -9,9 +9,9 @@ import xarray as xr
 
 import hipsta_bids as hb
 from hipsta_bids.errors import ModelError
-from hipsta_bids.group.design.settings import GroupSettings
 from hipsta_bids.group.questions.analysis import register_side
-from hipsta_bids.group.stats.arrays import SideMaps
+from hipsta_bids.group.settings import GroupSettings
+from hipsta_bids.stats.arrays import SideMaps
 
 NX, NY, COUNT = 41, 5, 12
 

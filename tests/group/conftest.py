@@ -1,32 +1,11 @@
-"""Reference values computed with R, where the shared data are present."""
+"""Small studies, and settings that keep their analysis short."""
 
-import json
 import shutil
-from pathlib import Path
 
-import numpy as np
 import pytest
 from small_cohorts import Study, write_dataset
 
 from hipsta_bids.group.output import write
-
-ORACLE = Path(__file__).parents[2] / ".." / "shared" / "oracles" / "statistics.json"
-
-
-@pytest.fixture(scope="session")
-def oracle():
-    if not ORACLE.is_file():
-        pytest.skip("reference values of R not found")
-    return json.loads(ORACLE.read_text(encoding="utf-8"))
-
-
-@pytest.fixture(scope="session")
-def r_data(oracle):
-    """Data sets that come with R, as columns."""
-    return {
-        name: {column: np.array(values) for column, values in table.items()}
-        for name, table in oracle["data"].items()
-    }
 
 
 @pytest.fixture(scope="session")

@@ -8,7 +8,7 @@ from hipsta_bids.cli.group import group_parser, is_group_level
 from hipsta_bids.cli.main import main
 from hipsta_bids.errors import UsageError
 from hipsta_bids.group.cohort.exclusions import fulfilled
-from hipsta_bids.group.design.settings import GroupSettings, load_group_settings
+from hipsta_bids.group.settings import GroupSettings, load_group_settings
 from hipsta_bids.protocols.toml import settings_toml
 
 

@@ -32,10 +32,10 @@ from hipsta_bids.cli.group import group_parser
 from hipsta_bids.cli.main import main
 from hipsta_bids.cli.participant import build_parser
 from hipsta_bids.geometry.catalog import MAPS, PER_SUBFIELD, SUMMARY
-from hipsta_bids.group.design.settings import GroupSettings
 from hipsta_bids.group.output import write
 from hipsta_bids.group.output.tables import REPLICATE_COLUMNS
 from hipsta_bids.group.questions.replicate import GROUPS, PUBLISHED
+from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.io import files
 from hipsta_bids.io.files import read_tsv
 from hipsta_bids.protocols.protocol import Tissue

@@ -26,7 +26,7 @@ def found(given, *, rest=0, **_others):
 """
 
 IMPORTS = """
-from hipsta_bids.group.stats import glm
+from hipsta_bids.stats import glm
 from hipsta_bids.io.files import (
     read_table,
 )

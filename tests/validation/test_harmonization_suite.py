@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hipsta_bids.group.design.settings import GroupSettings
+from hipsta_bids.group.settings import GroupSettings
 from validation import harmonization
 from validation.harmonization import SitesPlan, analyze_sites, left_over, simulate_sites
 

@@ -19,11 +19,11 @@ from hipsta_bids.errors import InputError, MissingFileError, NothingToDoError
 from hipsta_bids.group.cohort.covariates import relocate
 from hipsta_bids.group.cohort.exclusions import SHOWN, Choices, Condition, fulfilled
 from hipsta_bids.group.cohort.quality import OUTLIER
-from hipsta_bids.group.design.formula import listed
 from hipsta_bids.io import files
 from hipsta_bids.io.files import checked_foreign
 from hipsta_bids.protocols.toml import settings_hash
 from hipsta_bids.settings import Settings, SheetSettings
+from hipsta_bids.stats.formula import listed
 from hipsta_bids.types import PARTICIPANT, SESSION, Decision, VisitKey
 
 

@@ -15,14 +15,15 @@ import pandas as pd
 from hipsta_bids.derivatives.dataset import linked_path, read_links
 from hipsta_bids.derivatives.names import natural_order
 from hipsta_bids.errors import InputError, MissingFileError, ModelError
-from hipsta_bids.group.design.formula import as_factor, check_numbers, level_name, listed, typed
-from hipsta_bids.group.design.model import FIRST_AGE, Comparison, VisitTime
-from hipsta_bids.group.design.settings import GroupSettings
-from hipsta_bids.group.design.visits import VISIT
+from hipsta_bids.group.model import Comparison, VisitTime
+from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.io import files
 from hipsta_bids.io.files import MISSING, is_missing
 from hipsta_bids.io.labels import match_labels
 from hipsta_bids.opening import SETTINGS, read_bounded
+from hipsta_bids.stats.design import FIRST_AGE
+from hipsta_bids.stats.formula import as_factor, check_numbers, level_name, listed, typed
+from hipsta_bids.stats.visits import VISIT
 from hipsta_bids.types import PARTICIPANT, SESSION
 
 

@@ -14,11 +14,11 @@ from hipsta_bids.derivatives.results import ResultPlace, read_sheet
 from hipsta_bids.errors import InputError
 from hipsta_bids.geometry.surrogate import compare_nearby
 from hipsta_bids.group.cohort.external import ExternalFiles, sign_notes
-from hipsta_bids.group.stats.arrays import SideMaps
 from hipsta_bids.inputs.maps import fill, find
 from hipsta_bids.io import files
 from hipsta_bids.io.gifti import read_map, read_surface
 from hipsta_bids.io.hippunfold import surfaces_beside
+from hipsta_bids.stats.arrays import SideMaps
 from hipsta_bids.types import VisitKey
 
 #: Nodes farther than this from all vertices have no value, mm; sheets are as thick or thicker.

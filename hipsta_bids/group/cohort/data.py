@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from hipsta_bids.derivatives.names import natural_order
 from hipsta_bids.errors import ModelError
-from hipsta_bids.group.design.formula import listed
-from hipsta_bids.group.design.model import BOTH, Comparison, asymmetry_name
-from hipsta_bids.group.stats.arrays import Bool, Float, Int, SideMaps, some_sheets
+from hipsta_bids.group.model import BOTH, Comparison, asymmetry_name
+from hipsta_bids.stats.arrays import Bool, Float, Int, SideMaps, some_sheets
+from hipsta_bids.stats.formula import listed
 from hipsta_bids.types import PARTICIPANT, SESSION
 
 

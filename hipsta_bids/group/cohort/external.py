@@ -18,13 +18,13 @@ from hipsta_bids.group.cohort.collect import SheetRecord
 from hipsta_bids.group.cohort.covariates import locate_sources
 from hipsta_bids.group.cohort.data import Cohort
 from hipsta_bids.group.cohort.read import CURVATURE, THICKNESS, VOLUME, Measured, visit_name
-from hipsta_bids.group.stats.arrays import SideMaps
 from hipsta_bids.inputs.layouts import volume_table
 from hipsta_bids.inputs.maps import Found, check_pattern, fields_of, fill, find, scan
 from hipsta_bids.io import files
 from hipsta_bids.io.files import entities
 from hipsta_bids.io.gifti import DENSE_SCALARS, PointMap, cifti_sides, read_map, read_surface
 from hipsta_bids.io.hippunfold import has_opposite_sign, surfaces_beside
+from hipsta_bids.stats.arrays import SideMaps
 from hipsta_bids.types import Mesh, VisitKey
 
 

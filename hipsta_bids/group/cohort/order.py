@@ -9,7 +9,7 @@ import pandas as pd
 from hipsta_bids.group.cohort.collect import Collection
 from hipsta_bids.group.cohort.covariates import Spellings, order_sessions, read_covariates
 from hipsta_bids.group.cohort.read import table_of, visit_name
-from hipsta_bids.group.design.settings import GroupSettings
+from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.types import VisitKey
 
 

@@ -6,8 +6,8 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
-from hipsta_bids.group.design.formula import level_labels
 from hipsta_bids.reports.verdict import RATINGS
+from hipsta_bids.stats.formula import level_labels
 from hipsta_bids.types import PARTICIPANT, Decision
 
 #: Whether a hemisphere is an outlier of the cohort.

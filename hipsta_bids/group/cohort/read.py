@@ -14,10 +14,10 @@ from hipsta_bids.geometry.catalog import MAPS, why_impossible
 from hipsta_bids.geometry.sheet import sheet_levels
 from hipsta_bids.group.cohort.collect import Exclusion, SheetRecord
 from hipsta_bids.group.cohort.data import Cohort, Measures
-from hipsta_bids.group.design.formula import listed
-from hipsta_bids.group.stats.arrays import MOST_KEPT, Float, SideMaps, blocks
 from hipsta_bids.protocols import EXPERIMENTAL
 from hipsta_bids.settings import SheetSettings
+from hipsta_bids.stats.arrays import MOST_KEPT, Float, SideMaps, blocks
+from hipsta_bids.stats.formula import listed
 from hipsta_bids.types import PARTICIPANT, SESSION, VisitKey
 
 #: Map that registration rests on.

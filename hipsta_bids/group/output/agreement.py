@@ -16,10 +16,10 @@ from hipsta_bids.group.output.citations import Citations, code, escaped, joined
 from hipsta_bids.group.output.ground import Ground, read_grounds
 from hipsta_bids.group.output.maps import ContrastMap, read_tests
 from hipsta_bids.group.output.panels import Row
-from hipsta_bids.group.stats.inference import MapKey
 from hipsta_bids.reports import cells, display
 from hipsta_bids.reports.group_maps import EFFECT_NAMES
 from hipsta_bids.reports.group_tables import GroupResults, records
+from hipsta_bids.stats.inference import MapKey
 from hipsta_bids.types import PARTICIPANT
 
 _FAILED = "failed"

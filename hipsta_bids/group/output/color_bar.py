@@ -8,9 +8,9 @@ import numpy as np
 
 from hipsta_bids.group.output import style
 from hipsta_bids.group.output.style import LINE, MM, SMALL
-from hipsta_bids.group.stats.arrays import Float
 from hipsta_bids.reports import display
 from hipsta_bids.reports.cells import MINUS
+from hipsta_bids.stats.arrays import Float
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

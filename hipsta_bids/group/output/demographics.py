@@ -11,12 +11,13 @@ from scipy import stats
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.cohort.data import Cohort
 from hipsta_bids.group.cohort.quality import exact_p
-from hipsta_bids.group.design.formula import in_order, level_labels, typed
-from hipsta_bids.group.design.grammar import closed_formula
-from hipsta_bids.group.design.model import FIRST_AGE, Groups
-from hipsta_bids.group.design.settings import GroupSettings
-from hipsta_bids.group.design.visits import VISIT
+from hipsta_bids.group.model import Groups
 from hipsta_bids.group.output.results import ALL, Analysis
+from hipsta_bids.group.settings import GroupSettings
+from hipsta_bids.stats.design import FIRST_AGE
+from hipsta_bids.stats.formula import in_order, level_labels, typed
+from hipsta_bids.stats.grammar import closed_formula
+from hipsta_bids.stats.visits import VISIT
 from hipsta_bids.types import PARTICIPANT, SESSION
 
 #: Variables that are described even if they do not vary.

@@ -21,14 +21,14 @@ from hipsta_bids.group.output.maps import draw_alignment, draw_measure
 from hipsta_bids.group.output.results import Analysis, ScoredMaps
 from hipsta_bids.group.output.shapes import AverageShape
 from hipsta_bids.group.output.slices import draw_surrogate
-from hipsta_bids.group.stats.arrays import Float, describe_known, mean_of_known
-from hipsta_bids.group.stats.glm import FittedMaps
 from hipsta_bids.io.files import MISSING
 from hipsta_bids.reports import display
 from hipsta_bids.reports.cells import SIDES, display_name, with_brackets
 from hipsta_bids.reports.display import COLORS, HEMISPHERE_COLORS, X_ENDS, kind_of, parts_of
 from hipsta_bids.reports.group_maps import MOST_FIGURES, measures_of
 from hipsta_bids.reports.group_tables import GroupResults, records
+from hipsta_bids.stats.arrays import Float, describe_known, mean_of_known
+from hipsta_bids.stats.glm import FittedMaps
 from hipsta_bids.types import PARTICIPANT
 
 if TYPE_CHECKING:

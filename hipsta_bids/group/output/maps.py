@@ -13,10 +13,10 @@ import pandas as pd
 from hipsta_bids.group.output import panels, style
 from hipsta_bids.group.output.ground import read_grounds
 from hipsta_bids.group.output.panels import Row
-from hipsta_bids.group.stats.arrays import Bool, Float
 from hipsta_bids.reports import cells, display, group_maps
 from hipsta_bids.reports.display import parts_of
 from hipsta_bids.reports.group_tables import GroupResults, map_unit, records
+from hipsta_bids.stats.arrays import Bool, Float
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -11,18 +11,19 @@ from hipsta_bids import __version__
 from hipsta_bids.group.cohort.crop import REACH
 from hipsta_bids.group.cohort.data import SIZES, Cohort
 from hipsta_bids.group.cohort.read import LEAST_SHARE
-from hipsta_bids.group.design import settings as group_settings
-from hipsta_bids.group.design.contrasts import Contrast
-from hipsta_bids.group.design.model import interactions
 from hipsta_bids.group.output.citations import Citations, code, escaped, joined
 from hipsta_bids.group.output.results import Analysis
 from hipsta_bids.group.output.tables import summary_tests
-from hipsta_bids.group.stats import inference
-from hipsta_bids.group.stats.clusters import TFCE_EXTENT, TFCE_HEIGHT
-from hipsta_bids.group.stats.exchangeability import exchange_text, spans_constant
-from hipsta_bids.group.stats.mmrm import VisitRows
+from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.protocols import EXPERIMENTAL
 from hipsta_bids.reports.group_tables import demographic_tests, opposite_changes
+from hipsta_bids.stats import inference
+from hipsta_bids.stats.clusters import TFCE_EXTENT, TFCE_HEIGHT
+from hipsta_bids.stats.contrasts import Contrast
+from hipsta_bids.stats.exchangeability import exchange_text, spans_constant
+from hipsta_bids.stats.formula import interactions
+from hipsta_bids.stats.mmrm import VisitRows
+from hipsta_bids.stats.settings import MultiplicitySettings
 from hipsta_bids.types import PARTICIPANT
 
 #: Level at which slopes are said to differ.
@@ -49,7 +50,7 @@ PROCEDURES: Mapping[str, str] = {
 def methods_text(
     cohort: Cohort,
     analysis: Analysis,
-    settings: group_settings.GroupSettings,
+    settings: GroupSettings,
     n_out: int,
     *,
     surfaces: Sequence[str] = (),
@@ -144,9 +145,7 @@ def _sample(
     return text + COMMON_SHEETS * (cohort.shared and has_sheets)
 
 
-def _registration(
-    analysis: Analysis, settings: group_settings.GroupSettings, cite: Callable[[str], str]
-) -> str:
+def _registration(analysis: Analysis, settings: GroupSettings, cite: Callable[[str], str]) -> str:
     rules = settings.registration
     if rules.align == "none":
         fewest = min(len(one.warps) for one in analysis.registrations.values())
@@ -202,7 +201,7 @@ def _rims(analysis: Analysis) -> str:
 
 
 def _harmonization(
-    analysis: Analysis, settings: group_settings.GroupSettings, cite: Callable[[str], str]
+    analysis: Analysis, settings: GroupSettings, cite: Callable[[str], str]
 ) -> list[str]:
     harmonization = analysis.harmonization
     if harmonization is None:
@@ -250,9 +249,7 @@ def _harmonization(
     return [text]
 
 
-def _models(
-    analysis: Analysis, settings: group_settings.GroupSettings, cite: Callable[[str], str]
-) -> str:
+def _models(analysis: Analysis, settings: GroupSettings, cite: Callable[[str], str]) -> str:
     contrasts = analysis.design.contrasts
     levels = escaped(", ".join(map(" ".join, analysis.design.references.items())))
     kind, subject, d = "linear model", "", "the estimate divided by the residual standard deviation"
@@ -312,9 +309,7 @@ def _tests(contrasts: Sequence[Contrast]) -> str:
     return text
 
 
-def _visits(
-    analysis: Analysis, settings: group_settings.GroupSettings, cite: Callable[[str], str]
-) -> str:
+def _visits(analysis: Analysis, settings: GroupSettings, cite: Callable[[str], str]) -> str:
     """Return how repeated visits, and the baseline, were modeled."""
     if not isinstance(analysis.row_model, VisitRows):
         visits = analysis.row_model.visits
@@ -372,7 +367,7 @@ def _slopes(analysis: Analysis, cite: Callable[[str], str]) -> str:
     )
 
 
-def _nonlinear(analysis: Analysis, settings: group_settings.GroupSettings) -> str:
+def _nonlinear(analysis: Analysis, settings: GroupSettings) -> str:
     """Return how age was modeled, and in how many summary measures it was not linear."""
     names = [one.name for one in analysis.design.contrasts if one.name.endswith(" nonlinear")]
     if not names or settings.model.age == "linear":
@@ -392,9 +387,7 @@ def _nonlinear(analysis: Analysis, settings: group_settings.GroupSettings) -> st
     )
 
 
-def _correction(
-    rules: group_settings.MultiplicitySettings, cite: Callable[[str], str], analysis: Analysis
-) -> str:
+def _correction(rules: MultiplicitySettings, cite: Callable[[str], str], analysis: Analysis) -> str:
     if rules.method not in inference.PERMUTATIONS:
         return f"{discovery_text(rules, cite, analysis.found)}."
     inside = f" within levels of {escaped(rules.blocks)}" if rules.blocks else ""
@@ -424,14 +417,14 @@ def _correction(
     return f"{text} The statistic was the largest absolute statistic of all points."
 
 
-def _families(rules: group_settings.MultiplicitySettings, maps: Iterable[inference.MapKey]) -> str:
+def _families(rules: MultiplicitySettings, maps: Iterable[inference.MapKey]) -> str:
     """Return which points are one family of tests, and the number of families."""
     n = len(inference.families(maps, rules.scope))
     return f"{_FAMILIES[rules.scope]} ({n} {'family' if n == 1 else 'families'} of tests)"
 
 
 def discovery_text(
-    rules: group_settings.MultiplicitySettings,
+    rules: MultiplicitySettings,
     cite: Callable[[str], str],
     maps: Iterable[inference.MapKey],
 ) -> str:
@@ -442,7 +435,7 @@ def discovery_text(
     )
 
 
-def _joint(settings: group_settings.GroupSettings, cite: Callable[[str], str]) -> str:
+def _joint(settings: GroupSettings, cite: Callable[[str], str]) -> str:
     rules, joint = settings.multiplicity, settings.joint
     by = (
         "as minus twice the sum of their logarithms (Fisher)"
@@ -468,7 +461,7 @@ def _joint(settings: group_settings.GroupSettings, cite: Callable[[str], str]) -
     )
 
 
-def _asymmetry(analysis: Analysis, settings: group_settings.GroupSettings, cite: Citations) -> str:
+def _asymmetry(analysis: Analysis, settings: GroupSettings, cite: Citations) -> str:
     definition = "The asymmetry of each map was left minus right, in the unit of the measure."
     if (relative := settings.asymmetry.relative) and not analysis.comparison.pair:
         definition = (
@@ -482,7 +475,7 @@ def _asymmetry(analysis: Analysis, settings: group_settings.GroupSettings, cite:
 
 
 def _normative(
-    formula: str, n_reference: int, group: str, settings: group_settings.GroupSettings, source: str
+    formula: str, n_reference: int, group: str, settings: GroupSettings, source: str
 ) -> str:
     return (
         f"Each participant was scored against {n_reference} participants with {escaped(group)}. The"
@@ -495,9 +488,7 @@ def _normative(
     )
 
 
-def _classification(
-    analysis: Analysis, settings: group_settings.GroupSettings, cite: Citations
-) -> str:
+def _classification(analysis: Analysis, settings: GroupSettings, cite: Citations) -> str:
     rules, base = settings.classification, escaped(" + ".join(settings.classification.base))
     delong = cite("delong")
     separated = sum(one.columns["separated"] for *_, one in analysis.pairs)

@@ -10,8 +10,8 @@ from pyarrow import parquet as pq
 
 from hipsta_bids.group.cohort.data import SHEET, Cohort
 from hipsta_bids.group.output import results
-from hipsta_bids.group.stats.arrays import Float, Int, SideMaps, blocks, some_sheets
 from hipsta_bids.io import files
+from hipsta_bids.stats.arrays import Float, Int, SideMaps, blocks, some_sheets
 from hipsta_bids.types import PARTICIPANT, SESSION
 
 #: Name of the surface of the sheets in files.

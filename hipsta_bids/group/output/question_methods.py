@@ -5,12 +5,13 @@ from collections.abc import Callable, Sequence
 import pandas as pd
 
 from hipsta_bids import __version__
-from hipsta_bids.group.design import settings as group_settings
 from hipsta_bids.group.output.citations import Citations, escaped
 from hipsta_bids.group.output.methods import COMMON_SHEETS, PROCEDURES
 from hipsta_bids.group.output.saved import NormsFile
-from hipsta_bids.group.stats.norms import CENTILE_FOLDS, LEVELS, SHAPE_LEVEL
-from hipsta_bids.group.stats.trials import THINNING, TrialEffect, point_level
+from hipsta_bids.group.settings import GroupSettings
+from hipsta_bids.stats.norms import CENTILE_FOLDS, LEVELS, SHAPE_LEVEL
+from hipsta_bids.stats.settings import RetestSettings
+from hipsta_bids.stats.trials import THINNING, TrialEffect, point_level
 
 Cite = Callable[[str], str]
 """Numbers a work by its key."""
@@ -90,7 +91,7 @@ def norms_text(
 
 def power_text(
     effect: TrialEffect,
-    settings: group_settings.GroupSettings,
+    settings: GroupSettings,
     source: Callable[[Cite], str],
     cite: Cite,
 ) -> str:
@@ -131,9 +132,7 @@ def power_text(
     )
 
 
-def retest_text(
-    sessions: int, participants: int, settings: group_settings.RetestSettings, cite: Cite
-) -> str:
+def retest_text(sessions: int, participants: int, settings: RetestSettings, cite: Cite) -> str:
     """Return how agreement was estimated."""
     return (
         f"Agreement between {sessions} sessions of {participants} participants was estimated at"

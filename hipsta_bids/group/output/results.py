@@ -11,19 +11,20 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from hipsta_bids.group.cohort import data
-from hipsta_bids.group.design.formula import ModelSpec
-from hipsta_bids.group.design.grammar import closed_formula
-from hipsta_bids.group.design.model import Comparison, Design, Groups
+from hipsta_bids.group.model import Comparison, Groups
 from hipsta_bids.group.output.saved import SavedEffects, templates_to_json
-from hipsta_bids.group.stats import arrays
-from hipsta_bids.group.stats import registration as alignment
-from hipsta_bids.group.stats.arrays import Bool, Float, Int
-from hipsta_bids.group.stats.classify import ModelComparison
-from hipsta_bids.group.stats.combat import ARRAYS, SiteEffects, SiteMoments, Visits
-from hipsta_bids.group.stats.glm import FittedMaps, PointTest, PointwiseFit, RowModel
-from hipsta_bids.group.stats.inference import Discoveries, MapKey
-from hipsta_bids.group.stats.norms import NormativeScores
 from hipsta_bids.io.files import as_nested
+from hipsta_bids.stats import arrays
+from hipsta_bids.stats import registration as alignment
+from hipsta_bids.stats.arrays import Bool, Float, Int
+from hipsta_bids.stats.classify import ModelComparison
+from hipsta_bids.stats.combat import ARRAYS, SiteEffects, SiteMoments, Visits
+from hipsta_bids.stats.design import Design
+from hipsta_bids.stats.formula import ModelSpec
+from hipsta_bids.stats.glm import FittedMaps, PointTest, PointwiseFit, RowModel
+from hipsta_bids.stats.grammar import closed_formula
+from hipsta_bids.stats.inference import Discoveries, MapKey
+from hipsta_bids.stats.norms import NormativeScores
 from hipsta_bids.types import PARTICIPANT
 
 #: Group of all, where there are no groups.

@@ -13,13 +13,13 @@ from pydantic import AfterValidator, ConfigDict, Field, model_validator
 
 from hipsta_bids import __version__
 from hipsta_bids.errors import ModelError
-from hipsta_bids.group.design.grammar import closed_formula
-from hipsta_bids.group.stats.arrays import Float, Key
-from hipsta_bids.group.stats.combat import ARRAYS, SiteEffects
-from hipsta_bids.group.stats.norms import LEVELS, NORM_ARRAYS, Norms, People
-from hipsta_bids.group.stats.warps import DEGREE, Template
 from hipsta_bids.io import files
-from hipsta_bids.protocols.toml import Fraction, OpenFraction, TomlTable
+from hipsta_bids.stats.arrays import Float, Key
+from hipsta_bids.stats.combat import ARRAYS, SiteEffects
+from hipsta_bids.stats.grammar import closed_formula
+from hipsta_bids.stats.norms import LEVELS, NORM_ARRAYS, Norms, People
+from hipsta_bids.stats.warps import DEGREE, Template
+from hipsta_bids.types.tables import Fraction, OpenFraction, TomlTable
 
 #: Fields of a template that are arrays.
 _TEMPLATE_ARRAYS = ("knots", "mean", "components", "center")

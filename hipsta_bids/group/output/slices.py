@@ -12,11 +12,11 @@ from hipsta_bids.group.cohort.collect import SheetRecord
 from hipsta_bids.group.cohort.read import visit_name
 from hipsta_bids.group.output import style
 from hipsta_bids.group.output.results import Analysis, members_of
-from hipsta_bids.group.stats.arrays import describe_known
 from hipsta_bids.io import files
 from hipsta_bids.reports.cells import SIDES
 from hipsta_bids.reports.display import COLORS, X_ENDS, Y_ENDS
 from hipsta_bids.reports.group_tables import GroupResults
+from hipsta_bids.stats.arrays import describe_known
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -10,17 +10,17 @@ import numpy as np
 import pandas as pd
 
 from hipsta_bids.group.cohort.data import Cohort, hemispheres, participants_with, summary_values
-from hipsta_bids.group.design.formula import file_label
-from hipsta_bids.group.design.settings import GroupSettings
 from hipsta_bids.group.output import columns, results
 from hipsta_bids.group.output.columns import find_clusters, frame_of
-from hipsta_bids.group.stats.arrays import Float, describe_known, mean_of_known
-from hipsta_bids.group.stats.classify import ClassifierResult
-from hipsta_bids.group.stats.clusters import edges_of
-from hipsta_bids.group.stats.glm import FittedMaps, PointTest
-from hipsta_bids.group.stats.inference import Discoveries, MapKey, PermutationTest, control_fdr
-from hipsta_bids.group.stats.registration import Registration
+from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.reports import cells
+from hipsta_bids.stats.arrays import Float, describe_known, mean_of_known
+from hipsta_bids.stats.classify import ClassifierResult
+from hipsta_bids.stats.clusters import edges_of
+from hipsta_bids.stats.formula import file_label
+from hipsta_bids.stats.glm import FittedMaps, PointTest
+from hipsta_bids.stats.inference import Discoveries, MapKey, PermutationTest, control_fdr
+from hipsta_bids.stats.registration import Registration
 from hipsta_bids.types import PARTICIPANT, SESSION
 
 Named = tuple[str, pd.DataFrame]

@@ -6,8 +6,8 @@ from pathlib import Path
 from hipsta_bids.derivatives import dataset
 from hipsta_bids.derivatives.names import DATASET_FILES, TEXTS
 from hipsta_bids.errors import NothingToDoError, UsageError
-from hipsta_bids.group.design.formula import ascii_letters
 from hipsta_bids.io import files
+from hipsta_bids.stats.formula import ascii_letters
 
 #: Files of an analysis (pattern), and what follows the label of the template in their names.
 _FILES = {

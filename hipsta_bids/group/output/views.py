@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hipsta_bids.group.stats.arrays import Bool, Float, Int
 from hipsta_bids.io.hippunfold import unfolded_shares
 from hipsta_bids.reports.display import X_ENDS, Y_ENDS
+from hipsta_bids.stats.arrays import Bool, Float, Int
 from hipsta_bids.types import Mesh
 
 if TYPE_CHECKING:

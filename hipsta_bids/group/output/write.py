@@ -19,7 +19,6 @@ import pandas as pd
 from hipsta_bids.derivatives.names import DATASET_FILES
 from hipsta_bids.group.cohort.collect import Exclusion
 from hipsta_bids.group.cohort.data import SHEET, Cohort
-from hipsta_bids.group.design.settings import GroupSettings
 from hipsta_bids.group.output import results, tables
 from hipsta_bids.group.output.demographics import demographics_of
 from hipsta_bids.group.output.figures import draw_figures
@@ -27,13 +26,14 @@ from hipsta_bids.group.output.methods import methods_text
 from hipsta_bids.group.output.shapes import AverageShape
 from hipsta_bids.group.output.style import KINDS, Drawing, encode
 from hipsta_bids.group.output.tables import JointMap, joint_peaks, joint_points
-from hipsta_bids.group.stats.arrays import Float, blocks, return_memory
-from hipsta_bids.group.stats.glm import FittedMaps, PointTest
-from hipsta_bids.group.stats.inference import Discoveries, MapKey
+from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.io import files, gifti
 from hipsta_bids.progress import tell
 from hipsta_bids.reports.cells import JOINT
 from hipsta_bids.reports.group_tables import GroupResults
+from hipsta_bids.stats.arrays import Float, blocks, return_memory
+from hipsta_bids.stats.glm import FittedMaps, PointTest
+from hipsta_bids.stats.inference import Discoveries, MapKey
 from hipsta_bids.types import FAMILY, PARTICIPANT, SESSION
 
 _LOGGER = logging.getLogger(__name__)

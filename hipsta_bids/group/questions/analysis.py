@@ -10,26 +10,28 @@ import pandas as pd
 from scipy import special
 
 from hipsta_bids.errors import ModelError
+from hipsta_bids.group import model as modeling
 from hipsta_bids.group.cohort import data
 from hipsta_bids.group.cohort.read import leave_rare
-from hipsta_bids.group.design import model as designs
-from hipsta_bids.group.design.formula import ModelSpec, listed
-from hipsta_bids.group.design.grammar import closed_formula
-from hipsta_bids.group.design.settings import GlmSettings, GroupSettings
 from hipsta_bids.group.output import results
 from hipsta_bids.group.output.saved import SavedEffects
 from hipsta_bids.group.output.tables import JointMap
 from hipsta_bids.group.questions import harmonize
 from hipsta_bids.group.questions.scores import classify_groups, fit_summaries, score_cohort
-from hipsta_bids.group.stats import arrays, inference, registration
-from hipsta_bids.group.stats.clusters import edges_of
-from hipsta_bids.group.stats.glm import FittedMaps, RowModel, fit_maps, with_mean
-from hipsta_bids.group.stats.mixed import longitudinal_model
-from hipsta_bids.group.stats.mmrm import visit_model
-from hipsta_bids.group.stats.warps import Template, warp_labels, warp_values
+from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.progress import each, tell
 from hipsta_bids.reports import cells
 from hipsta_bids.reports.display import parts_of
+from hipsta_bids.stats import arrays, inference, registration
+from hipsta_bids.stats.clusters import edges_of
+from hipsta_bids.stats.design import Design, build_design
+from hipsta_bids.stats.formula import ModelSpec, listed
+from hipsta_bids.stats.glm import FittedMaps, RowModel, fit_maps, with_mean
+from hipsta_bids.stats.grammar import closed_formula
+from hipsta_bids.stats.mixed import longitudinal_model
+from hipsta_bids.stats.mmrm import visit_model
+from hipsta_bids.stats.settings import GlmSettings
+from hipsta_bids.stats.warps import Template, warp_labels, warp_values
 from hipsta_bids.types import PARTICIPANT
 
 #: Ratio of variances of a difference, true to that with equal ones, of which a note is made: then
@@ -40,12 +42,12 @@ _UNEQUAL = 1.3
 def analyze_cohort(
     cohort: data.Cohort,
     model: ModelSpec,
-    groups: designs.Groups | None,
+    groups: modeling.Groups | None,
     settings: GroupSettings,
     *,
     measures: data.Measures,
     references: Mapping[str, str],
-    comparison: designs.Comparison | None = None,
+    comparison: modeling.Comparison | None = None,
     time: str | None = None,
     icv: str | None = None,
     templates: Mapping[str, Template] | None = None,
@@ -83,7 +85,7 @@ def analyze_cohort(
     ModelError
         If the model cannot be fitted to these data.
     """
-    comparison = comparison or designs.Comparison()
+    comparison = comparison or modeling.Comparison()
     _check_covariates(model, comparison, settings, measures, is_harmonized=site_effects is not None)
     has_visits = bool(comparison.endpoint) or (
         comparison.longitudinal and settings.longitudinal.random == "visits"
@@ -101,13 +103,13 @@ def analyze_cohort(
         icv=icv,
         saved=site_effects,
     )
-    design = designs.build_design(table, model, settings.design, references)
+    design = build_design(table, model, settings.design, references)
     if plan is not None:
         design = harmonize.without_tests_of_sites(plan, design, model, comparison)
     if comparison.pair or not design.contrasts:
         design = replace(design, contrasts=with_mean(design))
 
-    make_rows: Callable[[designs.Design], RowModel] = partial(RowModel, settings=settings.glm)
+    make_rows: Callable[[Design], RowModel] = partial(RowModel, settings=settings.glm)
     if has_visits:
         arms = groups.column if groups and comparison.endpoint[:1] == ("clda",) else None
         make_rows = partial(
@@ -216,7 +218,7 @@ def analyze_cohort(
 
 def _check_covariates(
     model: ModelSpec,
-    comparison: designs.Comparison,
+    comparison: modeling.Comparison,
     settings: GroupSettings,
     measures: data.Measures,
     *,
@@ -239,7 +241,7 @@ def _check_covariates(
 
 
 def _check_visits(
-    comparison: designs.Comparison,
+    comparison: modeling.Comparison,
     settings: GroupSettings,
     *,
     maps: Sequence[str],
@@ -260,7 +262,7 @@ def _check_visits(
         )
 
 
-def _check_margins(design: designs.Design, cohort: data.Cohort, measures: data.Measures) -> None:
+def _check_margins(design: Design, cohort: data.Cohort, measures: data.Measures) -> None:
     """Refuse one margin for measures of several units."""
     names = [one.name for one in design.contrasts if one.margin]
     columns = {str(name) for side in cohort.sides.values() for name in side.summary.columns}
@@ -320,7 +322,7 @@ def _fit_cohort(
     plan: results.SitePlan | None,
     measures: data.Measures,
     rows: RowModel,
-    comparison: designs.Comparison,
+    comparison: modeling.Comparison,
     settings: GroupSettings,
     covariates: Sequence[str] = (),
     registrations: Mapping[str, registration.Registration] | None = None,
@@ -348,12 +350,18 @@ def _fit_cohort(
         relative = () if comparison.pair else settings.asymmetry.relative
         difference = data.asymmetry_maps(compared, maps, relative)
         contrasts = with_mean(rows.design)
-        fitted[designs.BOTH] = fit_maps(designs.BOTH, difference, rows, contrasts=contrasts)
+        fitted[modeling.BOTH] = fit_maps(modeling.BOTH, difference, rows, contrasts=contrasts)
     return (
         harmonization,
         compared,
         fitted,
-        inference.correct(fitted, rows, compared.table, settings.multiplicity),
+        inference.correct(
+            fitted,
+            rows,
+            compared.table,
+            settings.multiplicity,
+            report=partial(tell, "permutations"),
+        ),
     )
 
 
@@ -361,7 +369,7 @@ def register_side(
     cohort: data.Cohort,
     hemi: str,
     *,
-    groups: designs.Groups | None,
+    groups: modeling.Groups | None,
     settings: GroupSettings,
     templates: Mapping[str, Template] | None,
 ) -> tuple[registration.Registration, arrays.SideMaps]:
@@ -448,12 +456,12 @@ def unequal_spread(analysis: results.Analysis, settings: GlmSettings) -> Iterato
 
 
 def check_joint(
-    available: Sequence[str], comparison: designs.Comparison, settings: GroupSettings
+    available: Sequence[str], comparison: modeling.Comparison, settings: GroupSettings
 ) -> None:
     """Refuse measures that cannot be tested together, before anything is fitted."""
     available = [
         *available,
-        *(designs.asymmetry_name(name) for name in available if comparison.asymmetry),
+        *(modeling.asymmetry_name(name) for name in available if comparison.asymmetry),
     ]
     names, sides = settings.joint.measures, settings.joint.sides
     problem = None
@@ -489,7 +497,7 @@ def combine_maps(
     )
     groups: dict[inference.MapKey, dict[str, tuple[FittedMaps, str]]] = {}
     contrasts = {}
-    for hemis in [("L", "R")] if sides else [("L",), ("R",), (designs.BOTH,)]:
+    for hemis in [("L", "R")] if sides else [("L",), ("R",), (modeling.BOTH,)]:
         if not all((name, hemi) in fits for hemi, name in product(hemis, names)):
             continue
         parts = {
@@ -517,6 +525,7 @@ def combine_maps(
         analyses[0].compared.table,
         settings.multiplicity,
         combine=settings.joint.combine,
+        report=partial(tell, "permutations"),
     )
     return {
         key: JointMap(key=key, parts=groups[key], cohort=cohort, test=test, found=own)

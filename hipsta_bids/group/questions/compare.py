@@ -8,14 +8,11 @@ from typing import Any
 import pandas as pd
 
 from hipsta_bids.derivatives import dataset
+from hipsta_bids.group import model as modeling
 from hipsta_bids.group.cohort import collect
 from hipsta_bids.group.cohort.data import SHEET, modeled_table
 from hipsta_bids.group.cohort.masks import mask_note
 from hipsta_bids.group.cohort.quality import quality_notes, quality_table
-from hipsta_bids.group.design import model as designs
-from hipsta_bids.group.design.formula import folder_name
-from hipsta_bids.group.design.grammar import closed_formula
-from hipsta_bids.group.design.settings import GroupSettings
 from hipsta_bids.group.output.results import Analysis, harmonization_record
 from hipsta_bids.group.output.saved import load_effects
 from hipsta_bids.group.output.shapes import average_shapes, write_shapes
@@ -26,10 +23,13 @@ from hipsta_bids.group.questions import analysis as fitting
 from hipsta_bids.group.questions import study as studies
 from hipsta_bids.group.questions.exchange import SUMMARY, summarize, write_summary
 from hipsta_bids.group.questions.mixing import with_mixes
+from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.io import files
 from hipsta_bids.progress import tell
 from hipsta_bids.protocols.toml import resolve
 from hipsta_bids.reports.group_tables import GroupResults, opposite_changes
+from hipsta_bids.stats.formula import folder_name
+from hipsta_bids.stats.grammar import closed_formula
 from hipsta_bids.types import PARTICIPANT
 
 
@@ -62,7 +62,7 @@ def _analyze(options: studies.GroupOptions, settings: GroupSettings) -> studies.
     settings = study.settings
     fitting.check_joint(study.maps, options.comparison, settings)
     cohort = study.cohort
-    document, model, groups, references = designs.choose_model(
+    document, model, groups, references = modeling.choose_model(
         options.model,
         cohort.table,
         settings,
@@ -102,7 +102,7 @@ def _analyze(options: studies.GroupOptions, settings: GroupSettings) -> studies.
     table = analysis.compared.table
     incomplete = study.incomplete(analysis.design.dropped, table[PARTICIPANT])
     exclusions = [*study.exclusions, *collect.exclude_visits(table, incomplete)]
-    measures = designs.wanted_measures(options.model, options.measures)
+    measures = modeling.wanted_measures(options.model, options.measures)
     notes = [*study.notes, *_notes(study, analysis)]
     quality = quality_table(study.quality, groups.column) if groups else pd.DataFrame()
     notes += quality_notes(quality)
@@ -197,7 +197,7 @@ def _notes(study: studies.Study, analysis: Analysis) -> list[str]:
         notes += [
             f"{name} is n/a for all, and not in the model; fill it in: {name} may explain "
             "differences"
-            for name in designs.empty_covariates(study.cohort.table, settings)
+            for name in modeling.empty_covariates(study.cohort.table, settings)
         ]
     if n_later := sum(one.reason == "later-session" for one in study.exclusions):
         notes.append(

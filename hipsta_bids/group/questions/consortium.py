@@ -13,7 +13,6 @@ from hipsta_bids import __version__
 from hipsta_bids.derivatives.names import META, META_REPORT
 from hipsta_bids.errors import OutputError, UsageError
 from hipsta_bids.group.cohort.data import Cohort
-from hipsta_bids.group.design.settings import GroupSettings
 from hipsta_bids.group.output import write
 from hipsta_bids.group.output.citations import Citations, code, escaped
 from hipsta_bids.group.output.ground import grounds_of
@@ -24,13 +23,14 @@ from hipsta_bids.group.output.style import Drawing
 from hipsta_bids.group.output.tables import META_COLUMNS
 from hipsta_bids.group.questions.exchange import SiteSummary, read_summary, shown_counts
 from hipsta_bids.group.questions.sites import Meta, analyze_sites, check_agreement, meta_tables
-from hipsta_bids.group.stats.arrays import SideMaps
-from hipsta_bids.group.stats.glm import FittedMaps
-from hipsta_bids.group.stats.inference import PERMUTATIONS
-from hipsta_bids.group.stats.meta import FIXED, RANDOM
+from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.io import files
 from hipsta_bids.protocols.toml import resolve
 from hipsta_bids.reports.meta import write_meta_report
+from hipsta_bids.stats.arrays import SideMaps
+from hipsta_bids.stats.glm import FittedMaps
+from hipsta_bids.stats.inference import PERMUTATIONS
+from hipsta_bids.stats.meta import FIXED, RANDOM
 
 
 def run_meta(

@@ -10,13 +10,13 @@ import pandas as pd
 from numpy.typing import ArrayLike
 
 from hipsta_bids.errors import InputError, UsageError, did_you_mean, in_python
-from hipsta_bids.group.design.formula import listed
 from hipsta_bids.group.output import style, write
 from hipsta_bids.group.output.citations import Citations, escaped
 from hipsta_bids.group.output.tables import CORRELATION_COLUMNS
-from hipsta_bids.group.stats.arrays import Float
-from hipsta_bids.group.stats.correlation import correlate_maps
 from hipsta_bids.io import files, gifti
+from hipsta_bids.stats.arrays import Float
+from hipsta_bids.stats.correlation import correlate_maps
+from hipsta_bids.stats.formula import listed
 from hipsta_bids.types import Mesh
 
 if TYPE_CHECKING:

@@ -19,17 +19,17 @@ from pydantic import Field
 from hipsta_bids import __version__
 from hipsta_bids.errors import InputError, ModelError
 from hipsta_bids.group.cohort.data import Cohort, grows_with_head, summary_values
-from hipsta_bids.group.design.formula import typed
-from hipsta_bids.group.design.grammar import closed_formula
-from hipsta_bids.group.design.model import Design, build_design
-from hipsta_bids.group.design.settings import GroupSettings
 from hipsta_bids.group.output.results import Analysis, templates_of
 from hipsta_bids.group.questions.disclosure import check_cells, check_people, is_traceable
-from hipsta_bids.group.stats.arrays import Float, Int
-from hipsta_bids.group.stats.glm import FittedMaps, PointTest, fit_points, with_mean
+from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.io import files
 from hipsta_bids.io.files import FileNumbers, Number, Text, read_foreign, rounded
-from hipsta_bids.protocols.toml import TomlTable
+from hipsta_bids.stats.arrays import Float, Int
+from hipsta_bids.stats.design import Design, build_design
+from hipsta_bids.stats.formula import typed
+from hipsta_bids.stats.glm import FittedMaps, PointTest, fit_points, with_mean
+from hipsta_bids.stats.grammar import closed_formula
+from hipsta_bids.types.tables import TomlTable
 
 #: File of a summary, in the folder of an analysis.
 SUMMARY = "summary.json"

@@ -10,17 +10,18 @@ from formulaic import Formula
 
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.cohort.data import SIZES, Cohort, Measures, grows_with_head, modeled_table
-from hipsta_bids.group.design import formula as formulas
-from hipsta_bids.group.design.grammar import closed_formula, term_text
-from hipsta_bids.group.design.model import DEPENDENCE, Comparison, Design, build_design
-from hipsta_bids.group.design.settings import GroupSettings
+from hipsta_bids.group.model import Comparison
 from hipsta_bids.group.output.results import Harmonization, SitePlan, digests
 from hipsta_bids.group.output.saved import SavedEffects, damaged
 from hipsta_bids.group.questions.scores import without_variable
-from hipsta_bids.group.stats import combat
-from hipsta_bids.group.stats.arrays import Bool, Float
-from hipsta_bids.group.stats.registration import Registration
+from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.io.labels import refuse_alike
+from hipsta_bids.stats import combat
+from hipsta_bids.stats import formula as formulas
+from hipsta_bids.stats.arrays import Bool, Float
+from hipsta_bids.stats.design import DEPENDENCE, Design, build_design
+from hipsta_bids.stats.grammar import closed_formula, term_text
+from hipsta_bids.stats.registration import Registration
 from hipsta_bids.types import PARTICIPANT, SESSION
 
 #: Share of a contrast's weights that counts as rounding.

@@ -10,15 +10,15 @@ import numpy as np
 
 from hipsta_bids import __version__
 from hipsta_bids.errors import ModelError, UsageError
-from hipsta_bids.group.design.formula import level_labels, listed, typed
-from hipsta_bids.group.design.settings import GroupSettings
 from hipsta_bids.group.output.saved import NormsFile, load_norms, save_norms
 from hipsta_bids.group.questions import study as studies
 from hipsta_bids.group.questions.disclosure import check_sums, is_traceable
-from hipsta_bids.group.stats import summed_norms
-from hipsta_bids.group.stats.arrays import Float, Int, Key
-from hipsta_bids.group.stats.norms import People
+from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.io import files
+from hipsta_bids.stats import summed_norms
+from hipsta_bids.stats.arrays import Float, Int, Key
+from hipsta_bids.stats.formula import level_labels, listed, typed
+from hipsta_bids.stats.norms import People
 from hipsta_bids.types import PARTICIPANT
 
 #: File of norms, in the folder of an analysis.

@@ -13,9 +13,9 @@ from hipsta_bids.derivatives.dataset import PROVENANCE, counts_text
 from hipsta_bids.errors import InputError
 from hipsta_bids.group.cohort.quality import exact_p
 from hipsta_bids.group.cohort.read import visit_name
-from hipsta_bids.group.design.formula import typed
 from hipsta_bids.group.questions.study import Study
 from hipsta_bids.reports.cells import p_text
+from hipsta_bids.stats.formula import typed
 from hipsta_bids.types import PARTICIPANT, SESSION
 
 #: Largest difference of two edges of voxels, as a share: fields of view differ so within a

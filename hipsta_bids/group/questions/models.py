@@ -14,19 +14,21 @@ from numpy.typing import ArrayLike, NDArray
 from hipsta_bids.errors import in_python
 from hipsta_bids.group.cohort.covariates import Spellings, mark_missing, spelled_note
 from hipsta_bids.group.cohort.read import leave_rare
-from hipsta_bids.group.design.formula import with_factors
-from hipsta_bids.group.design.model import Design, ModelRequest, build_design, choose_model
-from hipsta_bids.group.design.settings import GroupSettings, load_group_settings
+from hipsta_bids.group.model import ModelRequest, choose_model
 from hipsta_bids.group.output.write import stats_of, write_stats
-from hipsta_bids.group.stats import registration
-from hipsta_bids.group.stats.arrays import Bool, Float, SideMaps
-from hipsta_bids.group.stats.glm import FittedMaps, PointTest, RowModel, fit_maps
-from hipsta_bids.group.stats.inference import Discoveries, MapKey, check_permutations, correct
-from hipsta_bids.group.stats.warps import warp_labels, warp_values
+from hipsta_bids.group.settings import GroupSettings, load_group_settings
 from hipsta_bids.io.files import check_writable
 from hipsta_bids.io.xarrays import make_dataset
+from hipsta_bids.progress import tell
 from hipsta_bids.reports.cells import card
 from hipsta_bids.reports.display import parts_of
+from hipsta_bids.stats import registration
+from hipsta_bids.stats.arrays import Bool, Float, SideMaps
+from hipsta_bids.stats.design import Design, build_design
+from hipsta_bids.stats.formula import with_factors
+from hipsta_bids.stats.glm import FittedMaps, PointTest, RowModel, fit_maps
+from hipsta_bids.stats.inference import Discoveries, MapKey, check_permutations, correct
+from hipsta_bids.stats.warps import warp_labels, warp_values
 from hipsta_bids.types import PARTICIPANT, Mesh
 
 _Number = TypeVar("_Number", np.float64, np.bool_)
@@ -276,7 +278,7 @@ def group(
     if spelled:
         note = spelled_note(spelled, formula or "", settings)
         design = replace(design, notes={**design.notes, "missing": note})
-    model = RowModel(design, settings.glm)
+    model, report = RowModel(design, settings.glm), partial(tell, "permutations")
     check_permutations(settings.multiplicity, settings.glm, design.contrasts)
     side_maps = {side: _side(values, measure, triangles) for side, values in sides.items()}
     fitted = {side: fit_maps(side, one, model) for side, one in side_maps.items()}
@@ -285,7 +287,7 @@ def group(
         unit=unit,
         design=design,
         fitted=fitted,
-        found=correct(fitted, model, table, settings.multiplicity),
+        found=correct(fitted, model, table, settings.multiplicity, report=report),
         axes=axes,
     )
 

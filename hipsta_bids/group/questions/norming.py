@@ -14,9 +14,7 @@ from hipsta_bids import __version__
 from hipsta_bids.derivatives import dataset
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.cohort.data import SHEET, Cohort, layers
-from hipsta_bids.group.design.formula import check_names, level_labels, listed, typed
-from hipsta_bids.group.design.model import BOTH, FIRST_AGE, Comparison
-from hipsta_bids.group.design.settings import GroupSettings, NormSettings
+from hipsta_bids.group.model import BOTH, Comparison
 from hipsta_bids.group.output import write
 from hipsta_bids.group.output.citations import escaped
 from hipsta_bids.group.output.figures import deviation_rows, draw_norms, norm_rows
@@ -31,15 +29,19 @@ from hipsta_bids.group.questions.merging import with_sums
 from hipsta_bids.group.questions.mixing import with_mixes
 from hipsta_bids.group.questions.scores import map_rows, score_rows
 from hipsta_bids.group.questions.trials import points_of
-from hipsta_bids.group.stats import norms as normative
-from hipsta_bids.group.stats import summed_norms
-from hipsta_bids.group.stats.arrays import Bool, Float, Int, Key
-from hipsta_bids.group.stats.glm import most_frequent
-from hipsta_bids.group.stats.warps import Template
+from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.io import files
 from hipsta_bids.io.labels import refuse_alike
 from hipsta_bids.progress import tell
 from hipsta_bids.protocols.toml import resolve
+from hipsta_bids.stats import norms as normative
+from hipsta_bids.stats import summed_norms
+from hipsta_bids.stats.arrays import Bool, Float, Int, Key
+from hipsta_bids.stats.design import FIRST_AGE
+from hipsta_bids.stats.formula import check_names, level_labels, listed, typed
+from hipsta_bids.stats.glm import most_frequent
+from hipsta_bids.stats.settings import NormSettings
+from hipsta_bids.stats.warps import Template
 from hipsta_bids.types import PARTICIPANT
 
 #: Points of each map, spread evenly, that are cross-validated.

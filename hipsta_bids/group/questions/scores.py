@@ -10,17 +10,19 @@ from formulaic import Formula
 
 from hipsta_bids.errors import ModelError, UsageError
 from hipsta_bids.group.cohort import data
-from hipsta_bids.group.design.contrasts import Contrast
-from hipsta_bids.group.design.formula import ModelSpec, check_names, listed, typed
-from hipsta_bids.group.design.grammar import closed_formula, term_text
-from hipsta_bids.group.design.model import Design, Groups, build_design
-from hipsta_bids.group.design.settings import ClassificationSettings, DesignSettings, GroupSettings
+from hipsta_bids.group.model import Groups
 from hipsta_bids.group.output.results import ScoredMaps
-from hipsta_bids.group.stats.arrays import Float, Int
-from hipsta_bids.group.stats.classify import ModelComparison, compare_pairs, forget_models
-from hipsta_bids.group.stats.glm import MEAN, PointwiseFit, RowModel, most_frequent, with_mean
-from hipsta_bids.group.stats.norms import w_scores
+from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.progress import tell
+from hipsta_bids.stats.arrays import Float, Int
+from hipsta_bids.stats.classify import ModelComparison, compare_pairs, forget_models
+from hipsta_bids.stats.contrasts import Contrast
+from hipsta_bids.stats.design import Design, build_design
+from hipsta_bids.stats.formula import ModelSpec, check_names, listed, typed
+from hipsta_bids.stats.glm import MEAN, PointwiseFit, RowModel, most_frequent, with_mean
+from hipsta_bids.stats.grammar import closed_formula, term_text
+from hipsta_bids.stats.norms import w_scores
+from hipsta_bids.stats.settings import ClassificationSettings, DesignSettings
 from hipsta_bids.types import PARTICIPANT, SESSION
 
 #: Region of a score that is the mean over the whole sheet.

@@ -9,7 +9,6 @@ from pathlib import Path
 from hipsta_bids import __version__
 from hipsta_bids.derivatives.names import COMPARISON
 from hipsta_bids.errors import MissingFileError, ModelError, OutputError, UsageError
-from hipsta_bids.group.design.settings import GroupSettings
 from hipsta_bids.group.output import agreement, write
 from hipsta_bids.group.output.agreement import Entry
 from hipsta_bids.group.output.citations import joined
@@ -17,6 +16,7 @@ from hipsta_bids.group.output.panels import draw_pages
 from hipsta_bids.group.output.tables import COMPARISON_COLUMNS
 from hipsta_bids.group.questions.compare import run_group
 from hipsta_bids.group.questions.study import GroupOptions, GroupResult
+from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.io import files
 from hipsta_bids.reports.comparison import write_comparison_report
 from hipsta_bids.reports.group_tables import GroupResults, read_group

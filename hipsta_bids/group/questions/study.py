@@ -13,15 +13,13 @@ from hipsta_bids import __version__
 from hipsta_bids.derivatives import dataset
 from hipsta_bids.derivatives.names import group_report
 from hipsta_bids.errors import InputError, ModelError, UsageError
+from hipsta_bids.group import model as modeling
 from hipsta_bids.group.cohort import collect, external, read
 from hipsta_bids.group.cohort.covariates import add_icv, add_time, read_covariates, spelled_note
 from hipsta_bids.group.cohort.crop import Places, crop_maps
 from hipsta_bids.group.cohort.data import SHEET, Cohort, Measures, choose_visits
 from hipsta_bids.group.cohort.masks import mask_sheets
 from hipsta_bids.group.cohort.order import read_in_order
-from hipsta_bids.group.design import model as designs
-from hipsta_bids.group.design.formula import ascii_letters, check_names, listed, with_factors
-from hipsta_bids.group.design.settings import GroupSettings
 from hipsta_bids.group.output import write
 from hipsta_bids.group.output.citations import REFERENCES
 from hipsta_bids.group.output.demographics import demographics_table
@@ -30,12 +28,14 @@ from hipsta_bids.group.output.saved import templates_from_json
 from hipsta_bids.group.output.tables import DEMOGRAPHIC_COLUMNS, registration_tables
 from hipsta_bids.group.output.template import template_file
 from hipsta_bids.group.questions import analysis
-from hipsta_bids.group.stats.arrays import Bool
-from hipsta_bids.group.stats.warps import Template
+from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.io import files
 from hipsta_bids.progress import each, tell
 from hipsta_bids.protocols.toml import resolve
 from hipsta_bids.reports.group import write_group_report
+from hipsta_bids.stats.arrays import Bool
+from hipsta_bids.stats.formula import ascii_letters, check_names, listed, with_factors
+from hipsta_bids.stats.warps import Template
 from hipsta_bids.types import PARTICIPANT, SESSION
 
 #: Share of participants that may be without a row in participants.tsv.
@@ -51,7 +51,7 @@ class GroupOptions:
     bids_dir: Path
     out_dir: Path
     sheets: collect.GroupRequest
-    model: designs.ModelRequest
+    model: modeling.ModelRequest
     covariates: tuple[Path, ...] = ()
     maps: tuple[tuple[str, str], ...] = ()
     """Names and patterns of other programs' maps."""
@@ -66,7 +66,7 @@ class GroupOptions:
     template: Path | None = None
     harmonize_model: Path | None = None
     """Parameters of the harmonization of another analysis."""
-    comparison: designs.Comparison = field(default_factory=designs.Comparison)
+    comparison: modeling.Comparison = field(default_factory=modeling.Comparison)
     export_summary: str | None = None
     """Name of this site in a summary for other sites, empty for that of the folder; ``None`` for no
     summary."""
@@ -117,7 +117,7 @@ class Study:
     """Measures of the sheets."""
     icv: str | None
     """Column of intracranial volume."""
-    time: designs.VisitTime | None
+    time: modeling.VisitTime | None
     exclusions: tuple[collect.Exclusion, ...]
     """Of hemispheres, and of sessions that are not compared."""
     notes: tuple[str, ...]
@@ -301,9 +301,9 @@ def read_study(
     collection = collect.collect_sheets(options.sheets, may_lack=bool(options.maps))
     reserved = read.SHEET_MAPS if collection.records else ()
     requests = external.map_patterns(options.maps, options.surfaces, reserved)
-    requested = designs.wanted_measures(options.model, options.measures)
+    requested = modeling.wanted_measures(options.model, options.measures)
     measures = read.choose_measures(requested, collection.records, [one.name for one in requests])
-    covariate_maps = designs.covariate_maps(options.model)
+    covariate_maps = modeling.covariate_maps(options.model)
     if covariate_maps:
         known_maps = [one.name for one in requests]
         found_maps = read.choose_measures(covariate_maps, collection.records, known_maps)

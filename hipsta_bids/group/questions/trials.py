@@ -14,11 +14,9 @@ from hipsta_bids import __version__
 from hipsta_bids.derivatives import dataset
 from hipsta_bids.derivatives.names import TRIAL_MAPS, TRIAL_TABLES
 from hipsta_bids.errors import ModelError
+from hipsta_bids.group import model as modeling
 from hipsta_bids.group.cohort.covariates import order_sessions
 from hipsta_bids.group.cohort.data import SHEET, SUMMARY, Cohort, Layer, layers, participants_with
-from hipsta_bids.group.design import model as designs
-from hipsta_bids.group.design.formula import listed, model_from_shortcut, parse_model
-from hipsta_bids.group.design.settings import GlmSettings, GroupSettings, RetestSettings
 from hipsta_bids.group.output import write
 from hipsta_bids.group.output.citations import Citations, code, escaped
 from hipsta_bids.group.output.columns import frame_of
@@ -31,13 +29,17 @@ from hipsta_bids.group.output.tables import entity_label
 from hipsta_bids.group.output.trial_figures import agreement_rows, size_rows
 from hipsta_bids.group.questions import study as studies
 from hipsta_bids.group.questions.mixing import with_mixes
-from hipsta_bids.group.stats import glm, trials
-from hipsta_bids.group.stats.arrays import Bool, Float, Int, SideMaps, describe_known, mean_of_known
-from hipsta_bids.group.stats.glm import FittedMaps, PointwiseFit, RowModel, fit_maps
-from hipsta_bids.group.stats.mixed import longitudinal_model
+from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.io import files, gifti
 from hipsta_bids.progress import tell
 from hipsta_bids.reports.cells import display_name
+from hipsta_bids.stats import glm, trials
+from hipsta_bids.stats.arrays import Bool, Float, Int, SideMaps, describe_known, mean_of_known
+from hipsta_bids.stats.design import build_design
+from hipsta_bids.stats.formula import listed, model_from_shortcut, parse_model
+from hipsta_bids.stats.glm import FittedMaps, PointwiseFit, RowModel, fit_maps
+from hipsta_bids.stats.mixed import longitudinal_model
+from hipsta_bids.stats.settings import GlmSettings, RetestSettings
 from hipsta_bids.types import PARTICIPANT, SESSION
 
 #: Months per unit of columns of time with these names.
@@ -161,21 +163,21 @@ class Modeled:
     def __init__(
         self,
         cohort: Cohort,
-        request: designs.ModelRequest,
+        request: modeling.ModelRequest,
         settings: GroupSettings,
-        visits: designs.VisitTime | None = None,
+        visits: modeling.VisitTime | None = None,
     ) -> None:
         table, covariates = cohort.table, None
         self.time: str | None = None
         if visits is not None:
             self.time, covariates = visits.column, visits.covariates
             _check_times(table, self.time, settings)
-        formula = request.formula or designs.default_formula(
+        formula = request.formula or modeling.default_formula(
             table, None, settings, covariates=covariates, time=self.time
         )
         contrasts = [self.time] if self.time else []
         self.spec = parse_model(model_from_shortcut(formula, contrasts, "reference"))
-        design = designs.build_design(table, self.spec, settings.design, dict(request.references))
+        design = build_design(table, self.spec, settings.design, dict(request.references))
         self._table, self._settings = table, settings
         self.model = RowModel(replace(design, contrasts=()), settings.glm)
         if self.time is not None:
@@ -308,7 +310,7 @@ def run_trial(
     if effect is not None:
         trials.point_level(settings.multiplicity, settings.power)  # refuses before anything is read
     visits = bool(effect and effect.visits)
-    options = replace(options, comparison=designs.Comparison(longitudinal=retest or visits))
+    options = replace(options, comparison=modeling.Comparison(longitudinal=retest or visits))
     study = studies.read_study(options, settings, among)
     source: Source
     if retest:

@@ -5,7 +5,7 @@ import pytest
 
 from hipsta_bids.errors import InputError
 from hipsta_bids.group.cohort.covariates import read_covariates, read_icv, relocate
-from hipsta_bids.group.design.settings import GroupSettings
+from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.io import files
 
 VISITS = pd.DataFrame(

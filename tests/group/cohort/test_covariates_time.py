@@ -5,7 +5,7 @@ import pytest
 
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.cohort.covariates import add_time
-from hipsta_bids.group.design.settings import GroupSettings
+from hipsta_bids.group.settings import GroupSettings
 
 SETTINGS = GroupSettings()
 WHO = ["sub-1", "sub-1", "sub-2", "sub-2"]

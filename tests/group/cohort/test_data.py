@@ -6,7 +6,7 @@ import pytest
 
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.cohort.data import Cohort, asymmetry_maps
-from hipsta_bids.group.stats.arrays import SideMaps
+from hipsta_bids.stats.arrays import SideMaps
 
 
 def cohort_of(left, right):

@@ -11,12 +11,12 @@ from hipsta_bids.errors import InputError, ModelError
 from hipsta_bids.group.cohort.covariates import read_covariates, spelled_note
 from hipsta_bids.group.cohort.exclusions import Choices
 from hipsta_bids.group.cohort.external import read_volumes
-from hipsta_bids.group.design.formula import check_numbers, typed, with_factors
-from hipsta_bids.group.design.settings import GroupSettings
 from hipsta_bids.group.questions.models import group
+from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.inputs.edits import read_ends
 from hipsta_bids.inputs.maps import read_regions
 from hipsta_bids.io import files, gifti
+from hipsta_bids.stats.formula import check_numbers, typed, with_factors
 
 SPELLINGS = (
     *("", " ", "n/a", "N/A", "NA", "na", "N.A.", "n.a.", "<NA>", "#N/A", "#NA", "NaN", "nan"),

@@ -11,12 +11,12 @@ from hipsta_bids.cli.main import main
 from hipsta_bids.errors import InputError
 from hipsta_bids.geometry.sampling import SampledMap
 from hipsta_bids.group.cohort.read import SHEET_MAPS, choose_measures
-from hipsta_bids.group.design.formula import left_side
 from hipsta_bids.group.output import write
 from hipsta_bids.group.output.tables import COLUMNS
 from hipsta_bids.inputs.scan import MapSource
 from hipsta_bids.io import files
 from hipsta_bids.participant.maps import write_map
+from hipsta_bids.stats.formula import left_side
 
 MISSING = ("03", "R")
 

@@ -20,9 +20,9 @@ from statsmodels.stats.oneway import anova_oneway
 from statsmodels.stats.weightstats import ttest_ind
 
 from hipsta_bids.cli.main import main
-from hipsta_bids.group.design.model import Groups
-from hipsta_bids.group.design.settings import GroupSettings
+from hipsta_bids.group.model import Groups
 from hipsta_bids.group.output.demographics import demographics_table
+from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.io import files
 from hipsta_bids.reports.group import group_page
 from validation.group import SimulationPlan, simulate_cohort

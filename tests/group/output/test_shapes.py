@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hipsta_bids.group.design.settings import ShapeSettings
 from hipsta_bids.group.output.shapes import align_rigidly, average_shape
+from hipsta_bids.group.settings import ShapeSettings
 
 SETTINGS = ShapeSettings()
 NODES = (15, 6)

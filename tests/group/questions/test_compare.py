@@ -16,15 +16,15 @@ from small_cohorts import GROUPS, NODES, PLAN, methods_of, place_of, table, writ
 from hipsta_bids.cli.main import main
 from hipsta_bids.group.cohort import read
 from hipsta_bids.group.cohort.collect import GroupRequest
-from hipsta_bids.group.design.contrasts import Contrast
-from hipsta_bids.group.design.model import ModelRequest
-from hipsta_bids.group.design.settings import GlmSettings
+from hipsta_bids.group.model import ModelRequest
 from hipsta_bids.group.output import write
 from hipsta_bids.group.output.tables import COLUMNS
 from hipsta_bids.group.questions import study
-from hipsta_bids.group.stats import arrays
-from hipsta_bids.group.stats.glm import fit_points
 from hipsta_bids.io import files
+from hipsta_bids.stats import arrays
+from hipsta_bids.stats.contrasts import Contrast
+from hipsta_bids.stats.glm import fit_points
+from hipsta_bids.stats.settings import GlmSettings
 
 MODEL = "group-age-sex"
 

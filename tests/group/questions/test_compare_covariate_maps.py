@@ -19,7 +19,7 @@ from small_cohorts import (
 
 from hipsta_bids.cli.main import main
 from hipsta_bids.errors import ExitCode
-from hipsta_bids.group.stats.inference import combine_evidence
+from hipsta_bids.stats.inference import combine_evidence
 
 FAST = ("--align", "none", "--no-classification", "--no-reports")
 

@@ -22,8 +22,8 @@ from small_cohorts import (
 
 from hipsta_bids.cli.main import main
 from hipsta_bids.group.output import write
-from hipsta_bids.group.stats.inference import control_fdr
 from hipsta_bids.reports.group import group_page
+from hipsta_bids.stats.inference import control_fdr
 from validation.group import simulate_cohort
 
 ALIGNED = ["--align", "none"]

@@ -28,12 +28,12 @@ from small_cohorts import (
 )
 
 from hipsta_bids.cli.main import main
-from hipsta_bids.group.design.contrasts import Contrast
-from hipsta_bids.group.design.settings import GlmSettings
 from hipsta_bids.group.output import write
-from hipsta_bids.group.stats.glm import fit_points
 from hipsta_bids.io import files
 from hipsta_bids.reports.group import group_page
+from hipsta_bids.stats.contrasts import Contrast
+from hipsta_bids.stats.glm import fit_points
+from hipsta_bids.stats.settings import GlmSettings
 
 #: One person and templates, where the shared data are present.
 HIPPUNFOLD = Path(__file__).parents[3] / ".." / "shared" / "data" / "hippunfold"

@@ -8,12 +8,13 @@ import pytest
 from check_disclosure import attack_designs, share_of_ordinary
 
 from hipsta_bids.errors import ModelError
-from hipsta_bids.group.design.formula import ModelSpec, typed
-from hipsta_bids.group.design.grammar import closed_formula
-from hipsta_bids.group.design.model import build_design
-from hipsta_bids.group.design.settings import DesignSettings, ExchangeSettings
 from hipsta_bids.group.questions import exchange
 from hipsta_bids.group.questions.disclosure import check_cells, check_people, is_traceable
+from hipsta_bids.group.settings import ExchangeSettings
+from hipsta_bids.stats.design import build_design
+from hipsta_bids.stats.formula import ModelSpec, typed
+from hipsta_bids.stats.grammar import closed_formula
+from hipsta_bids.stats.settings import DesignSettings
 
 
 def people(n_cell, seed=0, cells=(("CN", "F"), ("CN", "M"), ("AD", "F"), ("AD", "M"))):

@@ -22,17 +22,18 @@ from small_cohorts import (
 
 from hipsta_bids.cli.main import main
 from hipsta_bids.group.cohort.data import Cohort, Measures
-from hipsta_bids.group.design.contrasts import Contrast
-from hipsta_bids.group.design.formula import model_from_shortcut, parse_model
-from hipsta_bids.group.design.model import Comparison
-from hipsta_bids.group.design.settings import GlmSettings, GroupSettings
+from hipsta_bids.group.model import Comparison
 from hipsta_bids.group.output import write
 from hipsta_bids.group.output.figures import draw_sites
 from hipsta_bids.group.questions.harmonize import harmonize_cohort, plan_sites
-from hipsta_bids.group.stats.arrays import SideMaps
-from hipsta_bids.group.stats.glm import fit_points
+from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.io import files
 from hipsta_bids.reports.group import group_page
+from hipsta_bids.stats.arrays import SideMaps
+from hipsta_bids.stats.contrasts import Contrast
+from hipsta_bids.stats.formula import model_from_shortcut, parse_model
+from hipsta_bids.stats.glm import fit_points
+from hipsta_bids.stats.settings import GlmSettings
 
 SHIFT, SCALE, EFFECT = 0.3, 1.6, 0.25
 N = 36

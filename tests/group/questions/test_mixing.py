@@ -22,9 +22,9 @@ from small_cohorts import (
 from hipsta_bids.cli.main import main
 from hipsta_bids.derivatives.dataset import PROVENANCE
 from hipsta_bids.errors import ExitCode
-from hipsta_bids.group.design.settings import Provenance
 from hipsta_bids.io import files
 from hipsta_bids.reports.group import group_page
+from hipsta_bids.stats.settings import Provenance
 
 PEOPLE = 12
 USUAL = {

@@ -11,9 +11,9 @@ from statsmodels.regression.linear_model import OLS
 from statsmodels.stats.multitest import multipletests
 
 import hipsta_bids as hb
-import hipsta_bids.group.design.settings
 import hipsta_bids.group.output.write
-import hipsta_bids.group.stats.glm
+import hipsta_bids.group.settings
+import hipsta_bids.stats.glm
 from hipsta_bids.cli.main import main
 from hipsta_bids.errors import ModelError
 
@@ -41,7 +41,7 @@ LABELED = xr.DataArray(
 def test_the_folder_of_that_name_stays_a_package():
     assert hb.group is hipsta_bids.group
     assert callable(hb.group)
-    assert hipsta_bids.group.stats.glm.fit_points is not None
+    assert hipsta_bids.stats.glm.fit_points is not None
 
 
 def test_statistics_are_those_of_statsmodels():
@@ -111,7 +111,7 @@ def test_vertices_are_tested_like_points_of_a_sheet():
 
 def test_permutations_take_the_neighbors_that_are_given():
     table = TABLE.assign(group=np.where(TABLE.group == "AD", "AD", "CN"))
-    settings = hipsta_bids.group.design.settings.GroupSettings().changed(
+    settings = hipsta_bids.group.settings.GroupSettings().changed(
         multiplicity={"permutations": 200}
     )
     more = {"correction": "permutation-tfce", "settings": settings}

@@ -14,7 +14,6 @@ from scipy import stats
 from small_cohorts import NODES, place_of, read_participants, table, write_participants
 
 from hipsta_bids.cli.main import main
-from hipsta_bids.group.design.settings import RegistrationSettings
 from hipsta_bids.group.output.saved import (
     NormArrays,
     NormsFile,
@@ -24,9 +23,10 @@ from hipsta_bids.group.output.saved import (
 )
 from hipsta_bids.group.output.tables import COLUMNS
 from hipsta_bids.group.questions import norming
-from hipsta_bids.group.stats.registration import mean_profiles, register_to
 from hipsta_bids.io import files
 from hipsta_bids.reports.group import group_page
+from hipsta_bids.stats.registration import mean_profiles, register_to
+from hipsta_bids.stats.settings import RegistrationSettings
 
 TABLE = ("participant_id", "group", "age", "sex", "site")
 CONTROLS = ("--controls", "group=CN")

@@ -18,7 +18,7 @@ from small_cohorts import (
 
 from hipsta_bids.cli.main import main
 from hipsta_bids.group.cohort.covariates import order_sessions
-from hipsta_bids.group.design.settings import GroupSettings
+from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.io import files
 from validation.group import simulate_cohort
 

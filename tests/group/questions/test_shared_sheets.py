@@ -15,10 +15,10 @@ from hipsta_bids.group.cohort.collect import (
     grid_of,
 )
 from hipsta_bids.group.cohort.data import Cohort
-from hipsta_bids.group.design.settings import GroupSettings
 from hipsta_bids.group.questions.analysis import register_side
-from hipsta_bids.group.stats.arrays import SideMaps
+from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.settings import SheetSettings
+from hipsta_bids.stats.arrays import SideMaps
 
 NX, NY, PEOPLE, VISITS = 41, 5, 8, 2
 

@@ -6,10 +6,11 @@ import pytest
 from statsmodels.stats.power import TTestIndPower
 
 from hipsta_bids.group.cohort.data import SHEET, Cohort, layers
-from hipsta_bids.group.design.model import ModelRequest, VisitTime
-from hipsta_bids.group.design.settings import GroupSettings, PowerSettings
+from hipsta_bids.group.model import ModelRequest, VisitTime
 from hipsta_bids.group.questions.trials import Modeled, Retested
-from hipsta_bids.group.stats.trials import (
+from hipsta_bids.group.settings import GroupSettings
+from hipsta_bids.stats.settings import PowerSettings
+from hipsta_bids.stats.trials import (
     Reference,
     TrialEffect,
     endpoint_sd,

@@ -1,1 +1,0 @@
-"""Formulas, contrasts, comparisons and settings of the group level."""

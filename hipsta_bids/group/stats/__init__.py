@@ -1,1 +1,0 @@
-"""Statistics of arrays: nothing here knows files, folders or participants."""

@@ -1,0 +1,1 @@
+"""Design and statistics of arrays: nothing here knows files, folders or the group level."""
