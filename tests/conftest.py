@@ -38,7 +38,7 @@ def without_pages():
     """Make no pages, for the sake of time: they have tests of their own, in ``reports/``."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("hipsta_bids.participant.pages._try_all", lambda *_: None)
-        patch.setattr("hipsta_bids.group.questions.study.write_group_report", lambda *_: None)
+        patch.setattr("hipsta_bids.group.output.pages.write_group_report", lambda *_: None)
         yield
 
 

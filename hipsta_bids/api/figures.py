@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hipsta_bids.api.maps import attributes, check_choice, node_axes
+from hipsta_bids.derivatives.analyses import GroupResults, read_group
 from hipsta_bids.errors import ArgumentError, NothingToDoError, did_you_mean
 from hipsta_bids.geometry.catalog import MAPS
 from hipsta_bids.group.cohort.collect import grid_of
@@ -18,7 +19,6 @@ from hipsta_bids.reports import display
 from hipsta_bids.reports.cells import display_name, with_brackets
 from hipsta_bids.reports.group import group_models
 from hipsta_bids.reports.group_maps import measures_of
-from hipsta_bids.reports.group_tables import GroupResults, read_group
 from hipsta_bids.reports.results import Hemisphere, find_results
 
 if TYPE_CHECKING:

@@ -18,7 +18,7 @@ from hipsta_bids.reports.cells import display_name, unit_of
 from hipsta_bids.reports.group_maps import EFFECT_NAMES
 from hipsta_bids.reports.maps import draw_sheet
 from hipsta_bids.reports.results import SheetTable
-from hipsta_bids.types import Float
+from hipsta_bids.types import Float, parts_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -301,7 +301,7 @@ def _sheet(data: Measurement | xr.Dataset, columns: dict[str, Float]) -> SheetTa
     if isinstance(data, Measurement):
         return data.table
     state = {name: data[name].transpose("x", "y").to_numpy() for name in STATE if name in data}
-    parts = display.parts_of(data.coords["y"].to_numpy()) if "y" in data.coords else None
+    parts = parts_of(data.coords["y"].to_numpy()) if "y" in data.coords else None
     body = np.flatnonzero(parts == "body").tolist() if parts is not None else []
     return _bare_sheet(columns, state, (body[0], body[-1]) if body else None)
 

@@ -11,16 +11,12 @@ from markupsafe import escape
 from hipsta_bids.io import files
 from hipsta_bids.protocols.protocol import Tissue
 from hipsta_bids.reports.display import subfield_title
+from hipsta_bids.types import JOINT, SIDES, p_text
 
 if TYPE_CHECKING:
     import pandas as pd
     from markupsafe import Markup
 
-#: Names of the sides in tables of maps; in those of summary measures LR may be a mean.
-SIDES = {"L": "left", "R": "right", "LR": "left minus right", "both": "both sides"}
-DIFFERENCE, BOTH_SIDES = "LR", "both"
-#: Name of the map that tests several measures together, among those of measures.
-JOINT = "joint"
 MINUS = "\N{MINUS SIGN}"
 IDS = ("participant_id", "session_id")
 _THIRD = 1 / 3
@@ -92,13 +88,6 @@ def number_text(value: float, digits: int | None = None) -> str:
     text = f"{value:.3g}" if digits is None else f"{value:.{digits}f}"
     text = f"{value:.0f}" if "e+" in text else text
     return text.replace("-", MINUS)
-
-
-def p_text(p: float) -> str:
-    """Write a p-value."""
-    if not np.isfinite(p):
-        return files.MISSING
-    return "< 0.001" if p < 0.001 else f"{p:.3f}"  # noqa: PLR2004  (as papers have it)
 
 
 def position_text(peak: Mapping[str, Any]) -> str:

@@ -29,9 +29,9 @@ from hipsta_bids.protocols.toml import flatten, resolve
 from hipsta_bids.reports.maps import make_sprites, read_maps
 from hipsta_bids.reports.page import number, render
 from hipsta_bids.reports.results import SURFACES, Hemisphere, Views, find_results, input_path
-from hipsta_bids.reports.verdict import RATINGS, Verdict, verdict_of
+from hipsta_bids.reports.verdict import Verdict, verdict_of
 from hipsta_bids.settings import PUBLISHED, Settings
-from hipsta_bids.types import Decision, Float
+from hipsta_bids.types import RATINGS, Decision, Float
 
 #: Least number of hemispheres whose range is shown.
 SMALLEST_COHORT = 5

@@ -4,13 +4,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from hipsta_bids.derivatives.analyses import GroupResults, records
 from hipsta_bids.derivatives.names import COMPARISON
 from hipsta_bids.io import files
 from hipsta_bids.reports import cells
 from hipsta_bids.reports.group import heading, methods, origin
 from hipsta_bids.reports.group_maps import MOST_FIGURES, embedded
-from hipsta_bids.reports.group_tables import GroupResults, records
 from hipsta_bids.reports.page import Section, build_sections, render
+from hipsta_bids.types import SIDES, p_text
 
 _TEMPLATE = "comparison/table.html"
 _MOST_LINES = 12  # of findings; all are in the table of effect maps
@@ -47,7 +48,7 @@ def _cell(row: Mapping[str, Any], name: str) -> str:
     """Write a cell, a number with its limits."""
     value, measure = row[name], row.get("added") or row.get("measure") or ""
     if name == "hemi":
-        return cells.SIDES[value] if "dice" in row else cells.summary_side(value, measure)
+        return SIDES[value] if "dice" in row else cells.summary_side(value, measure)
     if isinstance(value, str):
         is_measure = name in {"measure", "added"}
         return cells.measures_text(value, row.get("unit", "1")) if is_measure else value
@@ -55,7 +56,7 @@ def _cell(row: Mapping[str, Any], name: str) -> str:
         return cells.limits_text(row, name)
     if name == "effect_size":
         return cells.effect_text(row)
-    return cells.p_text(value) if name in {"p", "p_fdr"} else cells.number_text(value)
+    return p_text(value) if name in {"p", "p_fdr"} else cells.number_text(value)
 
 
 def _findings(results: GroupResults) -> Mapping[str, Any] | None:
@@ -72,7 +73,7 @@ def _findings(results: GroupResults) -> Mapping[str, Any] | None:
             f" {row['other']}, {shared} in both; r {cells.number_text(row['r'], 2)}, Dice"
             f" {cells.number_text(row['dice'], 2)}"
         )
-        lines.append((f"{title}, {cells.SIDES[row['hemi']]}", text))
+        lines.append((f"{title}, {SIDES[row['hemi']]}", text))
     return {"lines": lines[:_MOST_LINES], "more": len(lines[_MOST_LINES:])} if lines else None
 
 

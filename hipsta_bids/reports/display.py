@@ -35,16 +35,9 @@ _UNSIGNED = "Reds", "Oranges"
 
 _EFFECTS = 99.0  # percentile of sizes that the colors of effects span
 _LEVEL = 0.05
-_ROUNDING = 1e-6  # of the ends of the body
 _SMALLEST = 1e-6  # reach of colors where all values are zero
 _LEAST_REACH = 3.0  # powers of ten of p that colors span at least
 _FAR_APART = 0.35  # of the most extreme ticks of p
-
-
-def parts_of(y: Float) -> NDArray[np.str_] | None:
-    """Name the part of rows at ``y``, whose body lies from -1 to 1; ``None`` if all are body."""
-    part = (y > -1 - _ROUNDING).astype(np.intp) + (y > 1 + _ROUNDING)
-    return np.array(("tail", "body", "head"))[part] if (part != 1).any() else None
 
 
 @dataclass(frozen=True, kw_only=True)

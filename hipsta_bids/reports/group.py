@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from hipsta_bids.derivatives.analyses import GroupResults, read_group, records
 from hipsta_bids.derivatives.names import DATASET_FILES, group_report
 from hipsta_bids.errors import HipstaError
 from hipsta_bids.io import files
@@ -21,8 +22,8 @@ from hipsta_bids.protocols import EXPERIMENTAL
 from hipsta_bids.reports import cells, group_tables
 from hipsta_bids.reports.display import DESIGN_COLORS, colors_of
 from hipsta_bids.reports.group_maps import embedded, map_scenes, norms, power, retest
-from hipsta_bids.reports.group_tables import GroupResults, read_group, records
 from hipsta_bids.reports.page import Section, build_sections, render
+from hipsta_bids.types import JOINT
 
 _LOGGER = logging.getLogger(__name__)
 _PREFIX = "group"
@@ -42,7 +43,7 @@ def design(results: GroupResults) -> Mapping[str, Any] | None:
     comparison, sided = record.get("comparison") or {}, record.get("one_sided") or {}
     return {
         "formula": record.get("formula"),
-        "measures": [m for m in measures["measure"].unique() if m != cells.JOINT]
+        "measures": [m for m in measures["measure"].unique() if m != JOINT]
         if len(measures)
         else [],
         "what": _what(comparison),

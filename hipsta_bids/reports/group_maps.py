@@ -7,12 +7,13 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from hipsta_bids.derivatives.analyses import GroupResults, records
 from hipsta_bids.derivatives.names import TRIAL_TABLES
 from hipsta_bids.reports import cells
 from hipsta_bids.reports.display import known
-from hipsta_bids.reports.group_tables import GroupResults, far_scores, map_unit, records, score_rows
+from hipsta_bids.reports.group_tables import far_scores, map_unit, score_rows
 from hipsta_bids.reports.maps import Picture, picture_of_file
-from hipsta_bids.types import Float
+from hipsta_bids.types import JOINT, SIDES, Float
 
 #: Kinds of effect sizes, by the test.
 EFFECT_NAMES = {"t": "Cohen's d", "F": "partial eta squared", "z": "combined evidence, z"}
@@ -32,7 +33,7 @@ def signed_logarithm(adjusted: Float, statistic: Float) -> Float:
 
 def kind_of_test(measure: str, points: pd.DataFrame) -> str:
     """Return the kind of the test in a table of points: ``t``, ``F``, or ``z`` of joint tests."""
-    return "z" if measure == cells.JOINT else "t" if points["cohen_d"].notna().any() else "F"
+    return "z" if measure == JOINT else "t" if points["cohen_d"].notna().any() else "F"
 
 
 def map_id(kind: str, index: int | str, hemi: str) -> str:
@@ -44,7 +45,7 @@ def measures_of(results: GroupResults) -> list[str]:
     """List the maps of an analysis in the order of its page, joint evidence first."""
     maps = results.table("maps")
     names = maps["measure"].unique().tolist() if len(maps) else []
-    return sorted(map(str, names), key=lambda name: name != cells.JOINT)
+    return sorted(map(str, names), key=lambda name: name != JOINT)
 
 
 def map_scenes(results: GroupResults) -> Mapping[str, Any] | None:
@@ -76,7 +77,7 @@ def map_scenes(results: GroupResults) -> Mapping[str, Any] | None:
         blocks.append({"title": title, "plates": plates})
         if scene and plates:
             data.append(_rounded(scene))
-    first = _OPEN + (cells.JOINT in measures)
+    first = _OPEN + (JOINT in measures)
     return {"blocks": blocks[:first], "more": blocks[first:], "data": data}
 
 
@@ -89,10 +90,10 @@ def embedded(results: GroupResults, name: str, caption: str, alt: str = "") -> l
 def _alternative(title: str, maps: pd.DataFrame) -> str:
     """Write what the maps of a measure show."""
     counts = "; ".join(
-        f"{row['contrast']}, {cells.SIDES[row['hemi']]}: {row['n_significant']} of {row['n_tests']}"
+        f"{row['contrast']}, {SIDES[row['hemi']]}: {row['n_significant']} of {row['n_tests']}"
         for row in records(maps)
     )
-    content = "evidence" if maps["measure"].iloc[0] == cells.JOINT else "means, effects"
+    content = "evidence" if maps["measure"].iloc[0] == JOINT else "means, effects"
     return f"{title}: {content} and significance. Points that survive: {counts}"
 
 
@@ -166,7 +167,7 @@ def _side(
     groups = group_means.groupby("group", sort=False) if len(group_means) else ()
     return {
         "hemi": hemi,
-        "title": cells.SIDES[hemi],
+        "title": SIDES[hemi],
         "shape": [int(first["node_x"].max()), int(first["node_y"].max())],
         "x": first["x"].to_numpy(),
         "y": first["y"].to_numpy(),
@@ -182,7 +183,7 @@ def _side(
 
 def _test(results: GroupResults, row: Mapping[str, Any]) -> dict[str, Any]:
     rows = results.table(str(row["file"]))
-    joint, kind = row["measure"] == cells.JOINT, kind_of_test(row["measure"], rows)
+    joint, kind = row["measure"] == JOINT, kind_of_test(row["measure"], rows)
     significant = rows["significant"].to_numpy() == True  # noqa: E712  (may hold missing values)
     numbers = {
         name: rows[name].to_numpy(dtype=np.float64)

@@ -1,10 +1,7 @@
 """What a group page says: findings in sentences, and tables of all else that an analysis left."""
 
-import csv
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from pathlib import Path
 from string import ascii_uppercase
 from typing import Any
 
@@ -12,14 +9,12 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
-from hipsta_bids.io import files
+from hipsta_bids.derivatives.analyses import GroupResults, records, short_contrast, without_effects
 from hipsta_bids.reports import cells
-from hipsta_bids.types import FAMILY
+from hipsta_bids.types import DIFFERENCE, FAMILY, JOINT, SIDES, p_text
 
 _ALPHA = 0.05  # of tests of summary measures and of models, for a word only
 _LEAST_SHARE = 0.01  # share of a map; what survives in less of it is no finding of the same rank
-#: How meta-analyses end the names of contrasts.
-_MODELS = re.compile(r" \((fixed|random) effects?\)$")
 _VISIBLE_ROWS = 12  # of summary measures in what was found; more are folded
 _MOST_ROWS = 200  # of lists, so that pages stay small
 #: Summary measures of the thickness of the whole sheet.
@@ -33,80 +28,10 @@ _TESTS = {
 }
 
 
-#: Columns that are never numbers.
-_TEXT = (
-    *("measure", "unit", "contrast", "hemi", "group", "subfield", "shares", "test", "effect"),
-    *("file", "model", "control", "case", "base", "added", "classifier", "region"),
-    *("analysis", "other", "seg", "groups", "formula", "correction"),
-    *("participant_id", "session_id", "reason", "message", "site", "kind", "version", "template"),
-    *("variable", "level"),
-)
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class GroupResults:
-    """The folder of one analysis."""
-
-    folder: Path
-    record: Mapping[str, Any]
-    """What was run, from ``analysis.json``."""
-    _tables: dict[str, pd.DataFrame] = field(default_factory=dict, repr=False)
-
-    @property
-    def name(self) -> str:
-        """Name of the model."""
-        return self.folder.name
-
-    @property
-    def levels(self) -> tuple[str, ...]:
-        """Groups that are compared, from least to most affected; may be empty."""
-        return tuple(str(level) for level in (self.record.get("groups") or {}).get("levels", ()))
-
-    def table(self, name: str) -> pd.DataFrame:
-        """Read a table; empty if there is none."""
-        if name not in self._tables:
-            path = self.folder / f"{name}.tsv"
-            self._tables[name] = (
-                pd.read_csv(
-                    path,
-                    sep="\t",
-                    na_values=[files.MISSING],
-                    keep_default_na=False,
-                    dtype=dict.fromkeys(_TEXT, str),
-                    quoting=csv.QUOTE_NONE,
-                )
-                if path.exists()
-                else pd.DataFrame()
-            )
-        return self._tables[name]
-
-    def everywhere(self, name: str) -> pd.DataFrame:
-        """Join a table of the sheets and tables of other programs' maps."""
-        prefixes = [*((self.record.get("inputs") or {}).get("maps") or {}), cells.JOINT]
-        parts = [self.table(name), *(self.table(f"{other}_{name}") for other in prefixes)]
-        return pd.concat([part for part in parts if len(part)] or parts[:1], ignore_index=True)
-
-
-def read_group(folder: Path) -> GroupResults:
-    """Read the record of an analysis."""
-    return GroupResults(folder=folder, record=files.read_json(folder / "analysis.json"))
-
-
-def records(table: pd.DataFrame) -> list[dict[str, Any]]:
-    """List the rows of a table by column."""
-    return [dict(zip(map(str, table.columns), row, strict=True)) for row in table.to_numpy(object)]
-
-
-def short_contrast(contrast: str) -> str:
-    """Write ``group[A] - group[B]``, as users do, like the default model, as ``A-B``."""
-    short = _MODELS.sub("", contrast)
-    return re.sub(r"\w+\[([^\]]*)\]", r"\1", short).replace(" - ", "-")
-
-
 def direction(results: GroupResults, contrast: str, hemi: str, sign: float) -> str:
     """Describe what a contrast above or below zero means."""
     comparison = results.record.get("comparison") or {}
-    if contrast == "mean" and hemi == cells.DIFFERENCE:
+    if contrast == "mean" and hemi == DIFFERENCE:
         return "larger on the left" if sign > 0 else "larger on the right"
     if contrast == "mean" and comparison.get("pair"):
         return "with an increase" if sign > 0 else "with a decrease"
@@ -212,7 +137,7 @@ def _side(results: GroupResults, row: Mapping[str, Any]) -> dict[str, Any]:
     selected = (peaks["measure"] == row["measure"]) & (peaks["contrast"] == row["contrast"])
     candidates = peaks[selected & (peaks["hemi"] == row["hemi"])]
     n, total = int(row["n_significant"]), int(row["n_tests"])
-    title, share = cells.SIDES[row["hemi"]].capitalize(), n / total if total else 0.0
+    title, share = SIDES[row["hemi"]].capitalize(), n / total if total else 0.0
     if not len(candidates):
         return {"title": title, "share": 0.0, "text": "nothing could be tested"}
     sided = (results.record.get("one_sided") or {}).get(row["contrast"])
@@ -251,9 +176,9 @@ def _directions(
 
 def _peak(results: GroupResults, peak: Mapping[str, Any], points: pd.DataFrame) -> str:
     """Describe the position of a peak in words, its size and its significance."""
-    corrected = f"corrected p {cells.p_text(peak['p_corrected'])}"
+    corrected = f"corrected p {p_text(peak['p_corrected'])}"
     place = cells.position_text(peak).partition(" (x ")[0]
-    if peak["measure"] == cells.JOINT:
+    if peak["measure"] == JOINT:
         return f"{place}: {peak['measures']}; together {corrected}"
     point = point_of(peak, points)
     effects = [f"{cells.effect_name(peak['effect'])} {cells.number_text(peak['effect_size'])}"]
@@ -300,7 +225,7 @@ def slope_of(results: GroupResults, contrast: str) -> str:
 
     All its columns are products of this variable and levels of factors.
     """
-    weights = (results.record.get("contrasts") or {}).get(_MODELS.sub("", contrast))
+    weights = (results.record.get("contrasts") or {}).get(without_effects(contrast))
     names = results.record.get("columns") or ()
     if weights is None or np.atleast_2d(weights).shape != (1, len(names)):
         return ""
@@ -362,7 +287,7 @@ def _classification(results: GroupResults) -> Iterator[str]:
             side, added = cells.summary_side(row["hemi"], row["added"]), row["added"]
             yield (
                 f"{row['control']} against {row['case']}, {side}: {cells.display_name(added)}"
-                f" adds to {row['base']} (p {cells.p_text(row['p'])});"
+                f" adds to {row['base']} (p {p_text(row['p'])});"
                 f" cross-validated area {row['auc_base_cv']:.2f} to {row['auc_full_cv']:.2f}"
             )
 
@@ -377,7 +302,7 @@ def peaks(results: GroupResults) -> Mapping[str, Any] | None:
     rows = records(table.assign(number=table.groupby(maps).cumcount() + 1).head(_MOST_ROWS))
     for row in rows:
         points = results.table(file_of[row["measure"], row["contrast"], row["hemi"]])
-        point = None if row["measure"] == cells.JOINT else point_of(row, points)
+        point = None if row["measure"] == JOINT else point_of(row, points)
         row["estimate"] = np.nan if point is None else point["estimate"]
     return {"rows": rows, "more": len(table) - len(rows)}
 

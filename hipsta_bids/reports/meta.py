@@ -10,13 +10,15 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
+from hipsta_bids.derivatives.analyses import GroupResults, records
 from hipsta_bids.derivatives.names import META, META_REPORT
 from hipsta_bids.io import files
 from hipsta_bids.reports import cells, group_tables
 from hipsta_bids.reports.group import heading, methods, origin
 from hipsta_bids.reports.group_maps import map_scenes
-from hipsta_bids.reports.group_tables import GroupResults, map_unit, records
+from hipsta_bids.reports.group_tables import map_unit
 from hipsta_bids.reports.page import Section, build_sections, render
+from hipsta_bids.types import SIDES, p_text
 
 _PREFIX = "meta"
 #: Forest plots of summary measures on the page; all are in the table.
@@ -37,11 +39,7 @@ def _forests(results: GroupResults, *, maps: bool) -> Iterator[dict[str, Any]]:
     at = table["x"].notna() if "x" in table else pd.Series(data=False, index=table.index)
     for number, rows in table[at == maps].groupby("plot", sort=False):
         first = records(rows.head(1))[0]
-        side = (
-            cells.SIDES[first["hemi"]]
-            if maps
-            else cells.summary_side(first["hemi"], first["measure"])
-        )
+        side = SIDES[first["hemi"]] if maps else cells.summary_side(first["hemi"], first["measure"])
         position = f" at {cells.position_text(first)}" if maps else ""
         title = f"{cells.measure_title(first['measure'])}, {side}, {first['contrast']}"
         drawing = _drawing(records(rows), str(first["unit"]))
@@ -107,9 +105,9 @@ def _drawing(rows: Sequence[Mapping[str, Any]], unit: str) -> dict[str, Any]:
         "middle": _NAMES + _PLOT / 2,
         "alt": f"estimates with limits [{cells.unit_of(unit)}]: {values}",
         "between": f"I² {cells.percent_text(random['i2'])}, τ {cells.with_unit(tau, unit)},"
-        f" Q p {cells.p_text(random['q_p'])}",
+        f" Q p {p_text(random['q_p'])}",
         "p": random["p"],
-        "p_text": cells.p_text(random["p"]),
+        "p_text": p_text(random["p"]),
     }
 
 

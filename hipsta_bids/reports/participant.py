@@ -39,9 +39,9 @@ from hipsta_bids.reports.results import (
     read_views,
 )
 from hipsta_bids.reports.slices import stack_of
-from hipsta_bids.reports.verdict import RATINGS, of_flag
+from hipsta_bids.reports.verdict import of_flag
 from hipsta_bids.reports.visits import draw_visits
-from hipsta_bids.types import Decision, Float
+from hipsta_bids.types import RATINGS, Decision, Float
 
 #: Finer masks of failed hemispheres are thinned to about this edge before they are drawn, mm.
 _EDGE = 0.9

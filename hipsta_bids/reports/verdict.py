@@ -13,9 +13,6 @@ from hipsta_bids.reports.page import number, read_table
 from hipsta_bids.reports.results import Finding, Hemisphere
 from hipsta_bids.types import Decision
 
-#: How a person rates a hemisphere, in the order of the keys 1, 2, 3; the last leaves it out.
-RATINGS = ("use", "unsure", "exclude")
-
 #: Flags about volumes that were sampled besides.
 _BESIDES = ("map-outside", "map-unusable", "roi-unusable")
 

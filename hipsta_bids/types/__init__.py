@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from hipsta_bids.protocols.protocol import Protocol
 
 _FLAT = 1e-3  # a surface is flat if it is thinner than this share of its length
+_ROUNDING = 1e-6  # of the ends of the body
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int32]
@@ -235,10 +236,17 @@ FAMILY = {
     "hemispheres": ("measure", "contrast"),
     "all": ("contrast",),
 }
+#: Names of the sides in tables of maps; in those of summary measures LR may be a mean.
+SIDES = {"L": "left", "R": "right", "LR": "left minus right", "both": "both sides"}
+DIFFERENCE, BOTH_SIDES = "LR", "both"
+#: Name of the map that tests several measures together, among those of measures.
+JOINT = "joint"
 #: SD of a normal distribution over its median absolute deviation; scipy.stats takes .6 s to import.
 MAD_TO_SD = 1.4826
 #: Columns at a repair are hatched if thickness is farther off its neighbors, mm.
 HATCHED_FROM = 0.05
+#: How a person rates a hemisphere, in the order of the keys 1, 2, 3; the last leaves it out.
+RATINGS = ("use", "unsure", "exclude")
 
 
 class Decision(StrEnum):
@@ -318,6 +326,19 @@ def position_text(point: Float | tuple[float, float, float], subfields: str = ""
     """Write a point (3,), RAS mm, and perhaps the subfields there, as messages do."""
     text = f"RAS {' '.join(f'{value:.1f}' for value in point)} mm"
     return f"{text} ({subfields})" if subfields else text
+
+
+def p_text(p: float) -> str:
+    """Write a p-value."""
+    if not np.isfinite(p):
+        return MISSING
+    return "< 0.001" if p < 0.001 else f"{p:.3f}"  # noqa: PLR2004  (as papers have it)
+
+
+def parts_of(y: Float) -> NDArray[np.str_] | None:
+    """Name the part of rows at ``y``, whose body lies from -1 to 1; ``None`` if all are body."""
+    part = (y > -1 - _ROUNDING).astype(np.intp) + (y > 1 + _ROUNDING)
+    return np.array(("tail", "body", "head"))[part] if (part != 1).any() else None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

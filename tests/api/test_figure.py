@@ -10,9 +10,9 @@ from PIL import Image
 
 import hipsta_bids as hb
 from hipsta_bids.cli.main import main
+from hipsta_bids.derivatives.analyses import read_group
 from hipsta_bids.errors import NothingToDoError, UsageError
 from hipsta_bids.group.output import write
-from hipsta_bids.reports.group_tables import read_group
 from hipsta_bids.stats import glm
 
 sys.path.append(str(Path(__file__).parents[1] / "group"))

@@ -6,8 +6,9 @@ import re
 import pandas as pd
 import pytest
 
+from hipsta_bids.derivatives.analyses import GroupResults
 from hipsta_bids.reports.cells import MINUS
-from hipsta_bids.reports.group_tables import GroupResults, findings, slope_of, slope_unit, summaries
+from hipsta_bids.reports.group_tables import findings, slope_of, slope_unit, summaries
 from hipsta_bids.reports.page import render
 
 MISSING = float("nan")

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from hipsta_bids.reports.results import Hemisphere, find_results
-from hipsta_bids.reports.verdict import RATINGS, verdict_of
+from hipsta_bids.reports.verdict import verdict_of
+from hipsta_bids.types import RATINGS
 
 
 def hemisphere(root, subject, hemi):

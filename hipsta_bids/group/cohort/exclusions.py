@@ -11,9 +11,8 @@ from hipsta_bids.derivatives.names import HemisphereName
 from hipsta_bids.errors import InputError, UsageError, did_you_mean
 from hipsta_bids.io import files
 from hipsta_bids.io.labels import match_rows
-from hipsta_bids.reports.verdict import RATINGS
 from hipsta_bids.stats.formula import listed
-from hipsta_bids.types import PARTICIPANT, SESSION, VisitKey
+from hipsta_bids.types import PARTICIPANT, RATINGS, SESSION, VisitKey
 
 #: Number of names that a note lists.
 SHOWN = 4

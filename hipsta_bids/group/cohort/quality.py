@@ -6,9 +6,8 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
-from hipsta_bids.reports.verdict import RATINGS
 from hipsta_bids.stats.formula import level_labels
-from hipsta_bids.types import PARTICIPANT, Decision
+from hipsta_bids.types import PARTICIPANT, RATINGS, Decision
 
 #: Whether a hemisphere is an outlier of the cohort.
 OUTLIER = ("no", "yes")

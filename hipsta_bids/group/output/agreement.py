@@ -11,6 +11,7 @@ import pandas as pd
 from scipy import stats
 
 from hipsta_bids import __version__
+from hipsta_bids.derivatives.analyses import GroupResults, records
 from hipsta_bids.geometry.surrogate import agreement
 from hipsta_bids.group.output.citations import Citations, code, escaped, joined
 from hipsta_bids.group.output.ground import Ground, read_grounds
@@ -18,9 +19,8 @@ from hipsta_bids.group.output.maps import ContrastMap, read_tests
 from hipsta_bids.group.output.panels import Row
 from hipsta_bids.reports import cells, display
 from hipsta_bids.reports.group_maps import EFFECT_NAMES
-from hipsta_bids.reports.group_tables import GroupResults, records
 from hipsta_bids.stats.inference import MapKey
-from hipsta_bids.types import PARTICIPANT
+from hipsta_bids.types import PARTICIPANT, SIDES
 
 _FAILED = "failed"
 #: Columns that locate a point: nodes of the sheet, or vertices of a surface.
@@ -259,7 +259,7 @@ def agreement_methods(
         " direction."
     )
     points = [
-        f"- {escaped(row['measure'])}, {escaped(row['contrast'])}, {cells.SIDES[row['hemi']]},"
+        f"- {escaped(row['measure'])}, {escaped(row['contrast'])}, {SIDES[row['hemi']]},"
         f" {escaped(row['analysis'])} and {escaped(row['other'])}: r"
         f" {cells.number_text(row['r'], 2)}, Dice {cells.number_text(row['dice'], 2)}"
         for row in records(table)

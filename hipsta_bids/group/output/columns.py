@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from hipsta_bids.group.cohort.data import Cohort
 from hipsta_bids.io.files import MISSING
-from hipsta_bids.reports.display import parts_of
 from hipsta_bids.stats.arrays import Bool, Float, Int
 from hipsta_bids.stats.clusters import label_regions
 from hipsta_bids.stats.glm import FittedMaps, PointTest
+from hipsta_bids.types import parts_of
 
 if TYPE_CHECKING:
     from hipsta_bids.stats.inference import Discoveries, MapKey

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
+from hipsta_bids.derivatives.analyses import GroupResults, records
 from hipsta_bids.group.cohort.data import SHEET, Cohort
 from hipsta_bids.group.output import panels, style
 from hipsta_bids.group.output.color_bar import spanned
@@ -23,13 +24,12 @@ from hipsta_bids.group.output.shapes import AverageShape
 from hipsta_bids.group.output.slices import draw_surrogate
 from hipsta_bids.io.files import MISSING
 from hipsta_bids.reports import display
-from hipsta_bids.reports.cells import SIDES, display_name, with_brackets
-from hipsta_bids.reports.display import COLORS, HEMISPHERE_COLORS, X_ENDS, kind_of, parts_of
+from hipsta_bids.reports.cells import display_name, with_brackets
+from hipsta_bids.reports.display import COLORS, HEMISPHERE_COLORS, X_ENDS, kind_of
 from hipsta_bids.reports.group_maps import MOST_FIGURES, measures_of
-from hipsta_bids.reports.group_tables import GroupResults, records
 from hipsta_bids.stats.arrays import Float, describe_known, mean_of_known
 from hipsta_bids.stats.glm import FittedMaps
-from hipsta_bids.types import PARTICIPANT
+from hipsta_bids.types import PARTICIPANT, SIDES, parts_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

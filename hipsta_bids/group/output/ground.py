@@ -7,9 +7,9 @@ from functools import cached_property
 import numpy as np
 import pandas as pd
 
+from hipsta_bids.derivatives.analyses import GroupResults, records
 from hipsta_bids.group.cohort.data import Cohort
 from hipsta_bids.io import gifti
-from hipsta_bids.reports.group_tables import GroupResults, records
 from hipsta_bids.stats.arrays import Float, Int
 from hipsta_bids.stats.glm import FittedMaps
 from hipsta_bids.types import Mesh

@@ -10,13 +10,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
+from hipsta_bids.derivatives.analyses import GroupResults, records
 from hipsta_bids.group.output import panels, style
 from hipsta_bids.group.output.ground import read_grounds
 from hipsta_bids.group.output.panels import Row
 from hipsta_bids.reports import cells, display, group_maps
-from hipsta_bids.reports.display import parts_of
-from hipsta_bids.reports.group_tables import GroupResults, map_unit, records
+from hipsta_bids.reports.group_tables import map_unit
 from hipsta_bids.stats.arrays import Bool, Float
+from hipsta_bids.types import BOTH_SIDES, DIFFERENCE, SIDES, parts_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -131,14 +132,14 @@ def mean_rows(results: GroupResults, measure: str) -> Iterator[Row]:
         return
     comparison = results.record.get("comparison") or {}
     change, unit = bool(comparison.get("pair")), map_unit(results, measure)
-    is_difference = means["hemi"] == cells.DIFFERENCE
+    is_difference = means["hemi"] == DIFFERENCE
     for part, difference in ((means[~is_difference], False), (means[is_difference], True)):
         scale = _mean_scale(measure, part, change=change or difference)
         title = "mean change" if change else "mean"
         for index, (group, rows) in enumerate(part.groupby("group", sort=False)):
             by_side = {str(hemi): own for hemi, own in rows.groupby("hemi", sort=False)}
             counts = {hemi: int(own["n"].max()) for hemi, own in by_side.items()}
-            number = ", ".join(f"{n} {cells.SIDES[hemi]}" for hemi, n in counts.items())
+            number = ", ".join(f"{n} {SIDES[hemi]}" for hemi, n in counts.items())
             if len(set(counts.values())) == 1:
                 number = f"n = {max(counts.values())}"
             yield Row(
@@ -242,7 +243,7 @@ def _counts(sides: Mapping[str, ContrastMap]) -> str:
             (
                 str(int(test.rejected.sum())),
                 *(() if uniform else (f"of {tested[hemi]}",)),
-                *(() if hemi == cells.BOTH_SIDES else (cells.SIDES[hemi],)),
+                *(() if hemi == BOTH_SIDES else (SIDES[hemi],)),
             )
         )
         for hemi, test in sides.items()

@@ -13,10 +13,10 @@ from hipsta_bids.group.cohort.data import SIZES, Cohort
 from hipsta_bids.group.cohort.read import LEAST_SHARE
 from hipsta_bids.group.output.citations import Citations, code, escaped, joined
 from hipsta_bids.group.output.results import Analysis
-from hipsta_bids.group.output.tables import summary_tests
+from hipsta_bids.group.output.tables import opposite_notes
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.protocols import EXPERIMENTAL
-from hipsta_bids.reports.group_tables import demographic_tests, opposite_changes
+from hipsta_bids.reports.group_tables import demographic_tests
 from hipsta_bids.stats import inference
 from hipsta_bids.stats.clusters import TFCE_EXTENT, TFCE_HEIGHT
 from hipsta_bids.stats.contrasts import Contrast
@@ -88,8 +88,7 @@ def methods_text(
         paragraphs.append(_classification(analysis, settings, cite))
     if analysis.found:
         paragraphs.append(_findings(analysis))
-    opposite = opposite_changes(summary_tests(cohort, analysis, settings))
-    paragraphs += [escaped(line) for line in opposite]
+    paragraphs += [escaped(line) for line in opposite_notes(cohort, analysis, settings)]
     if analysis.skipped:
         points = (f"- {escaped(line)}" for line in analysis.skipped)
         paragraphs.append("\n".join(["Notes:", "", *points]))

@@ -17,12 +17,11 @@ from hipsta_bids.group.output.color_bar import Scale, draw_bar
 from hipsta_bids.group.output.ground import Ground, beyond, middles_of
 from hipsta_bids.group.output.style import DOTS_PER_INCH, LETTER, MM, SMALL, TITLE
 from hipsta_bids.group.output.views import View, across, draw_mesh, laid_out, look
-from hipsta_bids.reports.cells import SIDES
-from hipsta_bids.reports.display import X_ENDS, Y_ENDS, parts_of
+from hipsta_bids.reports.display import X_ENDS, Y_ENDS
 from hipsta_bids.reports.group_maps import map_id
 from hipsta_bids.reports.maps import new_figure
 from hipsta_bids.stats.arrays import Bool, Float
-from hipsta_bids.types import Mesh
+from hipsta_bids.types import SIDES, Mesh, parts_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

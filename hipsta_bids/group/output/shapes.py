@@ -17,10 +17,9 @@ from hipsta_bids.group.cohort.read import visit_name
 from hipsta_bids.group.output.results import Analysis, members_of
 from hipsta_bids.group.settings import ShapeSettings
 from hipsta_bids.io import files, gifti
-from hipsta_bids.reports.display import parts_of
 from hipsta_bids.stats.arrays import Float, mean_of_known
 from hipsta_bids.stats.warps import warp_values
-from hipsta_bids.types import PARTICIPANT, Mesh
+from hipsta_bids.types import PARTICIPANT, Mesh, parts_of
 
 #: Most turns of alignment to the mean and of the mean.
 ALIGNMENT_TURNS = 50

@@ -8,15 +8,15 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
+from hipsta_bids.derivatives.analyses import GroupResults
 from hipsta_bids.group.cohort.collect import SheetRecord
 from hipsta_bids.group.cohort.read import visit_name
 from hipsta_bids.group.output import style
 from hipsta_bids.group.output.results import Analysis, members_of
 from hipsta_bids.io import files
-from hipsta_bids.reports.cells import SIDES
 from hipsta_bids.reports.display import COLORS, X_ENDS, Y_ENDS
-from hipsta_bids.reports.group_tables import GroupResults
 from hipsta_bids.stats.arrays import describe_known
+from hipsta_bids.types import SIDES
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

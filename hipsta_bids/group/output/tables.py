@@ -14,6 +14,7 @@ from hipsta_bids.group.output import columns, results
 from hipsta_bids.group.output.columns import find_clusters, frame_of
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.reports import cells
+from hipsta_bids.reports.group_tables import opposite_changes
 from hipsta_bids.stats.arrays import Float, describe_known, mean_of_known
 from hipsta_bids.stats.classify import ClassifierResult
 from hipsta_bids.stats.clusters import edges_of
@@ -21,7 +22,7 @@ from hipsta_bids.stats.formula import file_label
 from hipsta_bids.stats.glm import FittedMaps, PointTest
 from hipsta_bids.stats.inference import Discoveries, MapKey, PermutationTest, control_fdr
 from hipsta_bids.stats.registration import Registration
-from hipsta_bids.types import PARTICIPANT, SESSION
+from hipsta_bids.types import JOINT, PARTICIPANT, SESSION, p_text
 
 Named = tuple[str, pd.DataFrame]
 """File name without extension, and table."""
@@ -177,6 +178,18 @@ def summary_tests(
     """Return one row per test of a summary measure; empty without any."""
     blocks = list(_measures(cohort, analysis))
     return with_fdr(_stacked(blocks), settings) if blocks else pd.DataFrame()
+
+
+def opposite_notes(
+    cohort: Cohort, analysis: results.Analysis, settings: GroupSettings
+) -> list[str]:
+    """Return notes on volume and mean thickness that change in opposite directions."""
+    return opposite_changes(summary_tests(cohort, analysis, settings))
+
+
+def notebook_table(title: str, table: pd.DataFrame, rows: int) -> str:
+    """Show a table of at most as many rows in a notebook, below a title."""
+    return cells.card(title, table.to_html(index=False, max_rows=rows, border=0))
 
 
 def with_references(table: pd.DataFrame, analysis: results.Analysis) -> pd.DataFrame:
@@ -459,12 +472,12 @@ def joint_peaks(joint: Sequence[JointMap], neighbors: int, averages: Averages) -
             words = [
                 f"{title} {cells.effect_name(_EFFECTS[test.kind])}"
                 f" {cells.number_text(test.effect[at])},"
-                f" p {cells.p_text(test.p[at])}"
+                f" p {p_text(test.p[at])}"
                 for title, test in tests.items()
             ]
             rows.append(
                 {
-                    "measure": cells.JOINT,
+                    "measure": JOINT,
                     "contrast": joint_map.key.contrast,
                     "hemi": joint_map.key.hemi,
                     **frame.at(at),

@@ -7,7 +7,7 @@ import numpy as np
 
 from hipsta_bids.group.output.color_bar import spanned
 from hipsta_bids.group.output.panels import Row
-from hipsta_bids.reports.cells import with_brackets
+from hipsta_bids.reports.cells import display_name, with_brackets
 from hipsta_bids.stats.arrays import Float
 from hipsta_bids.stats.trials import MOST_PARTICIPANTS
 
@@ -22,7 +22,7 @@ def agreement_rows(
     if tables:
         within, icc = (_values(tables, name) for name in ("sd_within", "icc"))
         title = "Within-subject SD"
-        label = with_brackets(f"within-subject SD,\n{measure}", unit)
+        label = with_brackets(f"within-subject SD,\n{display_name(measure)}", unit)
         scale = spanned("magma", within)
         yield Row(kind="error", index=0, title=title, label=label, scale=scale, values=within)
         title = "ICC(2,1)"
@@ -50,7 +50,7 @@ def size_rows(tables: Mapping[str, Mapping[str, Any]], measure: str, _: str) -> 
             kind="size",
             index=0,
             title=f"Participants {arm}{ending}",
-            label=f"participants {arm},\n{measure}",
+            label=f"participants {arm},\n{display_name(measure)}",
             scale=scale,
             values=values,
             ticks={float(np.log10(n)): f"{n:,}" for n in ticks},

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from hipsta_bids.derivatives.analyses import GroupResults
 from hipsta_bids.derivatives.names import DATASET_FILES
 from hipsta_bids.group.cohort.collect import Exclusion
 from hipsta_bids.group.cohort.data import SHEET, Cohort
@@ -29,12 +30,10 @@ from hipsta_bids.group.output.tables import JointMap, joint_peaks, joint_points
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.io import files, gifti
 from hipsta_bids.progress import tell
-from hipsta_bids.reports.cells import JOINT
-from hipsta_bids.reports.group_tables import GroupResults
 from hipsta_bids.stats.arrays import Float, blocks, return_memory
 from hipsta_bids.stats.glm import FittedMaps, PointTest
 from hipsta_bids.stats.inference import Discoveries, MapKey
-from hipsta_bids.types import FAMILY, PARTICIPANT, SESSION
+from hipsta_bids.types import FAMILY, JOINT, PARTICIPANT, SESSION
 
 _LOGGER = logging.getLogger(__name__)
 

@@ -20,8 +20,6 @@ from hipsta_bids.group.questions import harmonize
 from hipsta_bids.group.questions.scores import classify_groups, fit_summaries, score_cohort
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.progress import each, tell
-from hipsta_bids.reports import cells
-from hipsta_bids.reports.display import parts_of
 from hipsta_bids.stats import arrays, inference, registration
 from hipsta_bids.stats.clusters import edges_of
 from hipsta_bids.stats.design import Design, build_design
@@ -32,7 +30,7 @@ from hipsta_bids.stats.mixed import longitudinal_model
 from hipsta_bids.stats.mmrm import visit_model
 from hipsta_bids.stats.settings import GlmSettings
 from hipsta_bids.stats.warps import Template, warp_labels, warp_values
-from hipsta_bids.types import PARTICIPANT
+from hipsta_bids.types import BOTH_SIDES, JOINT, PARTICIPANT, SIDES, parts_of
 
 #: Ratio of variances of a difference, true to that with equal ones, of which a note is made: then
 #: 9 % of tests of nothing have p below 0.05.
@@ -467,8 +465,8 @@ def check_joint(
     problem = None
     if unknown := [name for name in names if name not in available]:
         problem = f"no map is called {unknown[0]!r}; there are {', '.join(available)}"
-    elif names and cells.JOINT in available:
-        problem = f"a map is called {cells.JOINT}, as its results would be; give it another name"
+    elif names and JOINT in available:
+        problem = f"a map is called {JOINT}, as its results would be; give it another name"
     elif len(set(names)) < len(names):
         problem = "a measure is named twice; remove it"
     elif len(names) < 1 + (not sides) and (names or sides):
@@ -501,7 +499,7 @@ def combine_maps(
         if not all((name, hemi) in fits for hemi, name in product(hemis, names)):
             continue
         parts = {
-            name if len(hemis) == 1 else f"{name} {cells.SIDES[hemi]}": (
+            name if len(hemis) == 1 else f"{name} {SIDES[hemi]}": (
                 fits[name, hemi],
                 name,
             )
@@ -510,9 +508,9 @@ def combine_maps(
         _check_points(names, [one for one, _ in parts.values()])
         for test in fits[names[0], hemis[0]].fits[names[0]].tests:
             key = inference.MapKey(
-                cells.JOINT,
+                JOINT,
                 test.contrast.name,
-                cells.BOTH_SIDES if len(hemis) > 1 else hemis[0],
+                BOTH_SIDES if len(hemis) > 1 else hemis[0],
             )
             groups[key], contrasts[test.contrast.name] = parts, test.contrast
     if not groups:

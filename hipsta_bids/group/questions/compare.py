@@ -8,6 +8,7 @@ from typing import Any
 import pandas as pd
 
 from hipsta_bids.derivatives import dataset
+from hipsta_bids.derivatives.analyses import GroupResults
 from hipsta_bids.group import model as modeling
 from hipsta_bids.group.cohort import collect
 from hipsta_bids.group.cohort.data import SHEET, modeled_table
@@ -17,7 +18,7 @@ from hipsta_bids.group.output.results import Analysis, harmonization_record
 from hipsta_bids.group.output.saved import load_effects
 from hipsta_bids.group.output.shapes import average_shapes, write_shapes
 from hipsta_bids.group.output.slices import surrogate_table
-from hipsta_bids.group.output.tables import summary_tests
+from hipsta_bids.group.output.tables import opposite_notes
 from hipsta_bids.group.output.write import draw, write_results, write_table
 from hipsta_bids.group.questions import analysis as fitting
 from hipsta_bids.group.questions import study as studies
@@ -27,7 +28,6 @@ from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.io import files
 from hipsta_bids.progress import tell
 from hipsta_bids.protocols.toml import resolve
-from hipsta_bids.reports.group_tables import GroupResults, opposite_changes
 from hipsta_bids.stats.formula import folder_name
 from hipsta_bids.stats.grammar import closed_formula
 from hipsta_bids.types import PARTICIPANT
@@ -220,7 +220,7 @@ def _notes(study: studies.Study, analysis: Analysis) -> list[str]:
                 " survives, above the level; effects are widespread"
             )
     notes += fitting.unequal_spread(analysis, settings.glm)
-    notes += opposite_changes(summary_tests(study.cohort, analysis, settings))
+    notes += opposite_notes(study.cohort, analysis, settings)
     for hemi, registration in analysis.registrations.items():
         if not registration.converged:
             notes.append(f"hemisphere {hemi}: registration had not settled when it ended")

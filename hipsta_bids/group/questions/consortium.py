@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from hipsta_bids import __version__
-from hipsta_bids.derivatives.names import META, META_REPORT
+from hipsta_bids.derivatives.names import META
 from hipsta_bids.errors import OutputError, UsageError
 from hipsta_bids.group.cohort.data import Cohort
 from hipsta_bids.group.output import write
@@ -18,6 +18,7 @@ from hipsta_bids.group.output.citations import Citations, code, escaped
 from hipsta_bids.group.output.ground import grounds_of
 from hipsta_bids.group.output.maps import ContrastMap, contrasts
 from hipsta_bids.group.output.methods import discovery_text
+from hipsta_bids.group.output.pages import write_meta_page
 from hipsta_bids.group.output.panels import Row, draw_pages
 from hipsta_bids.group.output.style import Drawing
 from hipsta_bids.group.output.tables import META_COLUMNS
@@ -26,7 +27,6 @@ from hipsta_bids.group.questions.sites import Meta, analyze_sites, check_agreeme
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.io import files
 from hipsta_bids.protocols.toml import resolve
-from hipsta_bids.reports.meta import write_meta_report
 from hipsta_bids.stats.arrays import SideMaps
 from hipsta_bids.stats.glm import FittedMaps
 from hipsta_bids.stats.inference import PERMUTATIONS
@@ -65,9 +65,7 @@ def run_meta(
         notes += write.write_figures(scratch, _figures(meta), prints=figures)
         files.write_text(scratch / "methods.md", _methods(meta))
         files.write_json(scratch / "meta.json", _record(meta, paths, command, notes))
-    files.remove([out_dir / META_REPORT])  # it may be that of an earlier one
-    write_meta_report(out_dir)
-    return out_dir / META_REPORT, notes
+    return write_meta_page(out_dir), notes
 
 
 def _read(paths: Sequence[tuple[str | None, Path]]) -> list[SiteSummary]:

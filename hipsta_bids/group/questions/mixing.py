@@ -14,9 +14,8 @@ from hipsta_bids.errors import InputError
 from hipsta_bids.group.cohort.quality import exact_p
 from hipsta_bids.group.cohort.read import visit_name
 from hipsta_bids.group.questions.study import Study
-from hipsta_bids.reports.cells import p_text
 from hipsta_bids.stats.formula import typed
-from hipsta_bids.types import PARTICIPANT, SESSION
+from hipsta_bids.types import PARTICIPANT, SESSION, p_text
 
 #: Largest difference of two edges of voxels, as a share: fields of view differ so within a
 #: protocol, while 0.75 and 0.8 mm are two. Level of tests, for a clause only.

@@ -15,13 +15,12 @@ from hipsta_bids.errors import in_python
 from hipsta_bids.group.cohort.covariates import Spellings, mark_missing, spelled_note
 from hipsta_bids.group.cohort.read import leave_rare
 from hipsta_bids.group.model import ModelRequest, choose_model
+from hipsta_bids.group.output.tables import notebook_table
 from hipsta_bids.group.output.write import stats_of, write_stats
 from hipsta_bids.group.settings import GroupSettings, load_group_settings
 from hipsta_bids.io.files import check_writable
 from hipsta_bids.io.xarrays import make_dataset
 from hipsta_bids.progress import tell
-from hipsta_bids.reports.cells import card
-from hipsta_bids.reports.display import parts_of
 from hipsta_bids.stats import registration
 from hipsta_bids.stats.arrays import Bool, Float, SideMaps
 from hipsta_bids.stats.design import Design, build_design
@@ -29,7 +28,7 @@ from hipsta_bids.stats.formula import with_factors
 from hipsta_bids.stats.glm import FittedMaps, PointTest, RowModel, fit_maps
 from hipsta_bids.stats.inference import Discoveries, MapKey, check_permutations, correct
 from hipsta_bids.stats.warps import warp_labels, warp_values
-from hipsta_bids.types import PARTICIPANT, Mesh
+from hipsta_bids.types import PARTICIPANT, Mesh, parts_of
 
 _Number = TypeVar("_Number", np.float64, np.bool_)
 _GRID, _VERTICES = 3, 2  # axes of the maps of a side, participants included
@@ -66,8 +65,7 @@ class GroupFit:
         return f"{text}\n{self.table.to_string(index=False, max_rows=_TEXT_ROWS)}\n{arrays}"
 
     def _repr_html_(self) -> str:
-        table = self.table.to_html(index=False, max_rows=_TEXT_ROWS, border=0)
-        return card(repr(self).partition("\n")[0], table)
+        return notebook_table(repr(self).partition("\n")[0], self.table, _TEXT_ROWS)
 
     @property
     def sides(self) -> tuple[str, ...]:

@@ -8,14 +8,14 @@ from typing import Any
 
 import pandas as pd
 
+from hipsta_bids.derivatives.analyses import GroupResults, records, short_contrast
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.output.citations import joined
 from hipsta_bids.group.output.tables import REPLICATE_COLUMNS
 from hipsta_bids.group.output.write import write_table
 from hipsta_bids.group.questions.several import open_analysis
 from hipsta_bids.io.files import MISSING, read_tsv
-from hipsta_bids.reports import cells
-from hipsta_bids.reports.group_tables import GroupResults, records, short_contrast
+from hipsta_bids.types import p_text
 
 #: Published numbers as they are printed: one row per test, pair of classifiers, or group.
 PUBLISHED = Path(__file__).with_name("replicate.tsv")
@@ -130,4 +130,4 @@ def _spelled(name: str, value: str | float | None) -> str:
         return value
     if value is None or math.isnan(value):
         return MISSING
-    return cells.p_text(value).replace(" ", "") if name == "p" else f"{round(value, 2):g}"
+    return p_text(value).replace(" ", "") if name == "p" else f"{round(value, 2):g}"

@@ -7,19 +7,19 @@ from functools import partial
 from pathlib import Path
 
 from hipsta_bids import __version__
+from hipsta_bids.derivatives.analyses import GroupResults, read_group
 from hipsta_bids.derivatives.names import COMPARISON
 from hipsta_bids.errors import MissingFileError, ModelError, OutputError, UsageError
 from hipsta_bids.group.output import agreement, write
 from hipsta_bids.group.output.agreement import Entry
 from hipsta_bids.group.output.citations import joined
+from hipsta_bids.group.output.pages import write_comparison_page
 from hipsta_bids.group.output.panels import draw_pages
 from hipsta_bids.group.output.tables import COMPARISON_COLUMNS
 from hipsta_bids.group.questions.compare import run_group
 from hipsta_bids.group.questions.study import GroupOptions, GroupResult
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.io import files
-from hipsta_bids.reports.comparison import write_comparison_report
-from hipsta_bids.reports.group_tables import GroupResults, read_group
 
 _PAIRS = ("control", "case", "hemi", "added")
 
@@ -144,9 +144,7 @@ def compare_analyses(
         methods = agreement.agreement_methods(entries, table, notes, region)
         files.write_text(scratch / "methods.md", methods)
         files.write_json(scratch / COMPARISON, {**record, "notes": notes})
-    files.remove([folder.with_name(f"{folder.name}.html")])  # it may be that of an earlier one
-    if reports:
-        write_comparison_report(folder)
+    write_comparison_page(folder, reports=reports)
     return notes
 
 

@@ -11,7 +11,6 @@ import pandas as pd
 
 from hipsta_bids import __version__
 from hipsta_bids.derivatives import dataset
-from hipsta_bids.derivatives.names import group_report
 from hipsta_bids.errors import InputError, ModelError, UsageError
 from hipsta_bids.group import model as modeling
 from hipsta_bids.group.cohort import collect, external, read
@@ -23,6 +22,7 @@ from hipsta_bids.group.cohort.order import read_in_order
 from hipsta_bids.group.output import write
 from hipsta_bids.group.output.citations import REFERENCES
 from hipsta_bids.group.output.demographics import demographics_table
+from hipsta_bids.group.output.pages import write_page
 from hipsta_bids.group.output.results import templates_of
 from hipsta_bids.group.output.saved import templates_from_json
 from hipsta_bids.group.output.tables import DEMOGRAPHIC_COLUMNS, registration_tables
@@ -32,7 +32,6 @@ from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.io import files
 from hipsta_bids.progress import each, tell
 from hipsta_bids.protocols.toml import resolve
-from hipsta_bids.reports.group import write_group_report
 from hipsta_bids.stats.arrays import Bool
 from hipsta_bids.stats.formula import ascii_letters, check_names, listed, with_factors
 from hipsta_bids.stats.warps import Template
@@ -452,14 +451,8 @@ def _damaged(measured: read.Measured) -> tuple[str, ...]:
 
 def with_page(options: GroupOptions, result: GroupResult) -> GroupResult:
     """Add the page to results that were written, or why it could not be made."""
-    name = result.folder.name
-    path = options.out_dir / group_report(name)
-    if not options.reports:
-        files.remove([path])  # it would be that of an earlier analysis of this name
-        return result
-    tell("page")
-    problem = write_group_report(options.out_dir, name)
-    return replace(result, page=path if problem is None else None, problem=problem)
+    page, problem = write_page(options.out_dir, result.folder.name, reports=options.reports)
+    return replace(result, page=page, problem=problem)
 
 
 def _describe_dataset(options: GroupOptions) -> None:

@@ -32,7 +32,6 @@ from hipsta_bids.group.questions.mixing import with_mixes
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.io import files, gifti
 from hipsta_bids.progress import tell
-from hipsta_bids.reports.cells import display_name
 from hipsta_bids.stats import glm, trials
 from hipsta_bids.stats.arrays import Bool, Float, Int, SideMaps, describe_known, mean_of_known
 from hipsta_bids.stats.design import build_design
@@ -523,7 +522,7 @@ def _figures(
             }
             unit = cohorts[surface].units.get(measure, "1")
             tables = {hemi: result.tables[question] for hemi, result in sides.items()}
-            if rows := list(make(tables, display_name(measure), unit)):
+            if rows := list(make(tables, measure, unit)):
                 points = {hemi: r.points for hemi, r in sides.items() if r.points is not None}
                 grounds = grounds_of(cohorts[surface], points)
                 yield f"{measure}_{question}", partial(draw_pages, grounds, [rows])

@@ -10,6 +10,7 @@ import pytest
 from matplotlib.lines import Line2D
 from matplotlib.text import Text
 
+from hipsta_bids.derivatives.analyses import GroupResults
 from hipsta_bids.group.output import color_bar
 from hipsta_bids.group.output.color_bar import spanned
 from hipsta_bids.group.output.figures import draw_registration, draw_roc
@@ -19,7 +20,6 @@ from hipsta_bids.group.output.panels import Row, draw_pages
 from hipsta_bids.group.output.style import ONE_COLUMN, TWO_COLUMNS, style
 from hipsta_bids.io.gifti import sheet_triangles
 from hipsta_bids.reports.cells import MINUS
-from hipsta_bids.reports.group_tables import GroupResults
 from hipsta_bids.types import Mesh
 
 GRID = (41, 21)

@@ -19,6 +19,7 @@ from matplotlib.text import Text
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from hipsta_bids.derivatives.analyses import GroupResults
 from hipsta_bids.group.output.figures import draw_calibration, draw_roc, draw_sections
 from hipsta_bids.group.output.maps import draw_measure
 from hipsta_bids.group.output.panels import draw_view
@@ -27,7 +28,6 @@ from hipsta_bids.group.output.shapes import AverageShape
 from hipsta_bids.group.output.style import encode, style
 from hipsta_bids.group.output.views import across, draw_mesh, laid_out, look
 from hipsta_bids.io.gifti import sheet_triangles, surface_bytes
-from hipsta_bids.reports.group_tables import GroupResults
 from hipsta_bids.reports.maps import new_figure
 from hipsta_bids.stats.classify import Area, calibrate, roc_curve
 from hipsta_bids.stats.settings import ClassificationSettings

@@ -17,7 +17,7 @@ from hipsta_bids.cli.main import main
 from hipsta_bids.group.cohort import read
 from hipsta_bids.group.cohort.collect import GroupRequest
 from hipsta_bids.group.model import ModelRequest
-from hipsta_bids.group.output import write
+from hipsta_bids.group.output import pages, write
 from hipsta_bids.group.output.tables import COLUMNS
 from hipsta_bids.group.questions import study
 from hipsta_bids.io import files
@@ -295,7 +295,7 @@ def test_formula_contrast_reference_and_options(dataset, quick):
 
 @pytest.mark.parametrize("problem", [None, "kept.html: not made (no space)"])
 def test_the_page_is_named_unless_it_could_not_be_made(tmp_path, monkeypatch, problem):
-    monkeypatch.setattr(study, "write_group_report", lambda *_: problem)
+    monkeypatch.setattr(pages, "write_group_report", lambda *_: problem)
     sheets = GroupRequest(roots=(tmp_path,))
     given = study.GroupOptions(
         bids_dir=tmp_path, out_dir=tmp_path, sheets=sheets, model=ModelRequest()

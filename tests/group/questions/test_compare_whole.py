@@ -12,9 +12,9 @@ from hipsta_bids.cli.main import main
 from hipsta_bids.geometry.sheet import sheet_levels
 from hipsta_bids.group.output import figures, write
 from hipsta_bids.protocols import body_ends, rows_beyond
-from hipsta_bids.reports.display import parts_of
 from hipsta_bids.reports.group import group_page
 from hipsta_bids.settings import SheetSettings
+from hipsta_bids.types import parts_of
 
 REGION = "whole"
 TAIL, HEAD = rows_beyond(REGION, NODES[1])
