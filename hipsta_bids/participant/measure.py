@@ -214,6 +214,7 @@ def find_all(evidence: Evidence) -> list[Finding]:
         *sheet_checks.check_rows(sheet, checks),
         *sheet_checks.check_edges(evidence.whole, checks),
         *sheet_checks.check_subfields(sheet, evidence.subfield, checks),
+        *sheet_checks.check_lost_edges(sheet, evidence.whole, evidence.subfield, body, checks),
         sheet_checks.check_grooves(sheet, evidence.thickness, checks),
         *check_bumps(sheet, checks),
         *check_swollen_ends(sheet, checks),
