@@ -276,10 +276,8 @@ def _check_beyond(volume: types.LabelVolume, body: Body) -> list[Finding]:
 
 def _share_beyond(depth: Float) -> float:
     """Voxels beyond a plane over voxels before it, near it, by depths (N,), mm."""
-    near = np.abs(depth) < LATERAL_REACH
-    return float(
-        np.count_nonzero(near & (depth < 0)) / max(np.count_nonzero(near & (depth > 0)), 1)
-    )
+    near = depth[np.abs(depth) < LATERAL_REACH]
+    return float((near < 0).sum()) / max(float((near > 0).sum()), 1.0)
 
 
 def describe_uncus(body: Body, settings: CheckSettings) -> list[str]:
