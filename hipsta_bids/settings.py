@@ -192,10 +192,10 @@ class MeasureSettings(toml.SettingsTable):
 class CheckSettings(toml.SettingsTable):
     """What makes a map doubtful (flag) or wrong (refusal)."""
 
-    max_voxel: PositiveFloat = 0.85
-    """Refuse larger voxels in plane, mm: at 0.9, 5% of nodes are off by over 0.3 mm (phantoms)."""
+    max_voxel: PositiveFloat = 0.9
+    """Refuse larger voxels in plane, mm: no sheet is ``min_voxels_across`` of these thick."""
     min_voxels_across: NonNegativeFloat = 2.5
-    """Refuse sheets of fewer in-plane voxels: from here on, 0.5% of nodes are off (phantoms)."""
+    """Refuse sheets of fewer in-plane voxels: above, 0.5% of nodes are off by 0.3 mm (phantoms)."""
     min_label_order: Annotated[float, Field(ge=-1, le=1)] = 0.45
     """Refuse if the rank correlation of x with the medial-to-lateral order of labels is lower."""
     flag_thickness_ratio: NonNegativeFloat = 0.15

@@ -61,7 +61,8 @@ def check_subfields(
     """Flag the subfield that most rows lack, between rows that have it or up to an end.
 
     ``subfield`` (Nx, Ny) are values of Tissue. Protocols label CA1 and the subfields of both edges
-    all along the body; presubiculum and subiculum count together, and so do CA2 and CA3.
+    all along the body. Where CA2 stands for CA3, or the presubiculum for the subiculum, the sheet
+    is as wide, and no row lacks a subfield.
     """
     whole = _gap("", 0.0, settings.flag_subfield_gap, np.zeros((0, 3)), 0.0)
     gaps = _gaps(sheet.points[:, :, sheet.middle], subfield, settings)
@@ -70,26 +71,24 @@ def check_subfields(
 
 def _gaps(middle: Float, subfield: NDArray[np.uint8], settings: CheckSettings) -> Iterator[Finding]:
     step, lengths = node_step(middle, axis=1), np.linalg.norm(np.gradient(middle, axis=0), axis=-1)
-    groups: dict[tuple[int, ...], int] = {
-        (tissue,): edge for edge in (-1, 0) for tissue in np.unique(subfield[edge]).tolist()
-    }
-    groups |= {MEDIAL_END: 0, (Tissue.CA1,): len(middle) // 2, LATERAL_END: -1}
-    for tissues, edge in groups.items():
-        widths = np.where(np.isin(subfield, tissues), np.nan_to_num(lengths), 0.0).sum(axis=0)
-        name = " and ".join(Tissue(t).name for t in tissues if (subfield == t).any())
-        for (rows,) in ndimage.find_objects(ndimage.label(widths == 0)[0]):
-            beside = [
-                part.max() for part in (widths[: rows.start], widths[rows.stop :]) if len(part)
-            ]
-            if min(beside, default=0.0) < LEAST_WIDTH:
-                continue
-            size, points = (rows.stop - rows.start) * step, known(middle[edge, rows])
-            place, limit = "between rows that have it", settings.flag_subfield_gap
-            if len(beside) == 1:
-                end = "anterior" if rows.start else "posterior"
-                place, limit = f"up to the {end} end", settings.flag_subfield_end
-            text = f"rows lack {name} over {size:.1f} mm {place}"
-            yield _gap(text, size, limit, points, len(points) / len(widths))
+    lengths = np.nan_to_num(lengths)
+    present = np.unique(subfield).tolist()
+    for edge, group in ((0, MEDIAL_END), (len(middle) // 2, (Tissue.CA1,)), (-1, LATERAL_END)):
+        together = np.where(np.isin(subfield, group), lengths, 0.0).sum(axis=0)
+        parts = [(tissue,) for tissue in group if tissue in present]
+        for tissues in dict.fromkeys((group, *parts)):
+            widths = np.where(np.isin(subfield, tissues), lengths, 0.0).sum(axis=0)
+            usual = np.median(together[widths > 0]) if widths.any() else 0.0
+            absent = (widths == 0) & (together < usual - LEAST_WIDTH)
+            name = " and ".join(Tissue(tissue).name for tissue in tissues if tissue in present)
+            for (rows,) in ndimage.find_objects(ndimage.label(absent)[0]):
+                size, points = (rows.stop - rows.start) * step, known(middle[edge, rows])
+                place, limit = "between rows that have it", settings.flag_subfield_gap
+                if rows.start == 0 or rows.stop == len(widths):
+                    end = "anterior" if rows.start else "posterior"
+                    place, limit = f"up to the {end} end", settings.flag_subfield_end
+                text = f"rows lack {name} over {size:.1f} mm {place}"
+                yield _gap(text, size, limit, points, len(points) / len(widths))
 
 
 def _gap(text: str, size: float, limit: float, points: Float, share: float) -> Finding:
