@@ -216,7 +216,7 @@ class CheckSettings(toml.SettingsTable):
     """Flag them if they are more than this share of the body's voxels."""
     notch_share: toml.Numbers = (0.12, 0.3, 0.35)
     """Flag if more than this share of what both sides have is missing, one per distance."""
-    bump_contrast: NonNegativeFloat = 4.5
+    bump_contrast: NonNegativeFloat = 5.6
     """Flag a section with more of what others lack than so often the usual (suite population)."""
     intrusion_contrast: NonNegativeFloat = 3.7
     """The same for what both its neighbors label interior."""
@@ -227,15 +227,13 @@ class CheckSettings(toml.SettingsTable):
     flag_subfield_gap: NonNegativeFloat = 1.5
     """Flag rows without their edge's subfield over more than this, mm (1.2 at most in 128)."""
     flag_subfield_end: NonNegativeFloat = 3.0
-    """The same for rows up to an end of the body, mm (2.7 at most in 52)."""
-    flag_lost_edge: NonNegativeFloat = 0.07
-    """Flag an edge if more of its subfield lies outside the sheet, share (.061 at most in 52)."""
+    """The same for rows up to an end of the body, mm (2.8 at most in 128)."""
+    flag_lost_edge: NonNegativeFloat = 0.105
+    """Flag an edge if more of its subfield lies outside the sheet, share (.107 at most in 128)."""
     min_edge_voxels: PositiveFloat = 1.5
-    """Flag an edge of the sheet that is thinner, voxels: less is lost (1.7 at least in 52)."""
+    """Flag an edge of the sheet that is thinner, voxels: less is lost (1.7 at least in 128)."""
     flag_edge: toml.Numbers = (1.8, 2.2, 2.7)
     """Flag an edge that recedes behind both by more than this, one per distance, mm."""
-    flag_groove: toml.Numbers = (0.62, 0.85, 0.85)
-    """Flag a band that is thinner than both sides by more than this, one per distance, mm."""
     flag_bump: NonNegativeFloat = 5.8
     """Flag a patch thicker than round about by more roughnesses of the smoother wall (128 real
     hemispheres: 2 above it)."""

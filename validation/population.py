@@ -82,7 +82,6 @@ CALIBRATED: Mapping[str, tuple[str, float]] = MappingProxyType(
         "edge-notch": ("flag_edge", 1.0),
         "subfield-gap": ("flag_subfield_gap", 1.5),
         "edge-lost": ("flag_lost_edge", 0.05),
-        "thickness-groove": ("flag_groove", 0.55),
         "wall-bump": ("flag_bump", 5.0),
         "wall-dent": ("flag_dent", 5.0),
         "end-swollen": ("flag_swollen_end", 1.5),

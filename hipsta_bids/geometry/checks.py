@@ -246,38 +246,45 @@ def _check_beyond(volume: types.LabelVolume, body: Body) -> list[Finding]:
         if ends[end].rule in ("labels", "user"):
             continue
         near = points[(depth > 0) & (depth < BEYOND_REACH)]
-        beyond = np.count_nonzero((depth < 0) & (depth > -BEYOND_REACH))
-        findings.append(
+        beyond = [
+            _share_beyond(depth[np.isin(tissue, group)], LATERAL_REACH, ends.half_slice)
+            for group in (MEDIAL_END, (Tissue.CA1,), LATERAL_END)
+        ]
+        findings += [
             Finding(
                 reason="labels-end",
-                value=1 - float(beyond) / max(len(near), 1),
+                value=1 - _share_beyond(depth, BEYOND_REACH, ends.half_slice),
                 limit=1 - BEYOND_SHARE,
                 text=f"the labels of the sheet end at the {end} end of the body",
                 remedy="label the whole hippocampus, or check where the labels were cut",
                 points=near,
-            )
-        )
-        medial, ca1, lateral = (
-            _share_beyond(depth[np.isin(tissue, group)])
-            for group in (MEDIAL_END, (Tissue.CA1,), LATERAL_END)
-        )
-        findings.append(
+            ),
             Finding(
                 reason="subfield-gap",
-                value=min(medial, ca1, 1.0) - lateral,
+                value=min(*beyond[:2], 1.0) - beyond[2],
                 limit=LATERAL_LACK,
                 text=f"CA2 and CA3 end at the {end} end of the body; the other subfields do not",
                 remedy="complete the labels; until then, the body may be short",
                 points=near,
-            )
-        )
+            ),
+        ]
     return findings
 
 
-def _share_beyond(depth: Float) -> float:
-    """Voxels beyond a plane over voxels before it, near it, by depths (N,), mm."""
-    near = depth[np.abs(depth) < LATERAL_REACH]
-    return float((near < 0).sum()) / max(float((near > 0).sum()), 1.0)
+def _share_beyond(depth: Float, reach: float, half_slice: float) -> float:
+    """Volume beyond a plane over that before it, within ``reach`` of it, mm.
+
+    The voxels at depths (N,), mm, reach ``half_slice`` to both sides: slices may be thick.
+    """
+    beyond, before = (
+        np.clip(
+            np.minimum(way * depth + half_slice, reach) - np.maximum(way * depth - half_slice, 0),
+            0,
+            None,
+        ).sum()
+        for way in (-1, 1)
+    )
+    return float(beyond / before) if before else 0.0
 
 
 def describe_uncus(body: Body, settings: CheckSettings) -> list[str]:

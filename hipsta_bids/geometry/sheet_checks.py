@@ -1,9 +1,7 @@
 """What of a sheet a person should look at, as it does not resemble the sheet beside it.
 
-Rows that are narrower, edges that recede, and bands of odd thickness.
+Rows that are narrower, edges that recede, and maps that a second choice moves.
 """
-
-from collections.abc import Iterator
 
 import numpy as np
 from scipy import ndimage
@@ -15,10 +13,6 @@ from hipsta_bids.types import Finding, Float, Sheet
 ROW_DIP_REACH = 8.0
 #: Edges are compared with themselves at these distances along the axis on both sides, mm.
 EDGE_REACH = (2.5, 3.5, 5.0)
-#: Thickness is compared with that at these distances along the axis on both sides, mm.
-GROOVE_REACH = (1.0, 2.0, 3.0)
-#: Width over which thickness is averaged before grooves are sought, mm.
-GROOVE_WIDTH = 4.0
 #: The way into the sheet goes from an edge to the columns at this distance from it, mm.
 INWARD = 2.5
 
@@ -95,43 +89,6 @@ def check_edges(whole: Sheet, settings: CheckSettings) -> list[Finding]:
 def known(points: Float) -> Float:
     """Return the rows of (N, 3) points without NaN."""
     return points[np.isfinite(points).all(axis=1)]
-
-
-def check_grooves(sheet: Sheet, thickness: Float, settings: CheckSettings) -> Finding:
-    """Flag a band across the axis where thickness (Nx, Ny), mm, is less than on both sides.
-
-    A dent, or a bar that was cut, shows in few cross-sections; thickness of a whole sheet changes
-    more slowly along the axis.
-    """
-    middle, limits = sheet.points[:, :, sheet.middle], settings.flag_groove
-    columns = max(round(GROOVE_WIDTH / node_step(middle, axis=0)), 1)
-    bands = _bands(-thickness, limits, node_step(middle, axis=1), columns)
-    excess, size, (column, row) = max(bands, default=(0.0, 0.0, (0, 0)))
-    half = columns // 2
-    return Finding(
-        reason="thickness-groove",
-        value=size,
-        limit=size / excess if excess else limits[0],
-        text=f"a band of the sheet is {size:.1f} mm thinner than the sheet before and behind it",
-        remedy="look at the labels there",
-        points=known(middle[max(column - half, 0) : column + half + 1, row]),
-    )
-
-
-def _bands(
-    thickness: Float, limits: tuple[float, ...], step: float, columns: int
-) -> Iterator[tuple[float, float, tuple[int, int]]]:
-    """Thickest band at each distance: times the limit, mm above both sides, and column."""
-    for reach, limit in zip(GROOVE_REACH, limits, strict=True):
-        k = max(round(reach / step), 1)
-        if 2 * k >= thickness.shape[1]:
-            continue
-        sides = np.maximum(thickness[:, : -2 * k], thickness[:, 2 * k :])
-        above = np.nan_to_num(thickness[:, k:-k] - sides)
-        band = ndimage.uniform_filter1d(above, columns, axis=0)
-        at = np.unravel_index(band.argmax(), band.shape)
-        size = max(float(band[at]), 0.0)
-        yield size / limit, size, (int(at[0]), int(at[1]) + k)
 
 
 def node_step(middle: Float, axis: int) -> float:

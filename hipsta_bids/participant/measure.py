@@ -214,7 +214,6 @@ def find_all(evidence: Evidence) -> list[Finding]:
         *sheet_checks.check_rows(sheet, checks),
         *sheet_checks.check_edges(evidence.whole, checks),
         *coverage.check_coverage(sheet, evidence.whole, evidence.subfield, body, checks),
-        sheet_checks.check_grooves(sheet, evidence.thickness, checks),
         *check_bumps(sheet, checks),
         *check_swollen_ends(sheet, checks),
     ]
