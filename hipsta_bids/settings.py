@@ -228,8 +228,8 @@ class CheckSettings(toml.SettingsTable):
     """Flag rows without their edge's subfield over more than this, mm (1.2 at most in 128)."""
     flag_subfield_end: NonNegativeFloat = 3.0
     """The same for rows up to an end of the body, mm (2.8 at most in 128)."""
-    flag_lost_edge: NonNegativeFloat = 0.105
-    """Flag an edge if more of its subfield lies outside the sheet, share (.107 at most in 128)."""
+    flag_lost_edge: NonNegativeFloat = 0.06
+    """Flag an edge beyond which more of extent_x is labeled, share (.058 at most in 128)."""
     min_edge_voxels: PositiveFloat = 1.5
     """Flag an edge of the sheet that is thinner, voxels: less is lost (1.7 at least in 128)."""
     flag_edge: toml.Numbers = (1.8, 2.2, 2.7)

@@ -22,7 +22,7 @@ from hipsta_bids.types import Finding, Float, Sheet
 #: Rows may lack so much of a subfield, mm: less does not move the other columns.
 LEAST_WIDTH = 1.0
 #: Labels farther from the sheet than this are lost, mm: no sound phantom has any.
-LOST_BEYOND = 1.2
+LOST_BEYOND = 1.5
 #: Labels of an edge are compared with its columns up to this x, whatever their subfield is.
 EDGE_SHARE = 0.2
 #: An edge is as thick as its columns up to this x.
@@ -74,12 +74,12 @@ def _gaps(middle: Float, subfield: NDArray[np.uint8], settings: CheckSettings) -
     lengths = np.nan_to_num(lengths)
     present = np.unique(subfield).tolist()
     for edge, group in ((0, MEDIAL_END), (len(middle) // 2, (Tissue.CA1,)), (-1, LATERAL_END)):
-        together = np.where(np.isin(subfield, group), lengths, 0.0).sum(axis=0)
+        group_width = np.where(np.isin(subfield, group), lengths, 0.0).sum(axis=0)
         parts = [(tissue,) for tissue in group if tissue in present]
         for tissues in dict.fromkeys((group, *parts)):
             widths = np.where(np.isin(subfield, tissues), lengths, 0.0).sum(axis=0)
-            usual = np.median(together[widths > 0]) if widths.any() else 0.0
-            absent = (widths == 0) & (together < usual - LEAST_WIDTH)
+            usual = np.median(group_width[widths > 0]) if widths.any() else 0.0
+            absent = (widths == 0) & (group_width < usual - LEAST_WIDTH)
             name = " and ".join(Tissue(tissue).name for tissue in tissues if tissue in present)
             for (rows,) in ndimage.find_objects(ndimage.label(absent)[0]):
                 size, points = (rows.stop - rows.start) * step, known(middle[edge, rows])
@@ -109,7 +109,7 @@ def check_lost_labels(
     """Flag an edge of the sheet beyond which its subfield is labeled: that tissue dropped out.
 
     ``whole`` reaches from edge to edge; ``subfield`` (Nx, Ny) are values of Tissue. The statistic
-    is the share of the labels of the edge's subfields that lie off the sheet, mean of the rows.
+    is the share of ``extent_x`` that is lost at least, mean of the rows with labels.
     """
     points, tissue = body.inside_points()[1], body.tissue[body.inside]
     defined, length = np.isfinite(whole.points).all(axis=(2, 3)), np.nanmean(extent_x(whole))
@@ -125,22 +125,21 @@ def check_lost_labels(
         nearest = cKDTree(whole.points[columns].reshape(-1, 3)).query(points[labeled])
         gap, node = map(np.asarray, nearest)
         row, off = rows[node], gap > LOST_BEYOND
-        reach, voxels = np.zeros(count), np.bincount(row, minlength=count)
+        reach = np.zeros(count)
         np.maximum.at(reach, row[off], gap[off])
-        drawn = voxels > 0  # there are rows between thick slices
-        share = float((np.bincount(row, off, count)[drawn] / voxels[drawn]).mean())
-        short = float(reach[drawn].mean())
+        excess = reach[np.unique(row)]  # in thick slices, there are rows without labels
+        short = float(excess.mean())
         name = " and ".join(Tissue(t).name for t in np.unique(tissue[labeled]))
         findings.append(
             Finding(
                 reason="edge-lost",
-                value=share,
+                value=float(short / (length + short)),
                 limit=settings.flag_lost_edge,
-                text=f"{share:.0%} of {name} lies beyond the {edge} edge of the sheet; extent_x is "
-                f"at least {short:.1f} mm ({short / (length + short):.0%}) too small",
+                text=f"{name} is labeled up to {excess.max():.1f} mm beyond the {edge} edge; "
+                f"extent_x is {short:.1f} mm ({short / (length + short):.0%}) too small, or more",
                 remedy=f"look for thin labels; {_WRONG} are wrong",
                 points=points[labeled][off],
-                share=float((reach > 0)[drawn].mean()),
+                share=float((excess > 0).mean()),
             )
         )
     return findings
