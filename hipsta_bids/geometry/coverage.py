@@ -34,7 +34,6 @@ EDGES: tuple[Edge, ...] = (
     ("medial", MEDIAL_END, slice(None)),
     ("lateral", LATERAL_END, slice(None, None, -1)),
 )
-_WRONG = "extent_x, areas and positions along x"
 
 
 def check_coverage(
@@ -97,7 +96,7 @@ def _gap(text: str, size: float, limit: float, points: Float, share: float) -> F
         value=size,
         limit=limit,
         text=text,
-        remedy=f"complete the labels; until then, {_WRONG} are wrong",
+        remedy="complete the labels; extent_x and areas are too small",
         points=points,
         share=share,
     )
@@ -135,9 +134,9 @@ def check_lost_labels(
                 reason="edge-lost",
                 value=float(short / (length + short)),
                 limit=settings.flag_lost_edge,
-                text=f"{name} is labeled up to {excess.max():.1f} mm beyond the {edge} edge; "
-                f"extent_x is {short:.1f} mm ({short / (length + short):.0%}) too small, or more",
-                remedy=f"look for thin labels; {_WRONG} are wrong",
+                text=f"labels of {name} lie up to {excess.max():.1f} mm beyond the {edge} edge; "
+                f"extent_x is {short:.1f} mm ({short / (length + short):.0%}) too small",
+                remedy="look for thin labels; columns slide along x",
                 points=points[labeled][off],
                 share=float((excess > 0).mean()),
             )
@@ -159,7 +158,7 @@ def check_thin_edges(sheet: Sheet, body: Body, settings: CheckSettings) -> list[
                 limit=1 / settings.min_edge_voxels,
                 text=f"the {edge} edge of the sheet is {across:.1f} voxels thick; part of this "
                 "thin tissue is lost",
-                remedy=f"look for thin labels; {_WRONG} may be wrong",
+                remedy="look for thin labels; extent_x and areas may be too small",
                 points=known(sheet.points[order][0, :, sheet.middle]),
                 share=1.0,
             )

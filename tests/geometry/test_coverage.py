@@ -111,7 +111,7 @@ def test_labels_that_the_sheet_does_not_cover_are_flagged(start, short):
     if medial.raised:
         assert medial.points[:, 0].max() == pytest.approx(start - 1.5, abs=0.4)
         assert medial.share > 0.9
-        assert f"SUBICULUM is labeled up to {short:.1f} mm beyond the medial edge" in medial.text
+        assert f"labels of SUBICULUM lie up to {short:.1f} mm beyond the medial edge" in medial.text
         (size,) = re.findall(r"extent_x is ([\d.]+) mm", medial.text)
         assert float(size) == pytest.approx(short, abs=0.2)
 
