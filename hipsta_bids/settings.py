@@ -196,7 +196,7 @@ class CheckSettings(tables.SettingsTable):
     max_voxel: PositiveFloat = 0.9
     """Refuse larger voxels in plane, mm: no sheet is ``min_voxels_across`` of these thick."""
     min_voxels_across: NonNegativeFloat = 2.5
-    """Refuse sheets thinner than this many in-plane voxels."""
+    """Refuse sheets of fewer in-plane voxels: above, 0.5% of nodes are off by 0.3 mm (phantoms)."""
     min_label_order: Annotated[float, Field(ge=-1, le=1)] = 0.45
     """Refuse if the rank correlation of x with the medial-to-lateral order of labels is lower."""
     flag_thickness_ratio: NonNegativeFloat = 0.15
@@ -217,7 +217,7 @@ class CheckSettings(tables.SettingsTable):
     """Flag them if they are more than this share of the body's voxels."""
     notch_share: tables.Numbers = (0.12, 0.3, 0.35)
     """Flag if more than this share of what both sides have is missing, one per distance."""
-    bump_contrast: NonNegativeFloat = 4.5
+    bump_contrast: NonNegativeFloat = 5.6
     """Flag a section with more of what others lack than so often the usual (suite population)."""
     intrusion_contrast: NonNegativeFloat = 3.7
     """The same for what both its neighbors label interior."""
@@ -227,10 +227,14 @@ class CheckSettings(tables.SettingsTable):
     """Flag rows narrower than the widest on both sides by more than this (from the population)."""
     flag_subfield_gap: NonNegativeFloat = 1.5
     """Flag rows without their edge's subfield over more than this, mm (1.2 at most in 128)."""
+    flag_subfield_end: NonNegativeFloat = 3.0
+    """The same for rows up to an end of the body, mm (2.8 at most in 128)."""
+    flag_lost_edge: NonNegativeFloat = 0.06
+    """Flag an edge beyond which more of extent_x is labeled, share (.058 at most in 128)."""
+    min_edge_voxels: PositiveFloat = 1.5
+    """Flag an edge of the sheet that is thinner, voxels: less is lost (1.7 at least in 128)."""
     flag_edge: tables.Numbers = (1.8, 2.2, 2.7)
     """Flag an edge that recedes behind both by more than this, one per distance, mm."""
-    flag_groove: tables.Numbers = (0.62, 0.85, 0.85)
-    """Flag a band that is thinner than both sides by more than this, one per distance, mm."""
     flag_bump: NonNegativeFloat = 5.8
     """Flag a patch thicker than round about by more roughnesses of the smoother wall (128 real
     hemispheres: 2 above it)."""

@@ -81,7 +81,7 @@ CALIBRATED: Mapping[str, tuple[str, float]] = MappingProxyType(
         "extent-dip": ("flag_row_dip", 0.15),
         "edge-notch": ("flag_edge", 1.0),
         "subfield-gap": ("flag_subfield_gap", 1.5),
-        "thickness-groove": ("flag_groove", 0.55),
+        "edge-lost": ("flag_lost_edge", 0.05),
         "wall-bump": ("flag_bump", 5.0),
         "wall-dent": ("flag_dent", 5.0),
         "end-swollen": ("flag_swollen_end", 1.5),

@@ -25,7 +25,7 @@ from hipsta_bids.geometry.label_checks import border_sides
 from hipsta_bids.geometry.measures import column_area, measure_thickness
 from hipsta_bids.geometry.mesh import mean_wall_thickness
 from hipsta_bids.geometry.slices import points_of_ends
-from hipsta_bids.protocols.protocol import Part, Tissue, lateral_rank
+from hipsta_bids.protocols.protocol import LATERAL_END, MEDIAL_END, Part, Tissue, lateral_rank
 from hipsta_bids.settings import CheckSettings
 from hipsta_bids.types import Bool, Finding, Flag, Float, Sheet
 
@@ -44,6 +44,11 @@ END_LABEL_DEPTH = 2.0
 BEYOND_REACH = 3.0
 #: Flag an end without a label if fewer lie beyond it than this share of those before it.
 BEYOND_SHARE = 0.7
+#: CA2 and CA3 are counted within this distance on both sides of an end plane, mm.
+LATERAL_REACH = 5.0
+#: Flag an end beyond which they become fewer than the other subfields do by this share (sound
+#: hemispheres: .24 at most, nearly all below 0; missing halves: .51 to .95 in 14 of 15).
+LATERAL_LACK = 0.4
 #: A cross-section is compared with those at these distances on both sides, mm.
 NOTCH_REACH = (1.0, 2.0, 3.0)
 #: Cross-sections are compared without nodes this near to a bridge that was cut, grid nodes.
@@ -55,7 +60,7 @@ SECTION_NOISE = 0.02
 
 def check_voxels_across(surface: types.Surface, body: Body, settings: CheckSettings) -> float:
     """Refuse a sheet that is too thin for its voxels; return its thickness in voxels."""
-    thickness, voxel = mean_wall_thickness(surface), _voxel_across(body)
+    thickness, voxel = mean_wall_thickness(surface), voxel_across(body)
     across = thickness / voxel
     if across < settings.min_voxels_across:
         raise GeometryError(
@@ -198,7 +203,7 @@ def _check_probabilities(body: Body, unlike: digital.Index) -> Finding:
     )
 
 
-def _voxel_across(body: Body) -> float:
+def voxel_across(body: Body) -> float:
     """Edge of the voxels across the sheet, mm: the longest one if slices lie along the axis."""
     edges = np.linalg.norm(body.affine[:3, :3], axis=0)
     if edges.max() > LONG_VOXEL_RATIO * edges.min() and not cut_across(body):
@@ -227,12 +232,13 @@ def check_end_labels(
 def _check_beyond(volume: types.LabelVolume, body: Body) -> list[Finding]:
     """Flag ends without head or tail labels at which the labels of the sheet end.
 
-    The dentate gyrus and CA4 end before the sheet does, which closes behind them in the tail.
+    The dentate gyrus and CA4 end before the sheet does, which closes behind them in the tail. An
+    end that is put where CA2 and CA3 are missing, as the automatic rule needs them, is flagged too.
     """
     labeled = (volume.tissue > 0) & (volume.tissue <= Tissue.HIPPOCAMPUS)
     protocol = volume.protocol
     labeled &= ~np.isin(volume.tissue, list({*protocol.interior} - {*protocol.layer}))
-    points = digital.voxel_points(labeled, volume.affine)
+    points, tissue = digital.voxel_points(labeled, volume.affine), volume.tissue[labeled]
     findings = []
     ends = body.ends
     sides: tuple[types.End, ...] = ("posterior", "anterior")
@@ -240,18 +246,45 @@ def _check_beyond(volume: types.LabelVolume, body: Body) -> list[Finding]:
         if ends[end].rule in ("labels", "user"):
             continue
         near = points[(depth > 0) & (depth < BEYOND_REACH)]
-        beyond = np.count_nonzero((depth < 0) & (depth > -BEYOND_REACH))
-        findings.append(
+        beyond = [
+            _share_beyond(depth[np.isin(tissue, group)], LATERAL_REACH, ends.half_slice)
+            for group in (MEDIAL_END, (Tissue.CA1,), LATERAL_END)
+        ]
+        findings += [
             Finding(
                 reason="labels-end",
-                value=1 - float(beyond) / max(len(near), 1),
+                value=1 - _share_beyond(depth, BEYOND_REACH, ends.half_slice),
                 limit=1 - BEYOND_SHARE,
                 text=f"the labels of the sheet end at the {end} end of the body",
                 remedy="label the whole hippocampus, or check where the labels were cut",
                 points=near,
-            )
-        )
+            ),
+            Finding(
+                reason="subfield-gap",
+                value=min(*beyond[:2], 1.0) - beyond[2],
+                limit=LATERAL_LACK,
+                text=f"CA2 and CA3 end at the {end} end of the body; the other subfields do not",
+                remedy="complete the labels; until then, the body may be short",
+                points=near,
+            ),
+        ]
     return findings
+
+
+def _share_beyond(depth: Float, reach: float, half_slice: float) -> float:
+    """Volume beyond a plane over that before it, within ``reach`` of it, mm.
+
+    The voxels at depths (N,), mm, reach ``half_slice`` to both sides: slices may be thick.
+    """
+    beyond, before = (
+        np.clip(
+            np.minimum(way * depth + half_slice, reach) - np.maximum(way * depth - half_slice, 0),
+            0,
+            None,
+        ).sum()
+        for way in (-1, 1)
+    )
+    return float(beyond / before) if before else 0.0
 
 
 def describe_uncus(body: Body, settings: CheckSettings) -> list[str]:

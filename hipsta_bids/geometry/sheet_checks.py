@@ -1,15 +1,11 @@
 """What of a sheet a person should look at, as it does not resemble the sheet beside it.
 
-Rows that are narrower, edges that recede, subfields that are missing, and bands of odd thickness.
+Rows that are narrower, edges that recede, and maps that a second choice moves.
 """
 
-from collections.abc import Iterator
-
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
-from hipsta_bids.protocols.protocol import Tissue
 from hipsta_bids.settings import CheckSettings
 from hipsta_bids.types import Finding, Float, Sheet
 
@@ -17,18 +13,11 @@ from hipsta_bids.types import Finding, Float, Sheet
 ROW_DIP_REACH = 8.0
 #: Edges are compared with themselves at these distances along the axis on both sides, mm.
 EDGE_REACH = (2.5, 3.5, 5.0)
-#: Thickness is compared with that at these distances along the axis on both sides, mm.
-GROOVE_REACH = (1.0, 2.0, 3.0)
-#: Width over which thickness is averaged before grooves are sought, mm.
-GROOVE_WIDTH = 4.0
 #: The way into the sheet goes from an edge to the columns at this distance from it, mm.
 INWARD = 2.5
 
 #: A column is moved by a second choice if its thickness differs by more, mm.
 RIVAL_OFF = 0.3
-
-_LEAST_WIDTH = 1.0
-"""mm of a subfield that rows may lack: less does not move the other columns."""
 
 
 def check_rows(sheet: Sheet, settings: CheckSettings) -> list[Finding]:
@@ -51,7 +40,7 @@ def check_rows(sheet: Sheet, settings: CheckSettings) -> list[Finding]:
                 limit=limit,
                 text=f"the sheet's width {description.format(f'{change[row]:.0%}')}",
                 remedy="look for missing or added parts in the labels",
-                points=_known(middle[:, row]),
+                points=known(middle[:, row]),
             )
         )
     return findings
@@ -91,84 +80,15 @@ def check_edges(whole: Sheet, settings: CheckSettings) -> list[Finding]:
                 limit=limit,
                 text=f"the {name} edge of the sheet recedes by {size:.1f} mm",
                 remedy="look for a notch or a missing tip in the labels",
-                points=_known(outline[max(row - k // 2, 0) : row + k // 2 + 1]),
+                points=known(outline[max(row - k // 2, 0) : row + k // 2 + 1]),
             )
         )
     return findings
 
 
-def check_subfields(
-    sheet: Sheet, subfield: NDArray[np.uint8], settings: CheckSettings
-) -> list[Finding]:
-    """Flag a subfield of an edge, if rows between others that have it do not: the edge recedes.
-
-    ``subfield`` (Nx, Ny) are values of Tissue. Where less than a millimeter of a subfield can be
-    missing, the other columns hardly move.
-    """
-    middle = sheet.points[:, :, sheet.middle]
-    step, lengths = node_step(middle, axis=1), np.linalg.norm(np.gradient(middle, axis=0), axis=-1)
-    gaps = [(0.0, Tissue.BACKGROUND, 0, 0, 0)]
-    for edge in (0, -1):
-        for tissue in map(Tissue, np.unique(subfield[edge]).tolist()):
-            widths = np.where(subfield == tissue, np.nan_to_num(lengths), 0.0).sum(axis=0)
-            before, behind = (np.maximum.accumulate(widths[::way])[::way] for way in (1, -1))
-            empty = (widths == 0) & (np.minimum(before, behind) >= _LEAST_WIDTH)
-            for (part,) in ndimage.find_objects(ndimage.label(empty)[0]):
-                size = (part.stop - part.start) * step
-                gaps.append((size, tissue, edge, part.start, part.stop))
-    size, tissue, edge, first, last = max(gaps)
-    return [
-        Finding(
-            reason="subfield-gap",
-            value=size,
-            limit=settings.flag_subfield_gap,
-            text=f"{tissue.name} is missing over {size:.1f} mm between rows that have it",
-            remedy="complete the labels there",
-            points=_known(middle[edge, first:last]),
-        )
-    ]
-
-
-def _known(points: Float) -> Float:
-    """Rows of (N, 3) points without NaN."""
+def known(points: Float) -> Float:
+    """Return the rows of (N, 3) points without NaN."""
     return points[np.isfinite(points).all(axis=1)]
-
-
-def check_grooves(sheet: Sheet, thickness: Float, settings: CheckSettings) -> Finding:
-    """Flag a band across the axis where thickness (Nx, Ny), mm, is less than on both sides.
-
-    A dent, or a bar that was cut, shows in few cross-sections; thickness of a whole sheet changes
-    more slowly along the axis.
-    """
-    middle, limits = sheet.points[:, :, sheet.middle], settings.flag_groove
-    columns = max(round(GROOVE_WIDTH / node_step(middle, axis=0)), 1)
-    bands = _bands(-thickness, limits, node_step(middle, axis=1), columns)
-    excess, size, (column, row) = max(bands, default=(0.0, 0.0, (0, 0)))
-    half = columns // 2
-    return Finding(
-        reason="thickness-groove",
-        value=size,
-        limit=size / excess if excess else limits[0],
-        text=f"a band of the sheet is {size:.1f} mm thinner than the sheet before and behind it",
-        remedy="look at the labels there",
-        points=_known(middle[max(column - half, 0) : column + half + 1, row]),
-    )
-
-
-def _bands(
-    thickness: Float, limits: tuple[float, ...], step: float, columns: int
-) -> Iterator[tuple[float, float, tuple[int, int]]]:
-    """Thickest band at each distance: times the limit, mm above both sides, and column."""
-    for reach, limit in zip(GROOVE_REACH, limits, strict=True):
-        k = max(round(reach / step), 1)
-        if 2 * k >= thickness.shape[1]:
-            continue
-        sides = np.maximum(thickness[:, : -2 * k], thickness[:, 2 * k :])
-        above = np.nan_to_num(thickness[:, k:-k] - sides)
-        band = ndimage.uniform_filter1d(above, columns, axis=0)
-        at = np.unravel_index(band.argmax(), band.shape)
-        size = max(float(band[at]), 0.0)
-        yield size / limit, size, (int(at[0]), int(at[1]) + k)
 
 
 def node_step(middle: Float, axis: int) -> float:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from hipsta_bids.errors import GeometryError
-from hipsta_bids.geometry import repairs, sheet_checks
+from hipsta_bids.geometry import coverage, repairs, sheet_checks
 from hipsta_bids.geometry.body import Body, check_mask, check_side, extract_body
 from hipsta_bids.geometry.boundaries import Boundaries, find_boundaries
 from hipsta_bids.geometry.bumps import check_bumps, check_swollen_ends
@@ -213,8 +213,7 @@ def find_all(evidence: Evidence) -> list[Finding]:
         ),
         *sheet_checks.check_rows(sheet, checks),
         *sheet_checks.check_edges(evidence.whole, checks),
-        *sheet_checks.check_subfields(sheet, evidence.subfield, checks),
-        sheet_checks.check_grooves(sheet, evidence.thickness, checks),
+        *coverage.check_coverage(sheet, evidence.whole, evidence.subfield, body, checks),
         *check_bumps(sheet, checks),
         *check_swollen_ends(sheet, checks),
     ]

@@ -81,7 +81,7 @@ def test_the_volume_of_the_uncus_is_told(arc):
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_slices_along_the_axis_count_by_their_distance(arc, axis):
     affine = np.diag([0.5, 0.5, 0.5, 1.0])
-    assert checks._voxel_across(replace(arc.body, affine=affine)) == 0.5
+    assert checks.voxel_across(replace(arc.body, affine=affine)) == 0.5
     affine[axis, axis] = 2.0
     body = replace(arc.body, affine=affine)
-    assert checks._voxel_across(body) == (0.5 if cut_across(body) else 2.0)
+    assert checks.voxel_across(body) == (0.5 if cut_across(body) else 2.0)

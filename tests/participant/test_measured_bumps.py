@@ -1,5 +1,6 @@
-"""A ball of tissue on a wall: it makes the map wrong there, and is flagged there."""
+"""Damage of known size that makes a map wrong is flagged where it is."""
 
+import re
 from contextlib import nullcontext
 
 import numpy as np
@@ -42,3 +43,33 @@ def test_a_ball_on_a_wall_is_flagged_where_the_map_is_wrong(volume, plain, radiu
     center = site.beside((0.5, v), 0.6 * radius)
     assert np.linalg.norm(flag.points - center, axis=1).min() < radius + 0.4  # mm, a voxel
     assert np.linalg.norm(flag.points.mean(axis=0) - center) < radius + 0.8
+
+
+@pytest.mark.parametrize(
+    ("injury", "reason", "text"),
+    [
+        (("half-subfield", 0.4, (1.0, 1.0)), "subfield-gap", "CA2_3 over .* the anterior end"),
+        (("half-subfield", 0.4, (0.0, 0.0)), "subfield-gap", "SUBICULUM over .* the posterior end"),
+        (("thin-edge", 0.6, (0.0, 0.5)), "edge-thin", "the medial edge .* is 1.3 voxels thick"),
+        (
+            ("thin-edge", 0.4, (0.0, 0.5)),
+            "edge-lost",
+            "SUBICULUM lie .* beyond the medial edge",
+        ),
+        (
+            ("thin-edge", 0.4, (1.0, 0.5)),
+            "edge-lost",
+            "CA2_3 lie .* beyond the lateral edge",
+        ),
+    ],
+)
+def test_a_sheet_that_ends_early_is_flagged(volume, plain, injury, reason, text):
+    """The columns slide by millimeters, and the map looks plausible."""
+    maps = measure(make_defect(Site(volume, plain.sheet), *injury).volume)
+    shift = np.linalg.norm(
+        (maps.sheet.points - plain.sheet.points)[:, :, maps.sheet.middle], axis=-1
+    )
+    assert np.quantile(shift, 0.95) > 1.0  # mm
+    flag = next(flag for flag in maps.flags if flag.reason == reason)
+    assert re.search(text, flag.message)
+    assert "extent_x" in flag.message
