@@ -31,8 +31,8 @@ from numpy.typing import NDArray
 from scipy import optimize, sparse
 
 from hipsta_bids.errors import ModelError
+from hipsta_bids.extensions.consortia import exchange
 from hipsta_bids.group.cohort.data import Cohort, Measures
-from hipsta_bids.group.questions import exchange
 from hipsta_bids.group.questions.analysis import analyze_cohort
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.stats.arrays import SideMaps

@@ -10,7 +10,6 @@ from hipsta_bids.cli.commands import (
     compare_parser,
     correlate_parser,
     figure_parser,
-    meta_parser,
     phantom_parser,
     replicate_parser,
     resample_parser,
@@ -29,10 +28,12 @@ from hipsta_bids.derivatives.names import (
 )
 from hipsta_bids.derivatives.results import LAYERS, NODES, POSITION, STATE
 from hipsta_bids.errors import EXIT_MEANINGS
+from hipsta_bids.extensions import find_extensions
 from hipsta_bids.geometry.catalog import MAPS, PER_SUBFIELD, SECTIONS, SUMMARY, Column
 from hipsta_bids.group.output.tables import COLUMNS, JOINT_COLUMNS, REPLICATE_COLUMNS
 from hipsta_bids.group.questions.replicate import PUBLISHED
 from hipsta_bids.group.settings import GroupSettings
+from hipsta_bids.joints import load
 from hipsta_bids.reports.page import read_table
 from hipsta_bids.settings import Settings
 
@@ -309,12 +310,17 @@ def options_page() -> str:
         ("Group level", group_parser()),
         ("hipsta-bids phantom", phantom_parser()),
         ("hipsta-bids surrogate", surrogate_parser()),
-        ("hipsta-bids meta", meta_parser()),
         ("hipsta-bids compare", compare_parser()),
         ("hipsta-bids replicate", replicate_parser()),
         ("hipsta-bids figure", figure_parser()),
         ("hipsta-bids correlate", correlate_parser()),
         ("hipsta-bids resample", resample_parser()),
+        *(
+            (f"hipsta-bids {command.name}", load(command.parser)())
+            for extension in find_extensions()
+            for command in extension.commands
+            if command.parser
+        ),
     ):
         parts.append(f"## {title}")
         groups = {

@@ -7,7 +7,7 @@ from pathlib import Path
 from hipsta_bids.cli import parser as parsing
 from hipsta_bids.cli import participant
 from hipsta_bids.cli.console import echo, echo_table, warn
-from hipsta_bids.cli.parser import Parser, bids_label, from_namespace, given_settings, parser_of
+from hipsta_bids.cli.parser import Parser, bids_label, from_namespace, parser_of, site_path
 from hipsta_bids.errors import ArgumentError, ExitCode, MissingFileError, UsageError
 
 _DEMO_PROTOCOL = "freesurfer"  # the layout that the demo dataset has
@@ -42,20 +42,6 @@ def surrogate_parser() -> Parser:
     participant.add_selection(parser)
     participant.add_segmentations(parser)
     add("--settings", "FILE.toml")
-    return parser
-
-
-def meta_parser() -> Parser:
-    """Describe ``hipsta-bids meta``."""
-    parser, add = parser_of("meta")
-    add("sites", "SITE", nargs="+")
-    add("out", "OUT", type=Path)
-    add("--norms")
-    add("--random", choices=["reml", "reml-adhoc", "dl"])
-    add("--correction", choices=["fdr2", "bh"])
-    add("--fdr-scope", choices=["map", "hemispheres", "all"])
-    add("--settings", "FILE.toml")
-    add("--figures")
     return parser
 
 
@@ -256,50 +242,13 @@ def run_surrogate(arguments: Sequence[str]) -> ExitCode:
     return crosscheck(findings.items, options.output_dir, settings, echo, warn)
 
 
-def run_meta_analysis(arguments: Sequence[str]) -> ExitCode:
-    """Combine summaries of sites."""
-    options = meta_parser().parse_intermixed_args(arguments)
-    from hipsta_bids.group.questions.consortium import run_meta  # noqa: PLC0415  (heavy)
-    from hipsta_bids.group.settings import load_group_settings  # noqa: PLC0415  (start-up time)
-
-    choices = {
-        "meta": {"random": options.random},
-        "multiplicity": {"method": options.correction, "scope": options.fdr_scope},
-    }
-    settings = load_group_settings(options.settings).changed(**given_settings(choices))
-    paths = [_site(text) for text in options.sites]
-    if options.norms:
-        from hipsta_bids.group.questions.merging import merge_norms  # noqa: PLC0415  (heavy)
-
-        norms, notes = merge_norms([path for _, path in paths], options.out, settings)
-        for note in notes:
-            echo(f"note: {note}")
-        echo(f"norms: {norms}")
-        return ExitCode.OK
-    command = "hipsta-bids", "meta", *arguments
-    page, notes = run_meta(paths, options.out, settings, command, figures=options.figures)
-    for note in notes:
-        echo(f"note: {note}")
-    echo(f"results: {options.out / 'meta'}")
-    echo(f"report: {page}")
-    return ExitCode.OK
-
-
-def _site(text: str) -> tuple[str | None, Path]:
-    """Read ``NAME=PATH``, or a path."""
-    name, equals, path = text.partition("=")
-    if equals and name and "/" not in name:
-        return name, Path(path)
-    return None, Path(text)
-
-
 def run_compare(arguments: Sequence[str]) -> ExitCode:
     """Compare finished analyses."""
     options = compare_parser().parse_intermixed_args(arguments)
     from hipsta_bids.group.questions import several  # noqa: PLC0415  (heavy)
 
     several.check_folder(options.out)
-    entries = several.read_entries([_site(text) for text in options.analyses])
+    entries = several.read_entries([site_path(text) for text in options.analyses])
     command = "hipsta-bids", "compare", *arguments
     for note in several.compare_analyses(entries, options.out, command, figures=options.figures):
         echo(f"note: {note}")

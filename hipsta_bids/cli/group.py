@@ -22,6 +22,7 @@ from hipsta_bids.cli.parser import (
 from hipsta_bids.cli.participant import REGIONS
 from hipsta_bids.cli.questions import add_questions, is_question, run_comparison, run_question
 from hipsta_bids.errors import ExitCode, NothingToDoError, UsageError
+from hipsta_bids.extensions import find_parts
 from hipsta_bids.participant.pool import processors
 
 if TYPE_CHECKING:
@@ -62,14 +63,10 @@ def group_parser() -> Parser:
     _add_comparison(parser)
     _add_methods(parser)
     add_questions(parser)
-    adder(parser.add_argument_group("other sites"))(
-        "--export-summary",
-        "SITE",
-        "also write summary.json for `hipsta-bids meta`, without values of participants; "
-        "SITE: this site's name (default: BIDS_DIR's)",
-        nargs="?",
-        const="",
-    )
+    for part in find_parts():
+        adder(parser.add_argument_group(part.heading))(
+            part.option, part.value, part.text, nargs="?", const=""
+        )
     _add_reports(parser)
     return parser
 
@@ -530,5 +527,10 @@ def _options(parsed: argparse.Namespace, arguments: Sequence[str]) -> "GroupOpti
         surfaces=tuple(parsed.maps_surface),
         measures=tuple(dict.fromkeys(parsed.measures)),
         reports=not parsed.no_reports,
+        parts=tuple(
+            (part, value)
+            for part in find_parts()
+            if (value := getattr(parsed, part.name)) is not None
+        ),
         command=("hipsta-bids", *arguments),
     )

@@ -8,7 +8,6 @@ import signal
 import sys
 import traceback
 from collections.abc import Iterator, Sequence
-from importlib import import_module
 from importlib.resources import files
 from pathlib import Path
 from types import FrameType
@@ -17,6 +16,8 @@ from hipsta_bids.cli.console import echo, warn
 from hipsta_bids.cli.group import LEVEL, is_group_level, run_group_level
 from hipsta_bids.cli.participant import LEVELS, build_parser, run_participant_level
 from hipsta_bids.errors import EXIT_MEANINGS, ExitCode, HipstaError, UsageError, did_you_mean
+from hipsta_bids.extensions import find_extensions
+from hipsta_bids.joints import Command, load
 
 #: What a path or a file system may refuse anywhere.
 _OF_PATHS = {errno.ENAMETOOLONG, errno.ELOOP, errno.ENOTDIR, errno.EACCES, errno.EIO, errno.ESTALE}
@@ -25,23 +26,28 @@ _SIGNALED = 128  # shells report death by signal n as 128 + n
 
 #: Commands beside the BIDS App: name, its function in `commands`, arguments and meaning for the
 #: help. They are loaded when they are called.
+_CORE = (
+    ("protocols", "list_protocols", "", "list the known segmentation protocols (also: schemes)"),
+    ("schemes", "list_protocols", "", None),
+    ("settings", "print_settings", "[group]", "print all settings with their meaning, as TOML"),
+    ("demo-data", "write_demo_data", "DIR", "write a synthetic dataset with known thickness"),
+    ("demo", "run_demo", "DIR", "write it, run on it, and compare with the truth"),
+    ("phantom", "write_phantoms", "DIR", "write a synthetic cohort with a known effect"),
+    ("surrogate", "run_surrogate", "IN OUT", "measure thickness in single slices to check maps"),
+    ("compare", "run_compare", "FOLDER... OUT", "compare finished analyses (group level)"),
+    ("replicate", "run_replicate", "FOLDER OUT", "compare an analysis with Diers et al. (2023)"),
+    ("figure", "draw_figure", "WHAT OUT", "draw a figure for a paper from results"),
+    ("resample", "run_resample", "MAP... OUT", "move maps to HippUnfold's surfaces, or from there"),
+    ("export", "run_export", "OUT_DIR DIR", "write surfaces for FreeSurfer, or as VTK or PLY"),
+    ("correlate", "run_correlate", "MAP MAP OUT", "correlate two maps of the group level"),
+    ("validate", "run_validation", "", None),
+)
 COMMANDS = {
-    "protocols": ("list_protocols", "", "list the known segmentation protocols (also: schemes)"),
-    "schemes": ("list_protocols", "", None),
-    "settings": ("print_settings", "[group]", "print all settings with their meaning, as TOML"),
-    "demo-data": ("write_demo_data", "DIR", "write a synthetic dataset with known thickness"),
-    "demo": ("run_demo", "DIR", "write it, run on it, and compare with the truth"),
-    "phantom": ("write_phantoms", "DIR", "write a synthetic cohort with a known effect"),
-    "surrogate": ("run_surrogate", "IN OUT", "measure thickness in single slices to check maps"),
-    "meta": ("run_meta_analysis", "SITE... OUT", "combine summaries of sites (group level)"),
-    "compare": ("run_compare", "FOLDER... OUT", "compare finished analyses (group level)"),
-    "replicate": ("run_replicate", "FOLDER OUT", "compare an analysis with Diers et al. (2023)"),
-    "figure": ("draw_figure", "WHAT OUT", "draw a figure for a paper from results"),
-    "resample": ("run_resample", "MAP... OUT", "move maps to HippUnfold's surfaces, or from there"),
-    "export": ("run_export", "OUT_DIR DIR", "write surfaces for FreeSurfer, or as VTK or PLY"),
-    "correlate": ("run_correlate", "MAP MAP OUT", "correlate two maps of the group level"),
-    "validate": ("run_validation", "", None),
-}
+    name: Command(
+        name=name, run=f"hipsta_bids.cli.commands:{run}", arguments=arguments, meaning=meaning
+    )
+    for name, run, arguments, meaning in _CORE
+} | {command.name: command for extension in find_extensions() for command in extension.commands}
 
 _DESCRIPTOR = "--bids-exec-spec"
 
@@ -49,9 +55,9 @@ EPILOG = "\n".join(
     [
         "other commands (each has a --help of its own):",
         *(
-            f"  hipsta-bids {f'{name} {arguments}':<18} {meaning}"
-            for name, (_, arguments, meaning) in COMMANDS.items()
-            if meaning
+            f"  hipsta-bids {f'{name} {command.arguments}':<18} {command.meaning}"
+            for name, command in COMMANDS.items()
+            if command.meaning
         ),
         f"  hipsta-bids {_DESCRIPTOR:<18} print the Boutiques descriptor of both levels",
         "",
@@ -123,8 +129,7 @@ def _dispatch(arguments: list[str]) -> ExitCode:
     level = arguments[2:3] if not "".join(arguments[1:2]).startswith("-") else []
     is_app = not {*LEVELS, LEVEL}.isdisjoint(level)
     if arguments and arguments[0] in COMMANDS and not is_app:
-        function = COMMANDS[arguments[0]][0]
-        code: ExitCode = getattr(import_module("hipsta_bids.cli.commands"), function)(arguments[1:])
+        code: ExitCode = load(COMMANDS[arguments[0]].run)(arguments[1:])
         return code
     near = did_you_mean(arguments[:1], COMMANDS)
     if near and not is_app and not Path(arguments[0]).exists():

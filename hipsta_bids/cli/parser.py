@@ -116,25 +116,27 @@ def accept(parser: argparse.ArgumentParser, options: Mapping[str, str]) -> None:
 
 
 @cache
-def help_texts() -> dict[str, dict[str, str]]:
-    """Read the texts of the help, by command."""
-    return tomllib.loads((files("hipsta_bids.cli") / "help.toml").read_text(encoding="utf-8"))
+def help_texts(package: str = "hipsta_bids.cli") -> dict[str, dict[str, str]]:
+    """Read the texts of the help of a package, by command."""
+    return tomllib.loads((files(package) / "help.toml").read_text(encoding="utf-8"))
 
 
-def parser_of(command: str) -> tuple[Parser, Callable[..., None]]:
+def parser_of(command: str, package: str = "hipsta_bids.cli") -> tuple[Parser, Callable[..., None]]:
     """Return the parser of a command, and the function that adds an argument to it."""
-    texts = help_texts()[command]
+    texts = help_texts(package)[command]
     parser = Parser(f"hipsta-bids {command}", texts["description"], epilog=texts.get("epilog"))
-    return parser, adder(parser, command)
+    return parser, adder(parser, command, package)
 
 
-def adder(group: argparse._ActionsContainer, command: str = "") -> Callable[..., None]:
+def adder(
+    group: argparse._ActionsContainer, command: str = "", package: str = "hipsta_bids.cli"
+) -> Callable[..., None]:
     """Return a function that adds an argument to a group: spellings, value, text, and more.
 
     Without a value it is a switch; ``A B`` takes two values; ``A...`` takes several,
         and more when
     it is repeated. Paths are recognized by the value's name, numbers by the
-        default. The texts of a ``command`` are in ``help.toml``.
+        default. The texts of a ``command`` are in ``help.toml`` of the ``package``.
     """
 
     def add(flags: str, value: str = "", text: str = "", **options: Any) -> None:  # noqa: ANN401  (argparse's)
@@ -152,7 +154,7 @@ def adder(group: argparse._ActionsContainer, command: str = "") -> Callable[...,
         elif isinstance(options.get("default"), int | float) and "action" not in options:
             options.setdefault("type", type(options["default"]))
         names = flags.split()
-        group.add_argument(*names, help=text or help_texts()[command][names[0]], **options)
+        group.add_argument(*names, help=text or help_texts(package)[command][names[0]], **options)
 
     return add
 
@@ -218,6 +220,14 @@ def named_path(text: str) -> tuple[str, Path]:
     if equals or not folder.name:
         raise argparse.ArgumentTypeError(f"{text!r} is not of the form NAME=PATH")
     return folder.name, folder
+
+
+def site_path(text: str) -> tuple[str | None, Path]:
+    """Read ``NAME=PATH``, or a path."""
+    name, equals, path = text.partition("=")
+    if equals and name and "/" not in name:
+        return name, Path(path)
+    return None, Path(text)
 
 
 def given_settings(choices: Mapping[str, Mapping[str, object]]) -> dict[str, dict[str, object]]:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from hipsta_bids.cli.parser import Parser, adder, factor_level
 from hipsta_bids.errors import UsageError, did_you_mean
+from hipsta_bids.extensions import find_parts
 
 if TYPE_CHECKING:
     from hipsta_bids.group.questions.study import GroupOptions, GroupResult
@@ -19,7 +20,7 @@ _COMPARISON_ONLY = (
     *("longitudinal", "endpoint", "paired", "asymmetry", "normative", "model", "contrast"),
     *("permutations", "blocks", "fdr_scope", "base", "no_classification"),
     *("joint", "joint_sides"),
-    *("harmonize", "harmonize_model", "export_summary"),
+    *("harmonize", "harmonize_model"),
 )
 
 
@@ -162,7 +163,8 @@ def run_question(
     flags = [f"--{name.replace('_', '-')}" for name in (*_TRIALS, *_NORMS) if getattr(parsed, name)]
     if len(flags) > 1 and flags != ["--retest", "--power"]:
         raise UsageError(f"give one of {', '.join(flags)}")
-    _refuse(parsed, _COMPARISON_ONLY, f"with {' and '.join(flags)}")
+    parts = [part.name for part in find_parts()]
+    _refuse(parsed, (*_COMPARISON_ONLY, *parts), f"with {' and '.join(flags)}")
     if len(set(parsed.seg)) > 1:
         raise UsageError(f"--seg: name one protocol with {' and '.join(flags)}")
     if settings.harmonization.column:

@@ -257,8 +257,6 @@ TRIAL_MAPS: dict[str, tuple[str, str, str]] = {
     "n": ("power", "per_arm", "1"),
 }
 
-#: Folder and page of a meta-analysis, in an output folder of its own.
-META, META_REPORT = "meta", "meta.html"
 
 #: Record of a comparison of analyses, in its folder.
 COMPARISON = "comparison.json"

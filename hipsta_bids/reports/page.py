@@ -58,18 +58,20 @@ def build_sections(
     return built
 
 
-def render(template: str, **values: Any) -> str:  # noqa: ANN401  (what the template shows)
-    """Fill a page's template."""
-    return _environment().get_template(template).render(version=__version__, **values)
+def render(template: str, package: str = "hipsta_bids.reports", **values: Any) -> str:  # noqa: ANN401  (what the template shows)
+    """Fill a page's template; a ``package`` may add ``templates`` to those of the reports."""
+    return _environment(package).get_template(template).render(version=__version__, **values)
 
 
 @cache
-def _environment() -> "Environment":
-    from jinja2 import Environment, PackageLoader, StrictUndefined  # noqa: PLC0415  (start-up)
+def _environment(package: str) -> "Environment":
+    from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined  # noqa: PLC0415
     from markupsafe import Markup  # noqa: PLC0415
 
     environment = Environment(
-        loader=PackageLoader("hipsta_bids.reports"),
+        loader=ChoiceLoader(
+            [PackageLoader(name) for name in dict.fromkeys((package, "hipsta_bids.reports"))]
+        ),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,

@@ -14,7 +14,6 @@ from hipsta_bids.cli import main
 from hipsta_bids.cli.commands import (
     compare_parser,
     correlate_parser,
-    meta_parser,
     phantom_parser,
     replicate_parser,
     resample_parser,
@@ -231,7 +230,6 @@ def test_spellings_of_other_bids_apps(alias, field, value):
         ("participant", build_parser),
         ("surrogate", surrogate_parser),
         ("phantom", phantom_parser),
-        ("meta", meta_parser),
         ("compare", compare_parser),
         ("replicate", replicate_parser),
         ("resample", resample_parser),
@@ -296,7 +294,6 @@ def test_options_without_meaning_are_remembered_with_the_reason():
             "--participant-label: its values are ... 2 3 in out participant; write",
         ),
         ("in out --participant_label 01 participant", "--participant-label after analysis_level"),
-        ("--export-summary in out group", "--export-summary: its values are in; write"),
         ("export --participant-label 01 out dir", "write --participant-label after OUT_DIR, DIR"),
         ("figure --measures thickness group out -o a.pdf", "write --measures after what, OUT_DIR"),
         ("figure group out --measures thickness", "are required: -o/--output"),

@@ -95,14 +95,3 @@ def test_patterns_match_regular_files_only(study, capsys, kind, place):
     error = capsys.readouterr().err
     assert "no file matches" in error
     assert error.count("\n") == 1
-
-
-@pytest.mark.parametrize("kind", ["fifo", "zero"])
-def test_summaries_of_sites_end_at_once(tmp_path, capsys, kind):
-    make(tmp_path / "a.json", kind)
-    make(tmp_path / "b.json", kind)
-    sites = [str(tmp_path / name) for name in ("a.json", "b.json")]
-    assert main(["meta", *sites, str(tmp_path / "out")]) in {64, 65}
-    error = capsys.readouterr().err
-    assert "no regular file" in error
-    assert error.count("\n") == 1

@@ -2,12 +2,11 @@
 
 from pathlib import Path
 
-from hipsta_bids.derivatives.names import META_REPORT, group_report
+from hipsta_bids.derivatives.names import group_report
 from hipsta_bids.io import files
 from hipsta_bids.progress import tell
 from hipsta_bids.reports.comparison import write_comparison_report
 from hipsta_bids.reports.group import write_group_report
-from hipsta_bids.reports.meta import write_meta_report
 
 
 def write_page(out_dir: Path, name: str, *, reports: bool) -> tuple[Path | None, str | None]:
@@ -26,11 +25,3 @@ def write_comparison_page(folder: Path, *, reports: bool) -> None:
     files.remove([folder.with_name(f"{folder.name}.html")])  # it may be that of an earlier one
     if reports:
         write_comparison_report(folder)
-
-
-def write_meta_page(out_dir: Path) -> Path:
-    """Write the page of a meta-analysis, and return its path."""
-    path = out_dir / META_REPORT
-    files.remove([path])  # it may be that of an earlier one
-    write_meta_report(out_dir)
-    return path

@@ -34,8 +34,6 @@ CurveOf = Callable[[ClassifierResult], Columns]
 _MEANINGS = tomllib.loads((files("hipsta_bids.group.output") / "columns.toml").read_text("utf-8"))
 #: Meaning of every column; the unit is that of the measure unless said.
 COLUMNS: Mapping[str, str] = _MEANINGS["group"]
-#: The same of a meta-analysis.
-META_COLUMNS: Mapping[str, str] = COLUMNS | _MEANINGS["meta"]
 #: The same of analyses that are compared.
 COMPARISON_COLUMNS: Mapping[str, str] = COLUMNS | _MEANINGS["comparison"]
 #: The same of measures that are tested together.

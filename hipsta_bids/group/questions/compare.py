@@ -22,10 +22,10 @@ from hipsta_bids.group.output.tables import opposite_notes
 from hipsta_bids.group.output.write import draw, write_results, write_table
 from hipsta_bids.group.questions import analysis as fitting
 from hipsta_bids.group.questions import study as studies
-from hipsta_bids.group.questions.exchange import SUMMARY, summarize, write_summary
 from hipsta_bids.group.questions.mixing import with_mixes
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.io import files
+from hipsta_bids.joints import Writer, load
 from hipsta_bids.progress import tell
 from hipsta_bids.protocols.toml import resolve
 from hipsta_bids.stats.formula import folder_name
@@ -109,7 +109,8 @@ def _analyze(options: studies.GroupOptions, settings: GroupSettings) -> studies.
     if study.masked is not None:
         shares = study.masked[study.masked["visit"].isin(cohort.table.index)]
         notes.append(mask_note(shares, cohort.table[groups.column] if groups else None))
-    summary = _summary(study, analysis, notes)
+    writers, notes_of_parts = _parts(study, analysis)
+    notes += notes_of_parts
     in_slices = surrogate_table(study.collection.records, analysis, settings.glm.confidence)
     tell("average surfaces")
     shapes = average_shapes(study.collection.records, cohort, analysis, settings.shapes)
@@ -141,8 +142,8 @@ def _analyze(options: studies.GroupOptions, settings: GroupSettings) -> studies.
             write_table(folder, "surrogate", in_slices)
         if len(quality):
             write_table(folder, "quality", quality)
-        if summary is not None:
-            write_summary(folder / SUMMARY, summary)
+        for write_part in writers:
+            write_part(folder)
         write_shapes(folder, shapes)
         if analysis.registered and study.collection.records and not shapes:
             notes.append("no average surfaces: the surfaces of the participant level are missing")
@@ -166,26 +167,10 @@ def _analyze(options: studies.GroupOptions, settings: GroupSettings) -> studies.
     )
 
 
-def _summary(study: studies.Study, analysis: Analysis, notes: list[str]) -> dict[str, Any] | None:
-    """Make the summary for other sites, if it is asked for."""
-    options, collection = study.options, study.collection
-    if options.export_summary is None:
-        return None
-    summary, notes_of_summary = summarize(
-        study.cohort,
-        analysis,
-        study.settings,
-        site=options.export_summary or options.bids_dir.resolve().name,
-        inputs={
-            "versions": list(collection.versions),
-            "seg": collection.records[0].result.name.seg if collection.records else "none",
-            "region": options.sheets.region,
-            "labels": study.labels,
-            "settings_hash": collection.settings_hash,
-        },
-    )
-    notes += notes_of_summary
-    return summary
+def _parts(study: studies.Study, analysis: Analysis) -> tuple[list[Writer], list[str]]:
+    """Make the parts that options of extensions ask for, and notes."""
+    pairs = [load(part.make)(study, analysis, value) for part, value in study.options.parts]
+    return [writer for writer, _ in pairs], [note for _, notes in pairs for note in notes]
 
 
 def _notes(study: studies.Study, analysis: Analysis) -> list[str]:

@@ -25,8 +25,8 @@ from hipsta_bids.group.output.results import ScoredMaps
 from hipsta_bids.group.output.saved import NormsFile, load_norms, save_norms, templates_from_json
 from hipsta_bids.group.output.style import Drawing
 from hipsta_bids.group.questions import study as studies
-from hipsta_bids.group.questions.merging import with_sums
 from hipsta_bids.group.questions.mixing import with_mixes
+from hipsta_bids.group.questions.norm_sums import with_sums
 from hipsta_bids.group.questions.scores import map_rows, score_rows
 from hipsta_bids.group.questions.trials import points_of
 from hipsta_bids.group.settings import GroupSettings

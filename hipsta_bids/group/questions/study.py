@@ -30,6 +30,7 @@ from hipsta_bids.group.output.template import template_file
 from hipsta_bids.group.questions import analysis
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.io import files
+from hipsta_bids.joints import Part
 from hipsta_bids.progress import each, tell
 from hipsta_bids.protocols.toml import resolve
 from hipsta_bids.stats.arrays import Bool
@@ -66,9 +67,8 @@ class GroupOptions:
     harmonize_model: Path | None = None
     """Parameters of the harmonization of another analysis."""
     comparison: modeling.Comparison = field(default_factory=modeling.Comparison)
-    export_summary: str | None = None
-    """Name of this site in a summary for other sites, empty for that of the folder; ``None`` for no
-    summary."""
+    parts: tuple[tuple[Part, str], ...] = ()
+    """Parts of the results that extensions add, and the values of their options."""
     allow_missing: bool = False
     """Whether many participants may be without a row in participants.tsv."""
     part: str = ""

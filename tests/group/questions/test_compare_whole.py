@@ -1,41 +1,20 @@
 """The group level on sheets with head and tail: more rows, and nodes without values."""
 
 import re
-from dataclasses import replace
 
 import numpy as np
 import pandas as pd
 import pytest
-from small_cohorts import NODES, PLAN, write_dataset
+from small_cohorts import NODES
+from whole_cohorts import QUICK, REGION, SHAPE, TAIL, N, write_whole
 
 from hipsta_bids.cli.main import main
 from hipsta_bids.geometry.sheet import sheet_levels
 from hipsta_bids.group.output import figures, write
-from hipsta_bids.protocols import body_ends, rows_beyond
+from hipsta_bids.protocols import body_ends
 from hipsta_bids.reports.group import group_page
 from hipsta_bids.settings import SheetSettings
 from hipsta_bids.types import parts_of
-
-REGION = "whole"
-TAIL, HEAD = rows_beyond(REGION, NODES[1])
-SHAPE = (NODES[0], TAIL + NODES[1] + HEAD)
-#: A difference in the head alone.
-IN_HEAD = replace(
-    PLAN, nodes=SHAPE, center=(12.0, TAIL + NODES[1] + 2.0), core=(1.5, 1.0), taper=1.0
-)
-N = sum(PLAN.sizes)
-QUICK = ["--measures", "thickness", "--formula", "group", "--contrast", "group[CN]-group[AD]"]
-EXPORT = ["--export-summary", "one"]
-HOLE = (slice(4, 7), slice(TAIL + 1, TAIL + 4))
-
-
-def known_nodes():
-    """Rims of all, wider in some; a hole in all but two of either group."""
-    known = np.ones((N, *SHAPE), dtype=bool)
-    known[:, [0, -1]] = False
-    known[::2, :, -1] = False
-    known[2 : N - 2, *HOLE] = False
-    return known
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -49,11 +28,10 @@ def only_maps(*given):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    root = tmp_path_factory.mktemp("whole")
-    data, out = write_dataset(root, region=REGION, plan=IN_HEAD, known=known_nodes())
+    data, out = write_whole(tmp_path_factory.mktemp("whole"))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(write, "draw_figures", only_maps)
-        assert main([str(data), str(out), "group", "--region", REGION, *QUICK, *EXPORT]) == 0
+        assert main([str(data), str(out), "group", "--region", REGION, *QUICK]) == 0
     return out / "group" / f"thickness_group_{REGION}"
 
 
@@ -127,19 +105,3 @@ def test_trials_say_what_was_measured(folder):
     known = int((points[points.hemi == "L"].n > 0).sum())
     page = group_page(out / "group/power")
     assert re.search(rf"<td>left</td>\s*<td[^>]*>{known}</td>", page)
-
-
-def test_sites_are_combined_and_plots_name_the_part(folder, tmp_path, monkeypatch):
-    monkeypatch.setattr(write, "draw_figures", lambda *_: iter(()))
-    out = folder.parents[1]
-    one = folder / "summary.json"
-    bids, half = str(out.parent / "bids"), [f"{i:02d}" for i in range(3, N - 1)]
-    run = [bids, str(out), "group", "--region", REGION, *QUICK, "--name", "two"]
-    more = ["--export-summary", "two", "--template", str(one), "--participant-label", *half]
-    assert main([*run, *more, "--no-classification", "--no-reports"]) == 0
-    assert main(["meta", str(one), str(out / "group/two/summary.json"), str(tmp_path)]) == 0
-    forest = pd.read_csv(tmp_path / "meta/forest.tsv", sep="\t")
-    peaks = forest[forest.x.notna()]
-    assert "head" in set(peaks.part)
-    assert ((peaks.part == "head") == (peaks.y > 1)).all()
-    assert "whole hippocampus on one sheet" in (tmp_path / "meta/methods.md").read_text()

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from statsmodels.stats.meta_analysis import combine_effects
 
-from hipsta_bids.stats.meta import combine, meta_analyze
+from hipsta_bids.extensions.consortia.effects import combine, meta_analyze
 from hipsta_bids.stats.settings import MetaSettings
 
 #: Trials of the BCG vaccine (Colditz et al. 1994): cases and others among the vaccinated, and among

@@ -10,8 +10,9 @@ import numpy as np
 import pandas as pd
 
 from hipsta_bids.errors import ModelError
+from hipsta_bids.extensions.consortia.effects import Combined, MetaResult, meta_analyze
+from hipsta_bids.extensions.consortia.exchange import ModelSummary, SiteSummary, shown_counts
 from hipsta_bids.group.output import columns, tables
-from hipsta_bids.group.questions.exchange import ModelSummary, SiteSummary, shown_counts
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.io import files
 from hipsta_bids.io.files import FileNumbers
@@ -21,7 +22,6 @@ from hipsta_bids.stats.contrasts import Contrast
 from hipsta_bids.stats.formula import listed
 from hipsta_bids.stats.glm import MEAN, PointTest
 from hipsta_bids.stats.inference import Discoveries, MapKey, discover
-from hipsta_bids.stats.meta import Combined, MetaResult, meta_analyze
 
 #: Peaks of a map that get a forest plot.
 _MOST_PEAKS = 6

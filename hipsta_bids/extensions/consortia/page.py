@@ -11,7 +11,6 @@ import pandas as pd
 from scipy import stats
 
 from hipsta_bids.derivatives.analyses import GroupResults, records
-from hipsta_bids.derivatives.names import META, META_REPORT
 from hipsta_bids.io import files
 from hipsta_bids.reports import cells, group_tables
 from hipsta_bids.reports.group import heading, methods, origin
@@ -20,6 +19,8 @@ from hipsta_bids.reports.group_tables import map_unit
 from hipsta_bids.reports.page import Section, build_sections, render
 from hipsta_bids.types import SIDES, p_text
 
+#: Folder and page, in an output folder of their own.
+FOLDER, REPORT = "meta", "meta.html"
 _PREFIX = "meta"
 #: Forest plots of summary measures on the page; all are in the table.
 _MOST_FORESTS = 60
@@ -237,6 +238,7 @@ def meta_page(folder: Path) -> str:
     record = results.record
     return render(
         "group.html",
+        "hipsta_bids.extensions.consortia",
         title=f"Meta-analysis of {len(record.get('sites') or ())} sites",
         folder=folder.name,
         **heading(record),
@@ -245,6 +247,9 @@ def meta_page(folder: Path) -> str:
     )
 
 
-def write_meta_report(root: Path) -> None:
-    """Write the page of a meta-analysis, beside its folder."""
-    files.write_text(root / META_REPORT, meta_page(root / META))
+def write_meta_page(out_dir: Path) -> Path:
+    """Write the page of a meta-analysis beside its folder, and return its path."""
+    path = out_dir / REPORT
+    files.remove([path])  # it may be that of an earlier one
+    files.write_text(path, meta_page(out_dir / FOLDER))
+    return path

@@ -8,7 +8,7 @@ import pytest
 from check_disclosure import attack_designs, share_of_ordinary
 
 from hipsta_bids.errors import ModelError
-from hipsta_bids.group.questions import exchange
+from hipsta_bids.extensions.consortia import exchange
 from hipsta_bids.group.questions.disclosure import check_cells, check_people, is_traceable
 from hipsta_bids.group.settings import ExchangeSettings
 from hipsta_bids.stats.design import build_design

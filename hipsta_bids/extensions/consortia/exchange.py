@@ -21,9 +21,11 @@ from hipsta_bids.errors import InputError, ModelError
 from hipsta_bids.group.cohort.data import Cohort, grows_with_head, summary_values
 from hipsta_bids.group.output.results import Analysis, templates_of
 from hipsta_bids.group.questions.disclosure import check_cells, check_people, is_traceable
+from hipsta_bids.group.questions.study import Study
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.io import files
 from hipsta_bids.io.files import FileNumbers, Number, Text, read_foreign, rounded
+from hipsta_bids.joints import Writer
 from hipsta_bids.stats.arrays import Float, Int
 from hipsta_bids.stats.design import Design, build_design
 from hipsta_bids.stats.formula import typed
@@ -156,6 +158,28 @@ def shown_counts(counts: Mapping[str, Count]) -> dict[str, int | str]:
     if not levels:
         return dict(counts)
     return {level: "<5" if level in levels else f"{_FEWEST}+" for level in counts}
+
+
+def prepare_summary(study: Study, analysis: Analysis, site: str) -> tuple[Writer, list[str]]:
+    """Make the summary of an analysis for other sites; an empty ``site`` is the dataset's name.
+
+    Returns what writes it into the folder of the analysis, and notes. ModelError as `summarize`.
+    """
+    options, collection = study.options, study.collection
+    summary, notes = summarize(
+        study.cohort,
+        analysis,
+        study.settings,
+        site=site or options.bids_dir.resolve().name,
+        inputs={
+            "versions": list(collection.versions),
+            "seg": collection.records[0].result.name.seg if collection.records else "none",
+            "region": options.sheets.region,
+            "labels": study.labels,
+            "settings_hash": collection.settings_hash,
+        },
+    )
+    return lambda folder: write_summary(folder / SUMMARY, summary), notes
 
 
 def write_summary(path: Path, summary: Mapping[str, Any]) -> None:

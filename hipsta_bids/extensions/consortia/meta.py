@@ -1,8 +1,10 @@
 """The meta-analysis from files to files: summaries of sites become tables, maps and a page."""
 
+import tomllib
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from functools import partial
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -10,27 +12,26 @@ import numpy as np
 import pandas as pd
 
 from hipsta_bids import __version__
-from hipsta_bids.derivatives.names import META
 from hipsta_bids.errors import OutputError, UsageError
+from hipsta_bids.extensions.consortia.effects import FIXED, RANDOM
+from hipsta_bids.extensions.consortia.exchange import SiteSummary, read_summary, shown_counts
+from hipsta_bids.extensions.consortia.page import FOLDER, write_meta_page
+from hipsta_bids.extensions.consortia.sites import Meta, analyze_sites, check_agreement, meta_tables
 from hipsta_bids.group.cohort.data import Cohort
 from hipsta_bids.group.output import write
 from hipsta_bids.group.output.citations import Citations, code, escaped
 from hipsta_bids.group.output.ground import grounds_of
 from hipsta_bids.group.output.maps import ContrastMap, contrasts
 from hipsta_bids.group.output.methods import discovery_text
-from hipsta_bids.group.output.pages import write_meta_page
 from hipsta_bids.group.output.panels import Row, draw_pages
 from hipsta_bids.group.output.style import Drawing
-from hipsta_bids.group.output.tables import META_COLUMNS
-from hipsta_bids.group.questions.exchange import SiteSummary, read_summary, shown_counts
-from hipsta_bids.group.questions.sites import Meta, analyze_sites, check_agreement, meta_tables
+from hipsta_bids.group.output.tables import COLUMNS
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.io import files
 from hipsta_bids.protocols.toml import resolve
 from hipsta_bids.stats.arrays import SideMaps
 from hipsta_bids.stats.glm import FittedMaps
 from hipsta_bids.stats.inference import PERMUTATIONS
-from hipsta_bids.stats.meta import FIXED, RANDOM
 
 
 def run_meta(
@@ -52,7 +53,7 @@ def run_meta(
     sites = _read(paths)
     notes = check_agreement(sites)
     meta = analyze_sites(sites, settings)
-    folder = out_dir / META
+    folder = out_dir / FOLDER
     if folder.exists() and not (folder / "meta.json").exists():
         raise OutputError(
             f"{folder}: is no earlier meta-analysis; choose another output folder",
@@ -60,7 +61,7 @@ def run_meta(
         )
     with write.whole_folder(folder) as scratch:
         for name, table in meta_tables(meta):
-            write.write_table(scratch, name, table, described=name != "sites", meaning=META_COLUMNS)
+            write.write_table(scratch, name, table, described=name != "sites", meaning=_columns())
         _write_maps(scratch, meta)
         notes += write.write_figures(scratch, _figures(meta), prints=figures)
         files.write_text(scratch / "methods.md", _methods(meta))
@@ -90,6 +91,12 @@ def _read(paths: Sequence[tuple[str | None, Path]]) -> list[SiteSummary]:
     if len(sites) < 2:  # noqa: PLR2004 -- sites
         raise UsageError("meta: give the summaries of two sites or more")
     return sites
+
+
+def _columns() -> dict[str, str]:
+    """Read the meanings of columns; those of a meta-analysis differ in part from an analysis."""
+    text = (resources.files("hipsta_bids.extensions.consortia") / "columns.toml").read_text("utf-8")
+    return {**COLUMNS, **tomllib.loads(text)}
 
 
 def _write_maps(folder: Path, meta: Meta) -> None:
