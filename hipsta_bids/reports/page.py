@@ -59,7 +59,7 @@ def build_sections(
 
 
 def render(template: str, package: str = "hipsta_bids.reports", **values: Any) -> str:  # noqa: ANN401  (what the template shows)
-    """Fill a page's template; a ``package`` may add ``templates`` to those of the reports."""
+    """Fill a page's template; a ``package`` may have further ``templates``."""
     return _environment(package).get_template(template).render(version=__version__, **values)
 
 
