@@ -2,15 +2,11 @@
 
 import re
 import shlex
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import nibabel as nib
 import numpy as np
 import pandas as pd
-
-sys.path.append(str(Path(__file__).parent / "group"))
 from norm_cohorts import write_people
 from small_cohorts import (
     PLAN,
@@ -22,11 +18,14 @@ from small_cohorts import (
 )
 
 from hipsta_bids.derivatives.dataset import TABLES
+from hipsta_bids.extensions import find_extensions
 from hipsta_bids.io import files
 from hipsta_bids.phantom import Hemisphere, PhantomSpec
 from hipsta_bids.phantom import write_dataset as write_phantoms
 from validation.group import simulate_cohort
 
+#: Without the extension, its pages are not made.
+CONSORTIA = "consortia" in {extension.name for extension in find_extensions()}
 #: Twelve of each group at each site, as many as summaries of sites take.
 SITES = {"a": (*range(1, 13), *range(25, 37)), "b": (*range(13, 25), *range(37, 49))}
 GROUP = "cohort/bids cohort/out group --settings quick.toml --align none --measures thickness"
@@ -66,19 +65,22 @@ COMMANDS = [
     *(
         (
             (
-                f"{GROUP} --name {site} --no-classification --export-summary {site}"
-                f" --participant-label {PEOPLE[site]}"
+                f"{GROUP} --name {site} --no-classification"
+                f"{f' --export-summary {site}' * CONSORTIA} --participant-label {PEOPLE[site]}"
             ),
             0,
             [f"cohort/out/group/{site}.html"],
         )
         for site in SITES
     ),
-    (
-        "meta cohort/out/group/a/summary.json cohort/out/group/b/summary.json meta",
-        0,
-        ["meta/meta.html", "meta/meta/figures/*.svg"],
-    ),
+    *[
+        (
+            "meta cohort/out/group/a/summary.json cohort/out/group/b/summary.json meta",
+            0,
+            ["meta/meta.html", "meta/meta/figures/*.svg"],
+        )
+    ]
+    * CONSORTIA,
     (
         "compare cohort/out/group/a cohort/out/group/b compared",
         0,
