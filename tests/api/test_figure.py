@@ -1,12 +1,11 @@
 """Figures on demand, in Python and on the command line, from files alone."""
 
 import pickle
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
+from small_cohorts import write_dataset
 
 import hipsta_bids as hb
 from hipsta_bids.cli.main import main
@@ -14,9 +13,6 @@ from hipsta_bids.derivatives.analyses import read_group
 from hipsta_bids.errors import NothingToDoError, UsageError
 from hipsta_bids.group.output import write
 from hipsta_bids.stats import glm
-
-sys.path.append(str(Path(__file__).parents[1] / "group"))
-from small_cohorts import write_dataset
 
 
 @pytest.fixture(scope="module")
