@@ -25,7 +25,7 @@ from hipsta_bids.geometry.label_checks import border_sides
 from hipsta_bids.geometry.measures import column_area, measure_thickness
 from hipsta_bids.geometry.mesh import mean_wall_thickness
 from hipsta_bids.geometry.slices import points_of_ends
-from hipsta_bids.protocols.protocol import LATERAL_END, MEDIAL_END, Part, Tissue, lateral_rank
+from hipsta_bids.protocols.protocol import Part, Tissue, lateral_rank
 from hipsta_bids.settings import CheckSettings
 from hipsta_bids.types import Bool, Finding, Flag, Float, Sheet
 
@@ -44,11 +44,6 @@ END_LABEL_DEPTH = 2.0
 BEYOND_REACH = 3.0
 #: Flag an end without a label if fewer lie beyond it than this share of those before it.
 BEYOND_SHARE = 0.7
-#: CA2 and CA3 are counted within this distance on both sides of an end plane, mm.
-LATERAL_REACH = 5.0
-#: Flag an end beyond which they become fewer than the other subfields do by this share (sound
-#: hemispheres: .24 at most, nearly all below 0; missing halves: .51 to .95 in 14 of 15).
-LATERAL_LACK = 0.4
 #: A cross-section is compared with those at these distances on both sides, mm.
 NOTCH_REACH = (1.0, 2.0, 3.0)
 #: Cross-sections are compared without nodes this near to a bridge that was cut, grid nodes.
@@ -232,53 +227,37 @@ def check_end_labels(
 def _check_beyond(volume: types.LabelVolume, body: Body) -> list[Finding]:
     """Flag ends without head or tail labels at which the labels of the sheet end.
 
-    The dentate gyrus and CA4 end before the sheet does, which closes behind them in the tail. An
-    end that is put where CA2 and CA3 are missing, as the automatic rule needs them, is flagged too.
+    The dentate gyrus and CA4 end before the sheet does, which closes behind them in the tail.
     """
     labeled = (volume.tissue > 0) & (volume.tissue <= Tissue.HIPPOCAMPUS)
     protocol = volume.protocol
     labeled &= ~np.isin(volume.tissue, list({*protocol.interior} - {*protocol.layer}))
-    points, tissue = digital.voxel_points(labeled, volume.affine), volume.tissue[labeled]
-    findings = []
+    points = digital.voxel_points(labeled, volume.affine)
     ends = body.ends
     sides: tuple[types.End, ...] = ("posterior", "anterior")
-    for end, depth in zip(sides, ends.depths(points), strict=True):
-        if ends[end].rule in ("labels", "user"):
-            continue
-        near = points[(depth > 0) & (depth < BEYOND_REACH)]
-        beyond = [
-            _share_beyond(depth[np.isin(tissue, group)], LATERAL_REACH, ends.half_slice)
-            for group in (MEDIAL_END, (Tissue.CA1,), LATERAL_END)
-        ]
-        findings += [
-            Finding(
-                reason="labels-end",
-                value=1 - _share_beyond(depth, BEYOND_REACH, ends.half_slice),
-                limit=1 - BEYOND_SHARE,
-                text=f"the labels of the sheet end at the {end} end of the body",
-                remedy="label the whole hippocampus, or check where the labels were cut",
-                points=near,
-            ),
-            Finding(
-                reason="subfield-gap",
-                value=min(*beyond[:2], 1.0) - beyond[2],
-                limit=LATERAL_LACK,
-                text=f"CA2 and CA3 end at the {end} end of the body; the other subfields do not",
-                remedy="complete the labels; until then, the body may be short",
-                points=near,
-            ),
-        ]
-    return findings
+    return [
+        Finding(
+            reason="labels-end",
+            value=1 - _share_beyond(depth, ends.half_slice),
+            limit=1 - BEYOND_SHARE,
+            text=f"the labels of the sheet end at the {end} end of the body",
+            remedy="label the whole hippocampus, or check where the labels were cut",
+            points=points[(depth > 0) & (depth < BEYOND_REACH)],
+        )
+        for end, depth in zip(sides, ends.depths(points), strict=True)
+        if ends[end].rule not in ("labels", "user")
+    ]
 
 
-def _share_beyond(depth: Float, reach: float, half_slice: float) -> float:
-    """Volume beyond a plane over that before it, within ``reach`` of it, mm.
+def _share_beyond(depth: Float, half_slice: float) -> float:
+    """Volume beyond a plane over that before it, near it, of voxels at depths (N,), mm.
 
-    The voxels at depths (N,), mm, reach ``half_slice`` to both sides: slices may be thick.
+    A voxel reaches ``half_slice`` to both sides: a thick slice lies partly within reach.
     """
     beyond, before = (
         np.clip(
-            np.minimum(way * depth + half_slice, reach) - np.maximum(way * depth - half_slice, 0),
+            np.minimum(way * depth + half_slice, BEYOND_REACH)
+            - np.maximum(way * depth - half_slice, 0),
             0,
             None,
         ).sum()

@@ -22,7 +22,7 @@ from hipsta_bids.geometry.grid import check_voxel
 from hipsta_bids.geometry.measures import measure_thickness
 from hipsta_bids.geometry.mesh import extract_surface
 from hipsta_bids.protocols.load import load_protocol
-from hipsta_bids.protocols.protocol import LATERAL_END, MEDIAL_END, Part, Tissue
+from hipsta_bids.protocols.protocol import Part, Tissue
 from hipsta_bids.settings import CheckSettings, Settings
 from hipsta_bids.types import Coordinates
 
@@ -232,27 +232,6 @@ def test_a_dentate_gyrus_that_ends_before_the_sheet_is_no_missing_label(arc):
     assert core.any()
     assert whole.reason == "labels-end"
     assert whole.value == without.value
-
-
-@pytest.mark.parametrize(
-    ("gone", "raised"),
-    [
-        (LATERAL_END, True),
-        ((*MEDIAL_END, *LATERAL_END), False),  # the sheet closes
-        (MEDIAL_END, False),  # no end is put where these are missing
-        ((), False),
-    ],
-)
-def test_an_end_that_is_put_where_lateral_subfields_end_is_flagged(arc, gone, raised):
-    """The automatic rule needs them, so that half of a body without them is cut off."""
-    ends = arc.body.ends
-    body = replace(arc.body, ends=replace(ends, anterior=ends.anterior._replace(rule="core")))
-    lost = np.isin(arc.volume.tissue, gone) & (arc.volume.part == Part.HEAD)
-    volume = replace(arc.volume, tissue=np.where(lost, 0, arc.volume.tissue))
-    found = check_end_labels(volume, body, CHECKS)
-    (gap,) = (finding for finding in found if finding.reason == "subfield-gap")
-    assert gap.raised == raised
-    assert "CA2 and CA3 end at the anterior end" in gap.text
 
 
 def test_short_head_and_tail_labels_are_enough(arc):

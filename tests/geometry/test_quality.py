@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from hipsta_bids.geometry.sheet import sample_sheet, whole_body
 from hipsta_bids.geometry.topology import Repair
 from hipsta_bids.participant.measure import Evidence, find_all, quality_metrics
 from hipsta_bids.protocols.protocol import Tissue
@@ -16,13 +17,15 @@ from hipsta_bids.types import Sheet
 @pytest.fixture
 def evidence(arc):
     """Nothing to warn about."""
+    body, middle = arc.body, arc.sheet.points[:, :, arc.sheet.middle]
+    nearest = body.nearest(middle.reshape(-1, 3)).reshape(arc.sheet.valid.shape)
     return Evidence(
-        body=arc.body,
+        body=body,
         surface=arc.surface,
         mesh=arc.mesh,
         sheet=arc.sheet,
-        subfield=np.zeros(arc.sheet.valid.shape, dtype=np.uint8),
-        whole=arc.sheet,
+        subfield=body.tissue[body.inside][nearest],
+        whole=sample_sheet(arc.mesh, arc.coordinates, whole_body(Settings().sheet)),
         settings=Settings(),
         coordinates=arc.coordinates,
         image=(),
