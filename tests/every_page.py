@@ -7,6 +7,7 @@ from dataclasses import replace
 import nibabel as nib
 import numpy as np
 import pandas as pd
+from extension_marks import PRESENT
 from norm_cohorts import write_people
 from small_cohorts import (
     PLAN,
@@ -18,14 +19,13 @@ from small_cohorts import (
 )
 
 from hipsta_bids.derivatives.dataset import TABLES
-from hipsta_bids.extensions import find_extensions
 from hipsta_bids.io import files
 from hipsta_bids.phantom import Hemisphere, PhantomSpec
 from hipsta_bids.phantom import write_dataset as write_phantoms
 from validation.group import simulate_cohort
 
-#: Without the extension, its pages are not made.
-CONSORTIA = "consortia" in {extension.name for extension in find_extensions()}
+# Without the extension, its pages are not made.
+CONSORTIA = "consortia" in PRESENT
 #: Twelve of each group at each site, as many as summaries of sites take.
 SITES = {"a": (*range(1, 13), *range(25, 37)), "b": (*range(13, 25), *range(37, 49))}
 GROUP = "cohort/bids cohort/out group --settings quick.toml --align none --measures thickness"
@@ -109,8 +109,11 @@ COMMANDS = [
         0,
         ["visits/out/group/pairs.html"],
     ),
-    (f"{TRIAL} --retest --name again", 0, ["visits/out/group/again.html"]),
-    (f"{TRIAL} --power thinning=5% --name sizes", 0, ["visits/out/group/sizes.html"]),
+    *[
+        (f"{TRIAL} --retest --name again", 0, ["visits/out/group/again.html"]),
+        (f"{TRIAL} --power thinning=5% --name sizes", 0, ["visits/out/group/sizes.html"]),
+    ]
+    * ("trials" in PRESENT),
     (
         "norms/bids norms/out group --fit-norms --align none --measures volume --name norms",
         0,

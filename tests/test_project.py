@@ -11,10 +11,12 @@ from pathlib import Path
 
 import pytest
 import yaml
+from extension_marks import PRESENT
 from reference_pages import CHANGED, PAGES
 
 import hipsta_bids
 from hipsta_bids.errors import ExitCode
+from hipsta_bids.extensions import NAMES
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.settings import Settings
 
@@ -241,6 +243,8 @@ def test_paths_of_the_code_exist(page):
     code = re.findall(r"`([\w./-]+)`", (ROOT / page).read_text(encoding="utf-8"))
     paths = {text for text in code if re.search(r"/$|/.*\.(py|toml|js|html)$|^tools/", text)}
     paths -= {"inputs/mytool.py", "shared/"}  # an example, and data beside the clone
+    absent = tuple(f"extensions/{name}/" for name in set(NAMES) - PRESENT)  # were deleted
+    paths -= {path for path in paths if path.startswith(absent)}
     assert paths
     folders = ("", "hipsta_bids", "hipsta_bids/group", "hipsta_bids/reports")
     places = [ROOT / folder for folder in (*folders, "hipsta_bids/reports/templates")]

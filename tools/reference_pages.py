@@ -28,12 +28,11 @@ from hipsta_bids.derivatives.names import (
 )
 from hipsta_bids.derivatives.results import LAYERS, NODES, POSITION, STATE
 from hipsta_bids.errors import EXIT_MEANINGS
-from hipsta_bids.extensions import find_extensions
 from hipsta_bids.geometry.catalog import MAPS, PER_SUBFIELD, SECTIONS, SUMMARY, Column
 from hipsta_bids.group.output.tables import COLUMNS, JOINT_COLUMNS, REPLICATE_COLUMNS
 from hipsta_bids.group.questions.replicate import PUBLISHED
 from hipsta_bids.group.settings import GroupSettings
-from hipsta_bids.joints import load
+from hipsta_bids.joints import find_extensions, load
 from hipsta_bids.reports.page import read_table
 from hipsta_bids.settings import Settings
 

@@ -9,13 +9,7 @@ import pandas as pd
 from scipy import stats
 from statsmodels.stats.multitest import multipletests
 
-from hipsta_bids.group.cohort.data import SHEET, Cohort, layers
-from hipsta_bids.group.model import ModelRequest, VisitTime
-from hipsta_bids.group.questions.trials import Modeled, Retested
-from hipsta_bids.group.settings import GroupSettings
-from hipsta_bids.stats.contrasts import Contrast
-from hipsta_bids.stats.mixed import fit_mixed
-from hipsta_bids.stats.trials import (
+from hipsta_bids.extensions.trials.sizes import (
     SLOWING,
     THINNING,
     Reference,
@@ -24,6 +18,12 @@ from hipsta_bids.stats.trials import (
     power_of,
     sample_size,
 )
+from hipsta_bids.extensions.trials.trial import Modeled, Retested
+from hipsta_bids.group.cohort.data import SHEET, Cohort, layers
+from hipsta_bids.group.model import ModelRequest, VisitTime
+from hipsta_bids.group.settings import GroupSettings
+from hipsta_bids.stats.contrasts import Contrast
+from hipsta_bids.stats.mixed import fit_mixed
 from hipsta_bids.types import PARTICIPANT, SESSION, Bool, Float
 from validation.group import smooth_noise, thickness_side
 from validation.report import Cells, Content, suite, table

@@ -14,6 +14,7 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 from skimage.measure import marching_cubes
 
+from hipsta_bids.extensions.trials.sizes import participants_needed
 from hipsta_bids.geometry.body import extract_body
 from hipsta_bids.geometry.columns import SMOOTHING
 from hipsta_bids.geometry.digital import box_around, low_corner, positions
@@ -25,7 +26,6 @@ from hipsta_bids.participant.longitudinal import Frame, lay_visit, make_frame, m
 from hipsta_bids.phantom import PhantomSpec, Thinning
 from hipsta_bids.protocols.protocol import Part, Tissue
 from hipsta_bids.settings import BodySettings, Settings
-from hipsta_bids.stats.trials import participants_needed
 from hipsta_bids.types import Bool, Float, HemisphereMaps, LabelVolume, Sheet
 from validation import cases
 from validation.hippunfold import draw_template

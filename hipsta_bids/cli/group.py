@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hipsta_bids import __version__
+from hipsta_bids.cli import questions
 from hipsta_bids.cli.console import Progress, echo, echo_start, quiet, warn
 from hipsta_bids.cli.parser import (
     Parser,
@@ -20,9 +21,8 @@ from hipsta_bids.cli.parser import (
     positive_int,
 )
 from hipsta_bids.cli.participant import REGIONS
-from hipsta_bids.cli.questions import add_questions, is_question, run_comparison, run_question
 from hipsta_bids.errors import ExitCode, NothingToDoError, UsageError
-from hipsta_bids.extensions import find_parts
+from hipsta_bids.joints import find_parts, load
 from hipsta_bids.participant.pool import processors
 
 if TYPE_CHECKING:
@@ -37,8 +37,7 @@ without --model and --formula: group + age + sex (+ site) from BIDS_DIR/particip
 each group is compared with the reference level: CN, CU, healthy control ..., else the first.
 The run prints the reference level; --reference FACTOR=LEVEL changes it.
 
---retest, --power, --fit-norms and --norms answer questions of their own, in OUT_DIR/group/retest/,
-power-.../, norms/ and scores/
+{questions} answer questions of their own, each in a folder of OUT_DIR/group
 
 results: OUT_DIR/group/MODEL/; begin with OUT_DIR/group/MODEL.html
 
@@ -52,7 +51,7 @@ def group_parser() -> Parser:
         prog="hipsta-bids BIDS_DIR OUT_DIR group",
         usage="hipsta-bids BIDS_DIR OUT_DIR group [options]",
         description="compare maps and summary measures of participants",
-        epilog=_EPILOG,
+        epilog=_EPILOG.format(questions=questions.listed_questions()),
     )
     parser.add_argument("bids_dir", type=Path, help="the BIDS dataset, with participants.tsv")
     parser.add_argument("output_dir", type=Path, help="the participant level's output dataset")
@@ -62,7 +61,7 @@ def group_parser() -> Parser:
     _add_model(parser)
     _add_comparison(parser)
     _add_methods(parser)
-    add_questions(parser)
+    questions.add_questions(parser)
     for part in find_parts():
         adder(parser.add_argument_group(part.heading))(
             part.option, part.value, part.text, nargs="?", const=""
@@ -401,7 +400,9 @@ def _run(parsed: argparse.Namespace, arguments: Sequence[str]) -> ExitCode:
     PROCESSORS.set(parsed.n_procs)
     settings = _settings(parsed)
     with Progress(-1 if parsed.quiet else 0):
-        answer = run_question if is_question(parsed) else run_comparison
+        answer = (
+            questions.run_question if questions.is_question(parsed) else questions.run_comparison
+        )
         result = answer(parsed, _options(parsed, arguments), settings)
     for warning in result.warnings:
         warn(f"warning: {warning}")
@@ -467,12 +468,10 @@ def _settings(parsed: argparse.Namespace) -> "GroupSettings":
             "measures": tuple(parsed.joint) or None,
             "sides": parsed.joint_sides or None,
         },
-        "power": {
-            "power": parsed.power_level,
-            "dropout": parsed.dropout,
-            "allocation": parsed.allocation,
-        },
     }
+    for question in questions.all_questions():
+        if question.settings:
+            choices |= load(question.settings)(parsed)
     settings = load_group_settings(parsed.settings)
     settings = settings.changed(**given_settings(choices))
     if parsed.harmonize:

@@ -16,8 +16,7 @@ from hipsta_bids.cli.console import echo, warn
 from hipsta_bids.cli.group import LEVEL, is_group_level, run_group_level
 from hipsta_bids.cli.participant import LEVELS, build_parser, run_participant_level
 from hipsta_bids.errors import EXIT_MEANINGS, ExitCode, HipstaError, UsageError, did_you_mean
-from hipsta_bids.extensions import find_extensions
-from hipsta_bids.joints import Command, load
+from hipsta_bids.joints import Command, find_extensions, load
 
 #: What a path or a file system may refuse anywhere.
 _OF_PATHS = {errno.ENAMETOOLONG, errno.ELOOP, errno.ENOTDIR, errno.EACCES, errno.EIO, errno.ESTALE}

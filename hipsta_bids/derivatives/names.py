@@ -241,23 +241,6 @@ DATASET_FILES: dict[str, str] = {
     "report": "report.html",
 }
 
-#: Tables of the group level about repeated sessions and sample sizes: of summary measures, and of
-#: the points of maps.
-TRIAL_TABLES: dict[str, tuple[str, str]] = {
-    "retest": ("retest", "retest_points"),
-    "power": ("power", "power_points"),
-}
-
-#: Their maps, by the value of ``stat-``: the tables that have them, the column, and the unit; none
-#: is that of the map.
-TRIAL_MAPS: dict[str, tuple[str, str, str]] = {
-    "icc": ("retest", "icc", "1"),
-    "sdwithin": ("retest", "sd_within", ""),
-    "mdc": ("retest", "detectable_change", ""),
-    "n": ("power", "per_arm", "1"),
-}
-
-
 #: Record of a comparison of analyses, in its folder.
 COMPARISON = "comparison.json"
 

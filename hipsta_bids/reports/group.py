@@ -6,7 +6,7 @@ import io
 import logging
 import re
 import shlex
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +18,11 @@ from hipsta_bids.derivatives.names import DATASET_FILES, group_report
 from hipsta_bids.errors import HipstaError
 from hipsta_bids.io import files
 from hipsta_bids.io.files import hide_home
+from hipsta_bids.joints import find_extensions, load
 from hipsta_bids.protocols import EXPERIMENTAL
 from hipsta_bids.reports import cells, group_tables
 from hipsta_bids.reports.display import DESIGN_COLORS, colors_of
-from hipsta_bids.reports.group_maps import embedded, map_scenes, norms, power, retest
+from hipsta_bids.reports.group_maps import embedded, map_scenes, norms
 from hipsta_bids.reports.page import Section, build_sections, render
 from hipsta_bids.types import JOINT
 
@@ -145,7 +146,7 @@ def group_page(folder: Path) -> str:
         folder=folder.name,
         **heading(record),
         cohort=(folder.parent.parent / DATASET_FILES["report"]).exists(),
-        sections=build_sections(SECTIONS, results, _PREFIX),
+        sections=build_sections((*_further_sections(), *SECTIONS), results, _PREFIX),
     )
 
 
@@ -281,8 +282,6 @@ def _blocks(text: str) -> list[dict[str, Any]]:
 
 #: Sections of the page, from top to bottom.
 SECTIONS: tuple[Section[GroupResults], ...] = (
-    Section("power", "Sample size", "group/power.html", power),
-    Section("retest", "Test-retest", "group/retest.html", retest),
     Section("norms", "Norms", "group/norms.html", norms),
     Section("found", "What was found", "group/found.html", group_tables.findings),
     Section("people", "Participants", "group/people.html", group_tables.participants),
@@ -299,6 +298,13 @@ SECTIONS: tuple[Section[GroupResults], ...] = (
     Section("methods", "Methods paragraph", "group/methods.html", methods),
     Section("origin", "Origin", "group/origin.html", origin),
 )
+
+
+def _further_sections() -> Iterator[Section[GroupResults]]:
+    """Sections of extensions, which come first."""
+    for extension in find_extensions():
+        if extension.sections:
+            yield from load(extension.sections)
 
 
 def write_group_report(

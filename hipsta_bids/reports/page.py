@@ -14,6 +14,7 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from hipsta_bids import __version__
+from hipsta_bids.joints import find_extensions
 from hipsta_bids.reports.cells import FILTERS
 from hipsta_bids.reports.display import HATCHING, ORIENTATION
 from hipsta_bids.settings import Settings
@@ -58,19 +59,22 @@ def build_sections(
     return built
 
 
-def render(template: str, package: str = "hipsta_bids.reports", **values: Any) -> str:  # noqa: ANN401  (what the template shows)
-    """Fill a page's template; a ``package`` may have further ``templates``."""
-    return _environment(package).get_template(template).render(version=__version__, **values)
+def render(template: str, **values: Any) -> str:  # noqa: ANN401  (what the template shows)
+    """Fill a page's template."""
+    return _environment().get_template(template).render(version=__version__, **values)
 
 
 @cache
-def _environment(package: str) -> "Environment":
+def _environment() -> "Environment":
     from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined  # noqa: PLC0415
     from markupsafe import Markup  # noqa: PLC0415
 
     environment = Environment(
         loader=ChoiceLoader(
-            [PackageLoader(name) for name in dict.fromkeys((package, "hipsta_bids.reports"))]
+            [
+                PackageLoader("hipsta_bids.reports"),
+                *(PackageLoader(one.package) for one in find_extensions() if one.has_templates),
+            ]
         ),
         autoescape=True,
         undefined=StrictUndefined,

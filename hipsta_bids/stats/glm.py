@@ -528,3 +528,10 @@ def most_frequent(labels: NDArray[np.int8], count: int) -> Int:
         return np.full(labels.shape[1:], -1, dtype=np.int64)
     votes = np.stack([(labels == label).sum(axis=0) for label in range(count)])
     return np.where(votes.max(axis=0) > 0, votes.argmax(axis=0), -1).astype(np.int64)
+
+
+def points_of(side: SideMaps) -> FittedMaps:
+    """Locate the points of maps of one hemisphere, to which nothing was fitted."""
+    rows = np.arange(len(side.rows))
+    subfield = most_frequent(side.subfield[:], len(side.names))
+    return FittedMaps(maps=side, used=rows, rows=rows, subfield=subfield, fits={})

@@ -3,7 +3,8 @@
 from hipsta_bids.joints import Command, Extension, Part
 
 EXTENSION = Extension(
-    name="consortia",
+    package=__name__,
+    has_templates=True,
     meaning="Combine results and norms of several sites, without values of participants.",
     commands=(
         Command(

@@ -238,7 +238,6 @@ def meta_page(folder: Path) -> str:
     record = results.record
     return render(
         "group.html",
-        "hipsta_bids.extensions.consortia",
         title=f"Meta-analysis of {len(record.get('sites') or ())} sites",
         folder=folder.name,
         **heading(record),

@@ -28,7 +28,6 @@ from hipsta_bids.group.questions import study as studies
 from hipsta_bids.group.questions.mixing import with_mixes
 from hipsta_bids.group.questions.norm_sums import with_sums
 from hipsta_bids.group.questions.scores import map_rows, score_rows
-from hipsta_bids.group.questions.trials import points_of
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.io import files
 from hipsta_bids.io.labels import refuse_alike
@@ -39,7 +38,7 @@ from hipsta_bids.stats import summed_norms
 from hipsta_bids.stats.arrays import Bool, Float, Int, Key
 from hipsta_bids.stats.design import FIRST_AGE
 from hipsta_bids.stats.formula import check_names, level_labels, listed, typed
-from hipsta_bids.stats.glm import most_frequent
+from hipsta_bids.stats.glm import most_frequent, points_of
 from hipsta_bids.stats.settings import NormSettings
 from hipsta_bids.stats.warps import Template
 from hipsta_bids.types import PARTICIPANT

@@ -3,6 +3,7 @@
 import numpy as np
 import pandas as pd
 import pytest
+from extension_marks import needs
 from scipy import stats
 from small_cohorts import (
     FAST,
@@ -220,12 +221,13 @@ def visits(tmp_path_factory):
         (["--paired", "1", "3"], 2),
         (["--endpoint", "ancova", "1", "3"], 2),
         (["--endpoint", "clda", "1", "2", "3"], 2),
-        (["--retest"], 1),
+        pytest.param(["--retest"], 1, marks=needs("trials")),
     ],
 )
 def test_each_participant_counts_once_at_the_baseline(visits, options, groups, monkeypatch):
     data, out = visits
-    monkeypatch.setattr("hipsta_bids.group.questions.trials._figures", lambda *_: iter(()))
+    if options == ["--retest"]:
+        monkeypatch.setattr("hipsta_bids.extensions.trials.trial._figures", lambda *_: iter(()))
     fast = [one for one in FAST if "--retest" not in options or one != "--no-classification"]
     assert main([str(data), str(out), "group", *fast, *options, "--name", "q"]) == 0
     result = table(out / "group" / "q" / "demographics.tsv")

@@ -5,6 +5,7 @@ import re
 import numpy as np
 import pandas as pd
 import pytest
+from extension_marks import needs
 from small_cohorts import NODES
 from whole_cohorts import QUICK, REGION, SHAPE, TAIL, N, write_whole
 
@@ -94,6 +95,7 @@ def test_figures_show_how_many_have_a_value(folder):
         assert f">{word}<" in text
 
 
+@needs("trials")
 def test_trials_say_what_was_measured(folder):
     out = folder.parents[1]
     power = [*QUICK[:2], "--power", "thinning=5%", "--name", "power"]

@@ -8,6 +8,7 @@ from typing import get_args
 
 import numpy as np
 import pytest
+from extension_marks import needs
 from norm_cohorts import write_people
 from scipy import stats
 from small_cohorts import (
@@ -267,8 +268,10 @@ def test_sides_of_different_kinds(tmp_path, call):
             ],
             "years",
         ),
-        (["--retest"], "session"),
-        (["--power", "thinning=5%", "--visits", "0,12,24"], "session"),
+        pytest.param(["--retest"], "session", marks=needs("trials")),
+        pytest.param(
+            ["--power", "thinning=5%", "--visits", "0,12,24"], "session", marks=needs("trials")
+        ),
     ],
 )
 def test_visits_of_different_kinds(tmp_path, call, options, term):

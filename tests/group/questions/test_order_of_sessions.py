@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pandas as pd
 import pytest
+from extension_marks import needs
 from small_cohorts import (
     FAST,
     PLAN,
@@ -97,7 +98,7 @@ COMMON = "All visits of a participant were measured on one sheet"
 
 
 @pytest.mark.parametrize("frame", ["visit", "person", "shared"])
-@pytest.mark.parametrize("options", [(), ("--retest",)])
+@pytest.mark.parametrize("options", [(), pytest.param(("--retest",), marks=needs("trials"))])
 def test_methods_name_common_sheets(tmp_path, frame, options):
     folders = write_visits(tmp_path, ("1", "2"))
     path = folders[1] / "desc-settings.json"

@@ -260,6 +260,6 @@ def test_refusals_name_the_problem(compared, tmp_path, capsys):
     assert main([str(data), str(out), "group", *call]) == 0
     assert main(["compare", first, str(group / "age"), str(tmp_path / "out")]) == 65
     assert "no contrast of one name" in capsys.readouterr().err
-    trial = [str(compared[0]), str(compared[1]), "group", "--retest", "--seg", "ashs", "fs"]
+    trial = [str(compared[0]), str(compared[1]), "group", "--fit-norms", "--seg", "ashs", "fs"]
     assert main(trial) == 64
-    assert "name one protocol with --retest" in capsys.readouterr().err
+    assert "name one protocol with --fit-norms" in capsys.readouterr().err

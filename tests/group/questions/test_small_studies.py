@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from extension_marks import needs
 from small_cohorts import PLAN, methods_of, table, write_dataset
 
 from hipsta_bids.cli.main import main
@@ -71,6 +72,7 @@ def test_few_sheets_are_registered_to_a_template_of_another_cohort(eight, tmp_pa
     assert "not registered" not in methods_of(eight[1] / "group" / "given")
 
 
+@needs("trials")
 def test_sample_sizes_of_few_participants_are_not_registered(eight, capsys):
     data, out = eight
     line = [str(data), str(out), "group", "--measures", "thickness", "--no-reports"]

@@ -3,6 +3,7 @@
 import numpy as np
 import pandas as pd
 import pytest
+from extension_marks import needs
 from scipy import stats
 from small_cohorts import (
     NODES,
@@ -255,7 +256,12 @@ def test_equivalence_has_two_sides_of_one_difference(trial, capsys):
         ),
         (["--contrast", "age > 0.1", "--measures", "curvature"], 65, "a margin has one unit"),
         (["--endpoint", "mmrm", *SESSIONS, "--harmonize", "arm"], 65, "not with --harmonize"),
-        (["--endpoint", "mmrm", "base", "m12", "--retest"], 64, "has no effect with --retest"),
+        pytest.param(
+            ["--endpoint", "mmrm", "base", "m12", "--retest"],
+            64,
+            "has no effect with --retest",
+            marks=needs("trials"),
+        ),
     ],
 )
 def test_wrong_use_is_one_line(trial, capsys, options, code, words):

@@ -5,8 +5,8 @@ import pandas as pd
 import pytest
 
 from hipsta_bids.errors import ModelError
+from hipsta_bids.extensions.trials.trial import Retested
 from hipsta_bids.group.cohort.data import Cohort
-from hipsta_bids.group.questions.trials import Retested
 from hipsta_bids.group.settings import GroupSettings
 
 

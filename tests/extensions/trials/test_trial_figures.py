@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hipsta_bids.group.output.trial_figures import size_rows
+from hipsta_bids.extensions.trials.figures import size_rows
 
 
 def tables(per_arm, n, **columns):

@@ -6,8 +6,7 @@ from scipy import stats
 from statsmodels.stats.power import TTestIndPower
 
 from hipsta_bids.errors import ModelError, UsageError
-from hipsta_bids.stats.settings import MultiplicitySettings, PowerSettings
-from hipsta_bids.stats.trials import (
+from hipsta_bids.extensions.trials.sizes import (
     Reference,
     TrialEffect,
     participants_needed,
@@ -15,6 +14,7 @@ from hipsta_bids.stats.trials import (
     power_of,
     sample_size,
 )
+from hipsta_bids.stats.settings import MultiplicitySettings, PowerSettings
 
 SETTINGS = PowerSettings()
 REFERENCE = Reference(

@@ -7,7 +7,7 @@ from scipy import stats
 from statsmodels.formula.api import ols
 from statsmodels.stats.anova import anova_lm
 
-from hipsta_bids.stats.trials import repeatability
+from hipsta_bids.extensions.trials.sizes import repeatability
 
 #: Six targets and four judges, table 2 of Shrout and Fleiss (1979).
 JUDGED = [[9, 2, 5, 8], [6, 1, 3, 2], [8, 4, 6, 8], [7, 1, 2, 6], [10, 5, 6, 9], [6, 2, 4, 7]]

@@ -5,12 +5,7 @@ import pandas as pd
 import pytest
 from statsmodels.stats.power import TTestIndPower
 
-from hipsta_bids.group.cohort.data import SHEET, Cohort, layers
-from hipsta_bids.group.model import ModelRequest, VisitTime
-from hipsta_bids.group.questions.trials import Modeled, Retested
-from hipsta_bids.group.settings import GroupSettings
-from hipsta_bids.stats.settings import PowerSettings
-from hipsta_bids.stats.trials import (
+from hipsta_bids.extensions.trials.sizes import (
     Reference,
     TrialEffect,
     endpoint_sd,
@@ -18,6 +13,11 @@ from hipsta_bids.stats.trials import (
     power_of,
     sample_size,
 )
+from hipsta_bids.extensions.trials.trial import Modeled, Retested
+from hipsta_bids.group.cohort.data import SHEET, Cohort, layers
+from hipsta_bids.group.model import ModelRequest, VisitTime
+from hipsta_bids.group.settings import GroupSettings
+from hipsta_bids.stats.settings import PowerSettings
 from hipsta_bids.types import PARTICIPANT, SESSION
 from validation.group import thickness_side
 

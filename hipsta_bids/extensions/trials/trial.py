@@ -12,8 +12,11 @@ from scipy import stats
 
 from hipsta_bids import __version__
 from hipsta_bids.derivatives import dataset
-from hipsta_bids.derivatives.names import TRIAL_MAPS, TRIAL_TABLES
 from hipsta_bids.errors import ModelError
+from hipsta_bids.extensions.trials import sizes as trials
+from hipsta_bids.extensions.trials.figures import agreement_rows, size_rows
+from hipsta_bids.extensions.trials.methods import power_text, retest_text
+from hipsta_bids.extensions.trials.page import TABLES
 from hipsta_bids.group import model as modeling
 from hipsta_bids.group.cohort.covariates import order_sessions
 from hipsta_bids.group.cohort.data import SHEET, SUMMARY, Cohort, Layer, layers, participants_with
@@ -23,24 +26,30 @@ from hipsta_bids.group.output.columns import frame_of
 from hipsta_bids.group.output.ground import grounds_of
 from hipsta_bids.group.output.methods import COMMON_SHEETS
 from hipsta_bids.group.output.panels import draw_pages
-from hipsta_bids.group.output.question_methods import power_text, retest_text
 from hipsta_bids.group.output.style import Drawing
 from hipsta_bids.group.output.tables import entity_label
-from hipsta_bids.group.output.trial_figures import agreement_rows, size_rows
 from hipsta_bids.group.questions import study as studies
 from hipsta_bids.group.questions.mixing import with_mixes
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.io import files, gifti
 from hipsta_bids.progress import tell
-from hipsta_bids.stats import glm, trials
+from hipsta_bids.stats import glm
 from hipsta_bids.stats.arrays import Bool, Float, Int, SideMaps, describe_known, mean_of_known
 from hipsta_bids.stats.design import build_design
 from hipsta_bids.stats.formula import listed, model_from_shortcut, parse_model
-from hipsta_bids.stats.glm import FittedMaps, PointwiseFit, RowModel, fit_maps
+from hipsta_bids.stats.glm import FittedMaps, PointwiseFit, RowModel, fit_maps, points_of
 from hipsta_bids.stats.mixed import longitudinal_model
 from hipsta_bids.stats.settings import GlmSettings, RetestSettings
 from hipsta_bids.types import PARTICIPANT, SESSION
 
+#: Maps, by the value of ``stat-``: the tables that have them, the column, and the unit; none
+#: is that of the map.
+MAPS: dict[str, tuple[str, str, str]] = {
+    "icc": ("retest", "icc", "1"),
+    "sdwithin": ("retest", "sd_within", ""),
+    "mdc": ("retest", "detectable_change", ""),
+    "n": ("power", "per_arm", "1"),
+}
 #: Months per unit of columns of time with these names.
 _MONTHS = {"years": 12.0, "months": 1.0, "days": 12 / 365.25}
 #: Sessions that tell a participant's change from noise.
@@ -62,13 +71,6 @@ class Described:
     """(rows, points) that it rests on."""
     points: FittedMaps | None
     """Where the points are; ``None`` for a summary measure."""
-
-
-def points_of(side: SideMaps) -> FittedMaps:
-    """Locate the points of maps of one hemisphere, to which nothing was fitted."""
-    rows = np.arange(len(side.rows))
-    subfield = glm.most_frequent(side.subfield[:], len(side.names))
-    return FittedMaps(maps=side, used=rows, rows=rows, subfield=subfield, fits={})
 
 
 class Retested:
@@ -466,7 +468,7 @@ def _write_tables(
     folder: Path, cohorts: Mapping[str, Cohort], results: Sequence[Described]
 ) -> None:
     """Write a table per question and surface; of summary measures the smallest trial first."""
-    for question, (summary_title, points_title) in TRIAL_TABLES.items():
+    for question, (summary_title, points_title) in TABLES.items():
         blocks: dict[str, list[pd.DataFrame]] = {}
         for result in results:
             layer = result.layer
@@ -500,7 +502,7 @@ def _write_maps(folder: Path, cohorts: Mapping[str, Cohort], results: Sequence[D
             continue
         write.write_surface(folder, cohorts[layer.surface], result.points, layer.hemi)
         units = {"1": "1", "": layer.unit}
-        for stat, (question, column, unit) in TRIAL_MAPS.items():
+        for stat, (question, column, unit) in MAPS.items():
             if question in result.tables:
                 stem = f"hemi-{layer.hemi}_stat-{stat}_desc-{entity_label(layer.measure)}_statmap"
                 values = np.asarray(result.tables[question][column], dtype=np.float64)

@@ -5,11 +5,11 @@ from typing import Any
 
 import numpy as np
 
+from hipsta_bids.extensions.trials.sizes import MOST_PARTICIPANTS
 from hipsta_bids.group.output.color_bar import spanned
 from hipsta_bids.group.output.panels import Row
 from hipsta_bids.reports.cells import display_name, with_brackets
 from hipsta_bids.stats.arrays import Float
-from hipsta_bids.stats.trials import MOST_PARTICIPANTS
 
 #: Ticks of numbers of participants.
 _COUNTS = tuple(n * 10**power for power in range(5) for n in (1, 2, 3, 5))

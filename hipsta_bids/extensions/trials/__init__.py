@@ -1,0 +1,20 @@
+"""Trials: agreement of repeated sessions, and sample sizes."""
+
+from hipsta_bids.joints import Extension, Question
+
+EXTENSION = Extension(
+    package=__name__,
+    meaning="Measure the agreement of sessions, and find how many participants a trial needs.",
+    questions=(
+        Question(
+            flags=("retest", "power"),
+            dependents=("power_level", "dropout", "allocation", "visits", "among"),
+            without="--retest or --power",
+            options=f"{__name__}.options:add_options",
+            run=f"{__name__}.options:run",
+            settings=f"{__name__}.options:given_settings",
+        ),
+    ),
+    sections=f"{__name__}.page:SECTIONS",
+    has_templates=True,
+)
