@@ -102,6 +102,11 @@ def find_extensions() -> tuple[Extension, ...]:
     return tuple(import_module(f"{registry}.{name}").EXTENSION for name in present)
 
 
+def is_present(name: str) -> bool:
+    """Check whether the folder of an extension exists."""
+    return any(extension.package.endswith(f".{name}") for extension in find_extensions())
+
+
 def find_parts() -> tuple[Part, ...]:
     """Find what extensions add to the results of a comparison."""
     return tuple(part for extension in find_extensions() for part in extension.parts)

@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hipsta_bids.cli import main as command
-from hipsta_bids.group.output import saved
+from hipsta_bids.extensions.norms import file as saved
 from hipsta_bids.io import gifti
 from hipsta_bids.phantom import Hemisphere, PhantomSpec
 from hipsta_bids.phantom import write_dataset as write_phantoms
@@ -280,7 +280,7 @@ def leave_out_figures() -> None:
     for module, name, function in (
         ("group.output.write", "draw_figures", lambda *_: iter(())),
         ("group.output.write", "write_figures", lambda *_, **__: []),
-        ("group.questions.norming", "_figures", lambda *_: iter(())),
+        ("extensions.norms.norming", "_figures", lambda *_: iter(())),
         ("participant.run", "run_jobs", lambda plan, jobs: ((j, plan.work(j)) for j in jobs)),
     ):
         setattr(import_module(f"hipsta_bids.{module}"), name, function)

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import special, stats
 
+from hipsta_bids.extensions.norms.centiles import LEVELS, Norms, People, fit_norms
 from hipsta_bids.stats.arrays import Float
-from hipsta_bids.stats.norms import LEVELS, Norms, People, fit_norms
 from hipsta_bids.stats.settings import NormSettings
 from validation.report import Cell, Cells, Content, suite, table
 

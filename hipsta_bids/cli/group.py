@@ -22,7 +22,7 @@ from hipsta_bids.cli.parser import (
 )
 from hipsta_bids.cli.participant import REGIONS
 from hipsta_bids.errors import ExitCode, NothingToDoError, UsageError
-from hipsta_bids.joints import find_parts, load
+from hipsta_bids.joints import find_parts, find_questions, load
 from hipsta_bids.participant.pool import processors
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ without --model and --formula: group + age + sex (+ site) from BIDS_DIR/particip
 each group is compared with the reference level: CN, CU, healthy control ..., else the first.
 The run prints the reference level; --reference FACTOR=LEVEL changes it.
 
-{questions} answer questions of their own, each in a folder of OUT_DIR/group
+{questions}
 
 results: OUT_DIR/group/MODEL/; begin with OUT_DIR/group/MODEL.html
 
@@ -469,7 +469,7 @@ def _settings(parsed: argparse.Namespace) -> "GroupSettings":
             "sides": parsed.joint_sides or None,
         },
     }
-    for question in questions.all_questions():
+    for question in find_questions():
         if question.settings:
             choices |= load(question.settings)(parsed)
     settings = load_group_settings(parsed.settings)

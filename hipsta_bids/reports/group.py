@@ -22,7 +22,7 @@ from hipsta_bids.joints import find_extensions, load
 from hipsta_bids.protocols import EXPERIMENTAL
 from hipsta_bids.reports import cells, group_tables
 from hipsta_bids.reports.display import DESIGN_COLORS, colors_of
-from hipsta_bids.reports.group_maps import embedded, map_scenes, norms
+from hipsta_bids.reports.group_maps import embedded, map_scenes
 from hipsta_bids.reports.page import Section, build_sections, render
 from hipsta_bids.types import JOINT
 
@@ -282,7 +282,6 @@ def _blocks(text: str) -> list[dict[str, Any]]:
 
 #: Sections of the page, from top to bottom.
 SECTIONS: tuple[Section[GroupResults], ...] = (
-    Section("norms", "Norms", "group/norms.html", norms),
     Section("found", "What was found", "group/found.html", group_tables.findings),
     Section("people", "Participants", "group/people.html", group_tables.participants),
     Section("maps", "Maps", "group/maps.html", map_scenes),

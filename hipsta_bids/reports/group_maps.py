@@ -10,7 +10,7 @@ import pandas as pd
 from hipsta_bids.derivatives.analyses import GroupResults, records
 from hipsta_bids.reports import cells
 from hipsta_bids.reports.display import known
-from hipsta_bids.reports.group_tables import far_scores, map_unit, score_rows
+from hipsta_bids.reports.group_tables import map_unit
 from hipsta_bids.reports.maps import Picture, picture_of_file
 from hipsta_bids.types import JOINT, SIDES, Float
 
@@ -226,32 +226,3 @@ def _rounded(value: Any) -> Any:  # noqa: ANN401  (of JSON)
     if isinstance(value, Mapping):
         return {key: _rounded(part) for key, part in value.items()}
     return [_rounded(part) for part in value] if isinstance(value, list) else value
-
-
-def norms(results: GroupResults) -> Mapping[str, Any] | None:
-    """Describe norms and how well they hold, or participants against them."""
-    about = results.record.get("norms")
-    if not about:
-        return None
-    table, scores = results.table("coverage"), results.table("zscores")
-    shares = [name for name in table.columns if name.startswith("below_")]
-    pictures = []
-    for kind, suffix in (("norms", "centiles by age"), ("normmaps", "maps")):
-        for path in sorted((results.folder / "figures").glob(f"*_{kind}.svg")):
-            measure = cells.display_name(path.stem.removesuffix(f"_{kind}"))
-            pictures += embedded(results, path.stem, f"{measure.capitalize()}: {suffix}")
-    far, rows = list[dict[str, Any]](), list[tuple[str, str, list[pd.Series]]]()
-    if len(scores):
-        whole = scores[scores["region"].isna() | (scores["region"] == "all")]
-        whole = whole.rename(columns={"z": "w", "adapted": "reference"})
-        rows = score_rows(whole)
-        far = far_scores(whole[~whole["reference"].astype(bool)])
-    return {
-        **about,
-        "shares": shares,
-        "calibration": records(table),
-        "rows": rows,
-        "adapted": any(site["new"] for site in about["sites"]),
-        "far": far,
-        "pictures": pictures,
-    }

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from hipsta_bids.extensions.norms import centiles as norms_module
 from hipsta_bids.group.settings import GroupSettings
-from hipsta_bids.stats import norms as norms_module
 from hipsta_bids.stats.registration import mean_profiles, register
 from hipsta_bids.stats.settings import NormSettings, RegistrationSettings
 from hipsta_bids.stats.warps import warp_values

@@ -7,8 +7,8 @@ from hipsta_bids.cli.console import echo
 from hipsta_bids.cli.parser import Parser, given_settings, parser_of, site_path
 from hipsta_bids.errors import ExitCode
 from hipsta_bids.extensions.consortia.meta import run_meta
-from hipsta_bids.extensions.consortia.norms import merge_norms
 from hipsta_bids.group.settings import load_group_settings
+from hipsta_bids.joints import is_present
 
 
 def meta_parser() -> Parser:
@@ -16,7 +16,8 @@ def meta_parser() -> Parser:
     parser, add = parser_of("meta", "hipsta_bids.extensions.consortia")
     add("sites", "SITE", nargs="+")
     add("out", "OUT", type=Path)
-    add("--norms")
+    if is_present("norms"):
+        add("--norms")
     add("--random", choices=["reml", "reml-adhoc", "dl"])
     add("--correction", choices=["fdr2", "bh"])
     add("--fdr-scope", choices=["map", "hemispheres", "all"])
@@ -34,7 +35,9 @@ def run_meta_analysis(arguments: Sequence[str]) -> ExitCode:
     }
     settings = load_group_settings(options.settings).changed(**given_settings(choices))
     paths = [site_path(text) for text in options.sites]
-    if options.norms:
+    if getattr(options, "norms", False):
+        from hipsta_bids.extensions.consortia.norms import merge_norms  # noqa: PLC0415  (may be absent)
+
         norms, notes = merge_norms([path for _, path in paths], options.out, settings)
         for note in notes:
             echo(f"note: {note}")

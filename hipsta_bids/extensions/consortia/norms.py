@@ -8,10 +8,10 @@ import numpy as np
 
 from hipsta_bids import __version__
 from hipsta_bids.errors import ModelError, UsageError
-from hipsta_bids.group.output.saved import NormsFile, load_norms, save_norms
+from hipsta_bids.extensions.norms import sums as summed_norms
+from hipsta_bids.extensions.norms.file import NormsFile, load_norms, save_norms
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.io import files
-from hipsta_bids.stats import summed_norms
 from hipsta_bids.stats.formula import listed
 
 #: File of norms, in the folder of an analysis.

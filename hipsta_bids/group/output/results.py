@@ -24,7 +24,7 @@ from hipsta_bids.stats.formula import ModelSpec
 from hipsta_bids.stats.glm import FittedMaps, PointTest, PointwiseFit, RowModel
 from hipsta_bids.stats.grammar import closed_formula
 from hipsta_bids.stats.inference import Discoveries, MapKey
-from hipsta_bids.stats.norms import NormativeScores
+from hipsta_bids.stats.scores import NormativeScores
 from hipsta_bids.types import PARTICIPANT
 
 #: Group of all, where there are no groups.

@@ -21,7 +21,7 @@ from hipsta_bids.stats.design import Design, build_design
 from hipsta_bids.stats.formula import ModelSpec, check_names, listed, typed
 from hipsta_bids.stats.glm import MEAN, PointwiseFit, RowModel, most_frequent, with_mean
 from hipsta_bids.stats.grammar import closed_formula, term_text
-from hipsta_bids.stats.norms import w_scores
+from hipsta_bids.stats.scores import w_scores
 from hipsta_bids.stats.settings import ClassificationSettings, DesignSettings
 from hipsta_bids.types import PARTICIPANT, SESSION
 

@@ -11,12 +11,12 @@ from small_cohorts import read_participants, table, write_participants
 
 from hipsta_bids.cli.main import main
 from hipsta_bids.errors import ModelError
-from hipsta_bids.group.output.saved import _digest, load_norms
-from hipsta_bids.group.questions import norming
+from hipsta_bids.extensions.norms import norming
+from hipsta_bids.extensions.norms.centiles import NORM_ARRAYS, People
+from hipsta_bids.extensions.norms.file import _digest, load_norms
+from hipsta_bids.extensions.norms.sums import columns_of
 from hipsta_bids.group.questions.disclosure import check_sums
 from hipsta_bids.group.settings import ExchangeSettings
-from hipsta_bids.stats.norms import NORM_ARRAYS, People
-from hipsta_bids.stats.summed_norms import columns_of
 
 MEASURES = ("--measures", "thickness", "thickness_mean", "volume")
 SHARED = "[norms]\nshared_knots = [20.0, 50.0, 85.0]\n"

@@ -7,9 +7,15 @@ import pytest
 import statsmodels.api as sm
 from scipy import stats
 
-from hipsta_bids.stats.norms import LEVELS, NORM_ARRAYS, People, age_columns, fit_norms
+from hipsta_bids.extensions.norms.centiles import (
+    LEVELS,
+    NORM_ARRAYS,
+    People,
+    age_columns,
+    fit_norms,
+)
+from hipsta_bids.extensions.norms.sums import fit_sums, fit_values, sum_columns, sum_values
 from hipsta_bids.stats.settings import NormSettings
-from hipsta_bids.stats.summed_norms import fit_sums, fit_values, sum_columns, sum_values
 
 KNOTS = np.array([20.0, 40, 60, 85])
 #: Shift in mm, and scale of the SD; the last site is new.

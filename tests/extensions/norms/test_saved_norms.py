@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from hipsta_bids.errors import ModelError
-from hipsta_bids.group.output.saved import NormsFile, load_norms, save_norms
-from hipsta_bids.stats.norms import People, fit_norms, from_normal
+from hipsta_bids.extensions.norms.centiles import People, fit_norms, from_normal
+from hipsta_bids.extensions.norms.file import NormsFile, load_norms, save_norms
 from hipsta_bids.stats.settings import NormSettings
 
 KNOTS = np.array([20.0, 35, 50, 70, 90])

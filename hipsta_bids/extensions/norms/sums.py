@@ -8,9 +8,9 @@ sums as well; ages count by their first four moments.
 
 import numpy as np
 
+from hipsta_bids.extensions.norms.centiles import Norms, People, age_columns
 from hipsta_bids.stats.arrays import Bool, Float
 from hipsta_bids.stats.combat import solve_points
-from hipsta_bids.stats.norms import Norms, People, age_columns
 
 #: Steps of the fits, and the relative change of weights that ends them.
 _STEPS, _SETTLED = 50, 1e-12

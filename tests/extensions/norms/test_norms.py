@@ -7,8 +7,14 @@ import pytest
 import statsmodels.api as sm
 from scipy import integrate, interpolate, optimize, stats
 
-from hipsta_bids.stats import norms as norms_module
-from hipsta_bids.stats.norms import People, age_columns, fit_norms, from_normal, to_normal
+from hipsta_bids.extensions.norms import centiles as norms_module
+from hipsta_bids.extensions.norms.centiles import (
+    People,
+    age_columns,
+    fit_norms,
+    from_normal,
+    to_normal,
+)
 from hipsta_bids.stats.settings import NormSettings
 
 SETTINGS = NormSettings()

@@ -16,8 +16,9 @@ from scipy import special
 from hipsta_bids.errors import ModelError
 from hipsta_bids.stats.arrays import Bool, Float, Int
 from hipsta_bids.stats.combat import solve_weighted
-from hipsta_bids.stats.glm import chunks, fit_block
-from hipsta_bids.stats.settings import GlmSettings, NormSettings
+from hipsta_bids.stats.glm import chunks
+from hipsta_bids.stats.scores import tail_probability
+from hipsta_bids.stats.settings import NormSettings
 
 #: Values at a point are transformed if a likelihood-ratio test rejects the normal distribution
 #: at this level.
@@ -104,7 +105,7 @@ class Norms:
             n = np.maximum(norms_here.n[people_known.site], 1)  # without any, the shift is missing
             # Mean of the leverage of the spline and of sex.
             mean_leverage = (len(norms_here.mean) - 1) / np.maximum(norms_here.n.sum(axis=0), 1)
-            tail = _tail(z, n - 1, 1 / n + mean_leverage)
+            tail = tail_probability(z, n - 1, 1 / n + mean_leverage)
             scores[rows, part] = -np.sign(z) * special.ndtri(tail)
         return scores
 
@@ -337,64 +338,3 @@ def _likelihood(residuals: Float, shape: Float) -> tuple[Float, Float, Float]:
     single = np.stack([skewed, tailed]) * finite
     information = np.einsum("isp,jsp->pij", single, single)
     return (terms * finite).sum(axis=0), single.sum(axis=1).T, information
-
-
-@dataclass(frozen=True)
-class NormativeScores:
-    """Scores of all subjects at all points; NaN where a value or the model is missing."""
-
-    w: Float
-    """(subjects, points) observed minus expected, in residual standard deviations of the reference
-    group (Jack et al. 1997)."""
-    p: Float
-    """(subjects, points) two-sided, with the uncertainty of the expectation."""
-
-
-def w_scores(maps: Float, matrix: Float, reference: Bool, settings: GlmSettings) -> NormativeScores:
-    """Score each subject against a reference group, adjusted for covariates.
-
-    Members of the reference group are scored against its other members: as if the model were fitted
-    without them (from their leverage, so that nothing is fitted again). Their scores are thus
-    comparable with the scores of all others.
-    """
-    if settings.covariance != "ordinary":
-        raise ModelError("normative scores assume equal variances; set glm.covariance to ordinary")
-    reference_matrix = matrix[reference]
-    if len(reference_matrix) - matrix.shape[1] <= settings.min_residual_df:
-        raise ModelError(
-            f"normative scores: {len(reference_matrix)} reference subjects are too few for"
-            f" {matrix.shape[1]} columns"
-        )
-    if np.linalg.matrix_rank(reference_matrix) < matrix.shape[1]:
-        raise ModelError(
-            "normative scores: columns are not independent in the reference group; remove a "
-            "covariate that does not vary there"
-        )
-    basis, triangle = np.linalg.qr(reference_matrix)
-    rotated = matrix @ np.linalg.inv(triangle)
-    member = reference[:, None]
-    w, p = np.full((2, *maps.shape), np.nan)
-    for part in chunks(maps.shape, matrix.shape[1]):
-        values = np.asarray(maps[:, part], dtype=np.float64)
-        fit = fit_block(values[reference], basis, settings)
-        inverse = fit.covariance / (fit.sigma**2)[:, None, None]
-        leverage = np.einsum("psi,si->sp", rotated @ inverse, rotated)
-        residuals = values - rotated @ fit.scores.T
-        df = np.where(np.isfinite(fit.sigma), fit.n - basis.shape[1], np.nan) - member
-        # A subject that alone determines a coefficient cannot be told without it.
-        left = np.where(member, 1 - leverage, 1.0)
-        left[left <= np.sqrt(np.finfo(np.float64).eps)] = np.nan
-        # Of members, the variance without themselves.
-        squares = fit.sigma**2 * (df + member) - np.where(member, residuals**2 / left, 0.0)
-        sigma = np.sqrt(np.maximum(squares, 0.0) / df)
-        w[:, part] = residuals / left / np.where(sigma > 0, sigma, np.nan)
-        p[:, part] = 2 * _tail(w[:, part], df, np.where(member, leverage / left, leverage))
-    return NormativeScores(w, p)
-
-
-def _tail(z: Float, df: Float, variance: Float) -> Float:
-    """Probability of a deviation of this size to one side, by Student's distribution.
-
-    ``variance`` is that of the expectation, over the variance of values.
-    """
-    return np.asarray(special.stdtr(df, -np.abs(z) / np.sqrt(1 + variance)))

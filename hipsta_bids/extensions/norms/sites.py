@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 
 from hipsta_bids.errors import ModelError
-from hipsta_bids.group.output.saved import NormsFile
+from hipsta_bids.extensions.norms import sums as summed_norms
+from hipsta_bids.extensions.norms.centiles import People
+from hipsta_bids.extensions.norms.file import NormsFile
 from hipsta_bids.group.questions import study as studies
 from hipsta_bids.group.questions.disclosure import check_sums, is_traceable
 from hipsta_bids.io import files
-from hipsta_bids.stats import summed_norms
 from hipsta_bids.stats.arrays import Float, Int, Key
 from hipsta_bids.stats.formula import level_labels, typed
-from hipsta_bids.stats.norms import People
 from hipsta_bids.types import PARTICIPANT
 
 

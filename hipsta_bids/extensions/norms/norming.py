@@ -13,6 +13,11 @@ from scipy import special
 from hipsta_bids import __version__
 from hipsta_bids.derivatives import dataset
 from hipsta_bids.errors import ModelError
+from hipsta_bids.extensions.norms import centiles as normative
+from hipsta_bids.extensions.norms import sums as summed_norms
+from hipsta_bids.extensions.norms.file import NormsFile, load_norms, save_norms
+from hipsta_bids.extensions.norms.methods import norms_text
+from hipsta_bids.extensions.norms.sites import with_sums
 from hipsta_bids.group.cohort.data import SHEET, Cohort, layers
 from hipsta_bids.group.model import BOTH, Comparison
 from hipsta_bids.group.output import write
@@ -20,25 +25,22 @@ from hipsta_bids.group.output.citations import escaped
 from hipsta_bids.group.output.figures import deviation_rows, draw_norms, norm_rows
 from hipsta_bids.group.output.ground import grounds_of
 from hipsta_bids.group.output.panels import draw_pages
-from hipsta_bids.group.output.question_methods import norms_text
 from hipsta_bids.group.output.results import ScoredMaps
-from hipsta_bids.group.output.saved import NormsFile, load_norms, save_norms, templates_from_json
+from hipsta_bids.group.output.saved import templates_from_json
 from hipsta_bids.group.output.style import Drawing
 from hipsta_bids.group.questions import study as studies
 from hipsta_bids.group.questions.mixing import with_mixes
-from hipsta_bids.group.questions.norm_sums import with_sums
 from hipsta_bids.group.questions.scores import map_rows, score_rows
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.io import files
 from hipsta_bids.io.labels import refuse_alike
 from hipsta_bids.progress import tell
 from hipsta_bids.protocols.toml import resolve
-from hipsta_bids.stats import norms as normative
-from hipsta_bids.stats import summed_norms
 from hipsta_bids.stats.arrays import Bool, Float, Int, Key
 from hipsta_bids.stats.design import FIRST_AGE
 from hipsta_bids.stats.formula import check_names, level_labels, listed, typed
 from hipsta_bids.stats.glm import most_frequent, points_of
+from hipsta_bids.stats.scores import NormativeScores
 from hipsta_bids.stats.settings import NormSettings
 from hipsta_bids.stats.warps import Template
 from hipsta_bids.types import PARTICIPANT
@@ -469,7 +471,7 @@ def _score_maps(
                 continue
             norm = norms[hemi, measure]
             z = norm.score(values[hemi, measure][1], people.take(side.rows))
-            scores[measure] = normative.NormativeScores(z, 2 * special.ndtr(-np.abs(z)))
+            scores[measure] = NormativeScores(z, 2 * special.ndtr(-np.abs(z)))
         if scores:
             scored[hemi] = ScoredMaps(
                 rows=side.rows,

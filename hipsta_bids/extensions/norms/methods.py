@@ -5,10 +5,10 @@ from collections.abc import Callable, Sequence
 import pandas as pd
 
 from hipsta_bids import __version__
+from hipsta_bids.extensions.norms.centiles import CENTILE_FOLDS, LEVELS, SHAPE_LEVEL
+from hipsta_bids.extensions.norms.file import NormsFile
 from hipsta_bids.group.output.citations import Citations, escaped
 from hipsta_bids.group.output.methods import COMMON_SHEETS
-from hipsta_bids.group.output.saved import NormsFile
-from hipsta_bids.stats.norms import CENTILE_FOLDS, LEVELS, SHAPE_LEVEL
 
 Cite = Callable[[str], str]
 """Numbers a work by its key."""

@@ -1,0 +1,21 @@
+"""Norms: centiles by age, sex and site, and scores of other participants by them."""
+
+from hipsta_bids.joints import Extension, Question
+
+#: Options that have no effect without these questions.
+DEPENDENTS = ("controls", "among")
+EXTENSION = Extension(
+    package=__name__,
+    meaning="Fit norms of measures by age, sex and site, and score participants by them.",
+    questions=(
+        Question(
+            flags=("fit_norms", "norms"),
+            dependents=DEPENDENTS,
+            without="--norms",
+            options=f"{__name__}.options:add_options",
+            run=f"{__name__}.options:run",
+        ),
+    ),
+    sections=f"{__name__}.page:SECTIONS",
+    has_templates=True,
+)
