@@ -114,19 +114,22 @@ COMMANDS = [
         (f"{TRIAL} --power thinning=5% --name sizes", 0, ["visits/out/group/sizes.html"]),
     ]
     * ("trials" in PRESENT),
-    (
-        "norms/bids norms/out group --fit-norms --align none --measures volume --name norms",
-        0,
-        ["norms/out/group/norms.html"],
-    ),
-    (
+    *[
         (
-            "people/bids people/out group --norms norms/out/group/norms/norms.json"
-            " --controls group=CN --measures volume --name scores"
+            "norms/bids norms/out group --fit-norms --align none --measures volume --name norms",
+            0,
+            ["norms/out/group/norms.html"],
         ),
-        0,
-        ["people/out/group/scores.html"],
-    ),
+        (
+            (
+                "people/bids people/out group --norms norms/out/group/norms/norms.json"
+                " --controls group=CN --measures volume --name scores"
+            ),
+            0,
+            ["people/out/group/scores.html"],
+        ),
+    ]
+    * ("norms" in PRESENT),
 ]
 
 

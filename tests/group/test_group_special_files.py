@@ -6,6 +6,7 @@ import signal
 from pathlib import Path
 
 import pytest
+from extension_marks import PRESENT
 from small_cohorts import FAST, place_of, write_dataset
 
 from hipsta_bids.cli.main import main
@@ -31,7 +32,7 @@ CASES = [
     ("model.json", ["--model", "model.json"]),
     ("template.json", ["--template", "template.json"]),
     ("sites.json", ["--harmonize", "sex", "--harmonize-model", "sites.json"]),
-    ("norms.json", ["--norms", "norms.json"]),
+    *[("norms.json", ["--norms", "norms.json"])] * ("norms" in PRESENT),
     ("fs/sub-01/stats/aseg.stats", SEGMENTATIONS),
     ("fs/sub-01/mri/sub-01_icv.txt", SEGMENTATIONS),
     ("out/desc-settings.json", []),

@@ -309,6 +309,7 @@ def said(capsys):
     return capsys.readouterr().err
 
 
+@needs("norms")
 def test_norms_and_scores(tmp_path, capsys):
     data, out = write_people(tmp_path / "norms", {"A": 60, "B": 60}, 1)
     paths = sorted(out.rglob("*_desc-qc_metrics.json"))

@@ -5,6 +5,7 @@ import shutil
 import numpy as np
 import pandas as pd
 import pytest
+from extension_marks import needs
 from page_outline import Outline
 from scipy import stats
 from sklearn.metrics import f1_score
@@ -260,6 +261,10 @@ def test_refusals_name_the_problem(compared, tmp_path, capsys):
     assert main([str(data), str(out), "group", *call]) == 0
     assert main(["compare", first, str(group / "age"), str(tmp_path / "out")]) == 65
     assert "no contrast of one name" in capsys.readouterr().err
-    trial = [str(compared[0]), str(compared[1]), "group", "--fit-norms", "--seg", "ashs", "fs"]
-    assert main(trial) == 64
+
+
+@needs("norms")
+def test_norms_are_of_one_protocol(compared, capsys):
+    data, out, _ = compared
+    assert main([str(data), str(out), "group", "--fit-norms", "--seg", "ashs", "fs"]) == 64
     assert "name one protocol with --fit-norms" in capsys.readouterr().err
