@@ -90,7 +90,12 @@ def run_question(
             f"{' and '.join(flags)}: harmonization is not possible; remove "
             "harmonization.column from the settings"
         )
-    result: GroupResult = load(questions[0].run)(parsed, options, settings)
+    (question,) = questions
+    for further in find_questions():
+        if further is not question:
+            names = [name for name in further.dependents if name not in question.dependents]
+            refuse(parsed, names, f"without {further.without}")
+    result: GroupResult = load(question.run)(parsed, options, settings)
     return result
 
 

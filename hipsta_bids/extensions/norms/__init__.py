@@ -2,15 +2,13 @@
 
 from hipsta_bids.joints import Extension, Question
 
-#: Options that have no effect without these questions.
-DEPENDENTS = ("controls", "among")
 EXTENSION = Extension(
     package=__name__,
     meaning="Fit norms of measures by age, sex and site, and score participants by them.",
     questions=(
         Question(
             flags=("fit_norms", "norms"),
-            dependents=DEPENDENTS,
+            dependents=("controls", "among"),
             without="--norms",
             options=f"{__name__}.options:add_options",
             run=f"{__name__}.options:run",

@@ -5,11 +5,9 @@ import argparse
 from hipsta_bids.cli.parser import Parser, adder, factor_level
 from hipsta_bids.cli.questions import refuse
 from hipsta_bids.errors import UsageError
-from hipsta_bids.extensions.norms import DEPENDENTS
 from hipsta_bids.extensions.norms.norming import run_norms
 from hipsta_bids.group.questions.study import GroupOptions, GroupResult
 from hipsta_bids.group.settings import GroupSettings
-from hipsta_bids.joints import find_questions
 
 
 def add_options(parser: Parser) -> None:
@@ -39,9 +37,6 @@ def run(parsed: argparse.Namespace, options: GroupOptions, settings: GroupSettin
     if parsed.fit_norms and parsed.norms:
         raise UsageError("give one of --fit-norms, --norms")
     flag = "--fit-norms" if parsed.fit_norms else "--norms"
-    for question in find_questions():
-        names = [name for name in question.dependents if name not in DEPENDENTS]
-        refuse(parsed, names, f"without {question.without}")
     refuse(parsed, ("formula", "age_model"), f"with {flag}")
     if parsed.norms is None:
         refuse(parsed, ("controls",), "without --norms")

@@ -71,7 +71,6 @@ def run(parsed: argparse.Namespace, options: GroupOptions, settings: GroupSettin
         refuse(parsed, POWER_ONLY, "without --power")
     if parsed.power is None or parsed.retest:
         refuse(parsed, ("formula", "age_model"), f"with {flag}")
-    refuse(parsed, ("controls",), "without --norms")
     effect = None
     if parsed.power is not None:
         kind, share = parsed.power

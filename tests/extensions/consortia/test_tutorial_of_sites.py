@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from extension_marks import needs
 from scipy import stats
 from small_cohorts import table
 from tutorial_pages import blocks, plain, whole
@@ -43,6 +44,7 @@ def consortium(page=SITES):
     assert first == "Berlin"
 
 
+@needs("norms")
 def test_the_commands_of_the_consortium_are_understood():
     """Those that take long are only parsed here."""
     every = [line for line in consortium() if not isinstance(line, str)]
