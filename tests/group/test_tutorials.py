@@ -153,4 +153,4 @@ def test_the_sentences_of_the_phantom_tutorial_say_what_came_out(study):
     strict = [found(study, "tfce", hemi)[0] for hemi in "LR"]
     counts = [int((signs > 0).sum()) for signs in strict], int((strict[1] < 0).sum())
     assert f"{counts[0][0]} points survive on the left and {counts[0][1]} on the right" in page
-    assert f"and {counts[1] or 'no'} violet ones" in page
+    assert f"and {counts[1] or 'no'} violet one{'s' * (counts[1] != 1)}" in page
