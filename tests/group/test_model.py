@@ -3,6 +3,7 @@
 import numpy as np
 import pandas as pd
 import pytest
+from people_tables import participants
 
 from hipsta_bids.errors import UsageError
 from hipsta_bids.group.model import (
@@ -18,19 +19,6 @@ from hipsta_bids.stats.formula import parse_model
 
 DEFAULTS = GroupSettings()
 SETTINGS = DEFAULTS.design
-
-
-def participants(n=60, seed=0):
-    random = np.random.default_rng(seed)
-    return pd.DataFrame(
-        {
-            "group": np.array(["CU", "MCI", "DAT"])[np.arange(n) % 3],
-            "age": random.normal(70, 8, n).round(1),
-            "sex": np.array(["F", "M"])[random.integers(0, 2, n)],
-            "site": "one",
-        },
-        index=[f"sub-{i:02d}" for i in range(n)],
-    )
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pandas as pd
 import pytest
+from people_tables import participants
 from scipy import stats
 
 from hipsta_bids.errors import ModelError
@@ -21,19 +22,6 @@ from hipsta_bids.stats.references import choose_reference
 from hipsta_bids.stats.settings import DesignSettings, GlmSettings
 
 SETTINGS = DesignSettings()
-
-
-def participants(n=60, seed=0):
-    random = np.random.default_rng(seed)
-    return pd.DataFrame(
-        {
-            "group": np.array(["CU", "MCI", "DAT"])[np.arange(n) % 3],
-            "age": random.normal(70, 8, n).round(1),
-            "sex": np.array(["F", "M"])[random.integers(0, 2, n)],
-            "site": "one",
-        },
-        index=[f"sub-{i:02d}" for i in range(n)],
-    )
 
 
 def design(formula, contrasts=(), table=None, references=None, settings=SETTINGS):

@@ -6,8 +6,6 @@ from pathlib import Path
 from hipsta_bids.cli.console import echo
 from hipsta_bids.cli.parser import Parser, given_settings, parser_of, site_path
 from hipsta_bids.errors import ExitCode
-from hipsta_bids.extensions.consortia.meta import run_meta
-from hipsta_bids.group.settings import load_group_settings
 from hipsta_bids.joints import is_present
 
 
@@ -29,6 +27,9 @@ def meta_parser() -> Parser:
 def run_meta_analysis(arguments: Sequence[str]) -> ExitCode:
     """Combine summaries of sites."""
     options = meta_parser().parse_intermixed_args(arguments)
+    from hipsta_bids.extensions.consortia.meta import run_meta  # noqa: PLC0415  (heavy)
+    from hipsta_bids.group.settings import load_group_settings  # noqa: PLC0415  (start-up time)
+
     choices = {
         "meta": {"random": options.random},
         "multiplicity": {"method": options.correction, "scope": options.fdr_scope},

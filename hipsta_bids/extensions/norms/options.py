@@ -1,13 +1,15 @@
 """Options of norms, and what they ask."""
 
 import argparse
+from typing import TYPE_CHECKING
 
 from hipsta_bids.cli.parser import Parser, adder, factor_level
 from hipsta_bids.cli.questions import refuse
 from hipsta_bids.errors import UsageError
-from hipsta_bids.extensions.norms.norming import run_norms
-from hipsta_bids.group.questions.study import GroupOptions, GroupResult
-from hipsta_bids.group.settings import GroupSettings
+
+if TYPE_CHECKING:
+    from hipsta_bids.group.questions.study import GroupOptions, GroupResult
+    from hipsta_bids.group.settings import GroupSettings
 
 
 def add_options(parser: Parser) -> None:
@@ -32,8 +34,12 @@ def add_options(parser: Parser) -> None:
     )
 
 
-def run(parsed: argparse.Namespace, options: GroupOptions, settings: GroupSettings) -> GroupResult:
+def run(
+    parsed: argparse.Namespace, options: "GroupOptions", settings: "GroupSettings"
+) -> "GroupResult":
     """Fit norms, or score participants by them."""
+    from hipsta_bids.extensions.norms.norming import run_norms  # noqa: PLC0415  (heavy)
+
     if parsed.fit_norms and parsed.norms:
         raise UsageError("give one of --fit-norms, --norms")
     flag = "--fit-norms" if parsed.fit_norms else "--norms"

@@ -2,17 +2,16 @@
 
 import argparse
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 from hipsta_bids.cli.parser import Parser, adder
 from hipsta_bids.cli.questions import refuse
 from hipsta_bids.errors import did_you_mean
-from hipsta_bids.extensions.trials.sizes import TrialEffect
-from hipsta_bids.extensions.trials.trial import run_trial
-from hipsta_bids.group.questions.study import GroupOptions, GroupResult
-from hipsta_bids.group.settings import GroupSettings
+from hipsta_bids.extensions.trials import POWER_ONLY
 
-#: Options that only sample sizes have.
-POWER_ONLY = ("power_level", "dropout", "allocation", "visits")
+if TYPE_CHECKING:
+    from hipsta_bids.group.questions.study import GroupOptions, GroupResult
+    from hipsta_bids.group.settings import GroupSettings
 
 
 def add_options(parser: Parser) -> None:
@@ -64,8 +63,13 @@ def given_settings(parsed: argparse.Namespace) -> Mapping[str, Mapping[str, obje
     }
 
 
-def run(parsed: argparse.Namespace, options: GroupOptions, settings: GroupSettings) -> GroupResult:
+def run(
+    parsed: argparse.Namespace, options: "GroupOptions", settings: "GroupSettings"
+) -> "GroupResult":
     """Measure the agreement of sessions, or find sample sizes."""
+    from hipsta_bids.extensions.trials.sizes import TrialEffect  # noqa: PLC0415  (heavy)
+    from hipsta_bids.extensions.trials.trial import run_trial  # noqa: PLC0415  (heavy)
+
     flag = "--retest" if parsed.retest else "--power"
     if parsed.power is None:
         refuse(parsed, POWER_ONLY, "without --power")

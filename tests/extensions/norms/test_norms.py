@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 import statsmodels.api as sm
 from scipy import integrate, interpolate, optimize, stats
 
@@ -20,19 +19,6 @@ from hipsta_bids.stats.settings import NormSettings
 SETTINGS = NormSettings()
 KNOTS = np.array([20.0, 35, 50, 70, 90])
 SHAPES = np.array([[0.0, 0.8, -2.0, 0.3], [0.0, 0.0, -0.4, 0.5]])
-
-
-@pytest.fixture(scope="module")
-def cohort():
-    """Five points of two sites; the SD grows with age, values are skewed."""
-    random = np.random.default_rng(3)
-    site = np.repeat([0, 1], [70, 50])
-    age, sex = random.uniform(20, 90, 120), (np.arange(120) % 2).astype(float)
-    shape = np.array([[0.5] * 5, [0.0] * 5])
-    own = from_normal(random.standard_normal((120, 5)), shape)
-    sd = 0.1 * np.exp(0.01 * (age - 20)) * np.array([1.0, 1.5])[site]
-    values = (2 - 0.01 * age + 0.1 * sex + 0.2 * site)[:, None] + sd[:, None] * own
-    return values, People(age=age, sex=sex[:, None], site=site)
 
 
 def test_spline_has_every_natural_cubic_spline_of_its_knots():
