@@ -4,8 +4,8 @@ An extension is a folder of ``hipsta_bids.extensions``, whose ``__init__`` decla
 functions as ``module:function``; they are loaded when they are called.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from functools import cache
 from importlib import import_module
 from importlib.util import find_spec
@@ -77,6 +77,44 @@ class Question:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Step:
+    """What an option adds to the line of an analysis, and to its results."""
+
+    name: str
+    """Key of its plan and its result in an analysis, and of its entry in the record."""
+    flag: str
+    """How messages name it."""
+    names: tuple[str, ...]
+    """Names in Python of its options."""
+    options: str
+    """Function that adds its options to the parser."""
+    condition: str
+    """Function of a request: whether it is asked."""
+    plan: str
+    """Function of a request; returns what its functions need."""
+    excludes: tuple[str, ...] = ()
+    """Flags beside which it is refused."""
+    settings: str = ""
+    """Function of the parsed options and the settings; returns the settings, or refuses both."""
+    setting: str = ""
+    """Setting that asks it, too, as ``table.name``."""
+    records: tuple[str, ...] = ()
+    """Keys of the record, ``None`` in analyses that do not ask it."""
+    comparison: tuple[str, ...] = ()
+    """Names of options that are recorded with sessions and sides."""
+    inputs: Mapping[str, str] = field(default_factory=dict)
+    """Keys of the record of inputs, by the names of options that are paths."""
+    places: Mapping[str, str] = field(default_factory=dict)
+    """Functions of an analysis and the plan, which return the analysis, by place of the line:
+    ``design`` (after it), ``adjust`` (registered maps, before sessions are compared), ``score``
+    (after the fit), ``classify`` (before it)."""
+    blocks: Mapping[str, str] = field(default_factory=dict)
+    """Functions that yield parts of results, by place: ``tables``, ``figures``, ``files``,
+    ``methods`` (before the model), ``methods-after`` (after it), ``record``, ``source`` (of
+    labels that a plan rests on)."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Extension:
     """What a folder adds to the program."""
 
@@ -86,6 +124,7 @@ class Extension:
     commands: tuple[Command, ...] = ()
     parts: tuple[Part, ...] = ()
     questions: tuple[Question, ...] = ()
+    steps: tuple[Step, ...] = ()
     sections: str = ""
     """Sections of the page of an analysis, as ``module:tuple``."""
     has_templates: bool = False
@@ -115,3 +154,8 @@ def find_parts() -> tuple[Part, ...]:
 def find_questions() -> tuple[Question, ...]:
     """Find what extensions can be asked instead of a comparison."""
     return tuple(question for extension in find_extensions() for question in extension.questions)
+
+
+def find_steps() -> tuple[Step, ...]:
+    """Find what extensions add to the line of an analysis."""
+    return tuple(step for extension in find_extensions() for step in extension.steps)

@@ -34,6 +34,7 @@ from hipsta_bids.errors import ModelError
 from hipsta_bids.extensions.consortia import exchange
 from hipsta_bids.group.cohort.data import Cohort, Measures
 from hipsta_bids.group.questions.analysis import analyze_cohort
+from hipsta_bids.group.request import Request
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.stats.arrays import SideMaps
 from hipsta_bids.stats.design import Design
@@ -186,15 +187,16 @@ def export(table: pd.DataFrame, formula: str, random: np.random.Generator) -> st
         ),
     )
     cohort = Cohort(table=table, sides={"L": side}, x=ends, y=ends, units={})
-    analysis = analyze_cohort(
-        cohort,
-        parse_model(model_from_shortcut(formula, ["constant = Intercept"], "attack")),
-        None,
-        settings,
+    request = Request(
+        cohort=cohort,
+        model=parse_model(model_from_shortcut(formula, ["constant = Intercept"], "attack")),
+        groups=None,
+        settings=settings,
         measures=Measures(maps=("thickness",)),
         references={},
         icv="icv" if random.integers(2) else None,
     )
+    analysis = analyze_cohort(request)
     inputs = {"versions": [], "seg": "demo", "region": "body", "settings_hash": "0"}
     with patch.object(exchange, "_model", model_with_coefficients):
         summary, _ = exchange.summarize(cohort, analysis, settings, site="a", inputs=inputs)

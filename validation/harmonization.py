@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import ndimage
 
+from hipsta_bids.extensions.sites.combat import Visits, fit_effects, harmonize
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.stats.arrays import Float, Int
-from hipsta_bids.stats.combat import Visits, fit_effects, harmonize
 from hipsta_bids.stats.contrasts import Contrast
 from hipsta_bids.stats.glm import fit_points
 from hipsta_bids.stats.mixed import fit_mixed

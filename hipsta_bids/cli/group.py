@@ -22,7 +22,7 @@ from hipsta_bids.cli.parser import (
 )
 from hipsta_bids.cli.participant import REGIONS
 from hipsta_bids.errors import ExitCode, NothingToDoError, UsageError
-from hipsta_bids.joints import find_parts, find_questions, load
+from hipsta_bids.joints import find_parts, find_questions, find_steps, load
 from hipsta_bids.participant.pool import processors
 
 if TYPE_CHECKING:
@@ -61,6 +61,8 @@ def group_parser() -> Parser:
     _add_model(parser)
     _add_comparison(parser)
     _add_methods(parser)
+    for step in find_steps():
+        load(step.options)(parser)
     questions.add_questions(parser)
     for part in find_parts():
         adder(parser.add_argument_group(part.heading))(
@@ -239,12 +241,6 @@ def _add_comparison(parser: Parser) -> None:
     )
     add("--paired", "SES1 SES2", "the second session minus the first", type=bids_label("ses-"))
     add("--asymmetry", "", "also maps of left minus right")
-    add(
-        "--normative",
-        "FACTOR=LEVEL",
-        "score each participant against these, as group=CN (w-scores)",
-        type=factor_level,
-    )
 
 
 def _add_methods(parser: Parser) -> None:
@@ -260,18 +256,6 @@ def _add_methods(parser: Parser) -> None:
         "FILE",
         "register to the template.json of another analysis, or that in a summary.json or in a"
         " dataset of a template",
-    )
-    add(
-        "--harmonize",
-        "COLUMN",
-        "remove shifts and scales of sites or scanners (ComBat); effects of the model are "
-        "kept, sites are added to it",
-    )
-    add(
-        "--harmonize-model",
-        "FILE",
-        "harmonize by the harmonization.json of another analysis, its sites or new ones; "
-        "with its --template",
     )
     add(
         "--correction",
@@ -459,7 +443,6 @@ def _settings(parsed: argparse.Namespace) -> "GroupSettings":
         "design": {"mixed": tuple(parsed.mixed) or None},
         "model": {"age": parsed.age_model},
         "longitudinal": {"random": parsed.longitudinal},
-        "harmonization": {"column": parsed.harmonize},
         "classification": {
             "base": tuple(parsed.base) or None,
             "added": () if parsed.no_classification else None,
@@ -474,11 +457,9 @@ def _settings(parsed: argparse.Namespace) -> "GroupSettings":
             choices |= load(question.settings)(parsed)
     settings = load_group_settings(parsed.settings)
     settings = settings.changed(**given_settings(choices))
-    if parsed.harmonize:
-        # The default model has what is harmonized instead of other names of the same.
-        site_names = {"site", "scanner", "center"}
-        names = [name for name in settings.model.covariates if name.casefold() not in site_names]
-        settings = settings.changed(model={"covariates": (*names, parsed.harmonize)})
+    for step in find_steps():
+        if step.settings:
+            settings = load(step.settings)(parsed, settings)
     return settings
 
 
@@ -526,6 +507,7 @@ def _options(parsed: argparse.Namespace, arguments: Sequence[str]) -> "GroupOpti
         surfaces=tuple(parsed.maps_surface),
         measures=tuple(dict.fromkeys(parsed.measures)),
         reports=not parsed.no_reports,
+        further={name: getattr(parsed, name) for step in find_steps() for name in step.names},
         parts=tuple(
             (part, value)
             for part in find_parts()

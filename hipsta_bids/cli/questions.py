@@ -3,11 +3,12 @@
 import argparse
 import math
 from collections.abc import Sequence
+from operator import attrgetter
 from typing import TYPE_CHECKING
 
 from hipsta_bids.cli.parser import Parser, adder, factor_level
 from hipsta_bids.errors import UsageError
-from hipsta_bids.joints import find_parts, find_questions, load
+from hipsta_bids.joints import find_parts, find_questions, find_steps, load
 
 if TYPE_CHECKING:
     from hipsta_bids.group.questions.study import GroupOptions, GroupResult
@@ -15,10 +16,9 @@ if TYPE_CHECKING:
 
 #: Options that only comparisons have.
 _COMPARISON_ONLY = (
-    *("longitudinal", "endpoint", "paired", "asymmetry", "normative", "model", "contrast"),
+    *("longitudinal", "endpoint", "paired", "asymmetry", "model", "contrast"),
     *("permutations", "blocks", "fdr_scope", "base", "no_classification"),
     *("joint", "joint_sides"),
-    *("harmonize", "harmonize_model"),
 )
 
 
@@ -81,15 +81,16 @@ def run_question(
     flags = [_flag(name) for q in questions for name in q.flags if getattr(parsed, name)]
     if len(questions) > 1:
         raise UsageError(f"give one of {', '.join(flags)}")
-    parts = [part.name for part in find_parts()]
-    refuse(parsed, (*_COMPARISON_ONLY, *parts), f"with {' and '.join(flags)}")
+    names = [part.name for part in find_parts()]
+    names += [name for step in find_steps() for name in step.names]
+    refuse(parsed, (*_COMPARISON_ONLY, *names), f"with {' and '.join(flags)}")
     if len(set(parsed.seg)) > 1:
         raise UsageError(f"--seg: name one protocol with {' and '.join(flags)}")
-    if settings.harmonization.column:
-        raise UsageError(
-            f"{' and '.join(flags)}: harmonization is not possible; remove "
-            "harmonization.column from the settings"
-        )
+    for setting in filter(None, (step.setting for step in find_steps())):
+        if attrgetter(setting)(settings):
+            raise UsageError(
+                f"{' and '.join(flags)}: {setting} is not possible; remove it from the settings"
+            )
     (question,) = questions
     for further in find_questions():
         if further is not question:

@@ -145,8 +145,6 @@ class Comparison:
     """Two sessions, with ``ses-``: the second minus the first is analyzed."""
     asymmetry: bool = False
     """Also left minus right."""
-    normative: tuple[str, str] | None = None
-    """Factor and level of the group against which each participant is scored."""
 
     @property
     def suffix(self) -> str:
@@ -167,8 +165,8 @@ class Comparison:
             raise UsageError("give --longitudinal (all sessions) or --paired (two), not both")
         if self.endpoint:
             check_endpoint(self.endpoint)
-            if self.asymmetry or self.normative:
-                raise UsageError("--endpoint: remove --asymmetry and --normative")
+            if self.asymmetry:
+                raise UsageError("--endpoint: remove --asymmetry")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -146,7 +146,7 @@ def group_page(folder: Path) -> str:
         folder=folder.name,
         **heading(record),
         cohort=(folder.parent.parent / DATASET_FILES["report"]).exists(),
-        sections=build_sections((*_further_sections(), *SECTIONS), results, _PREFIX),
+        sections=build_sections(_all_sections(), results, _PREFIX),
     )
 
 
@@ -211,31 +211,6 @@ def _registration(results: GroupResults) -> Mapping[str, Any] | None:
     }
 
 
-def _harmonization(results: GroupResults) -> Mapping[str, Any] | None:
-    """Describe which effects of sites were taken out, and what is left of them."""
-    record = results.record.get("harmonization")
-    if not record:
-        return None
-    alt = "Means and SDs of the residuals of sites over points, before and after harmonization"
-    names = (results.record.get("inputs") or {}).get("maps") or {}
-    pictures = embedded(results, "sites", "Sites before and after harmonization", alt)
-    for name in names:
-        caption = f"Sites before and after harmonization, {cells.display_name(name)}"
-        pictures += embedded(results, f"{name}_sites", caption, alt)
-    sites = results.everywhere("sites")
-    settings = (results.record.get("settings") or {}).get("harmonization") or {}
-    limit = float(settings.get("explained", 1.0))
-    shares = (record.get("explained") or {}).items()
-    return {
-        **record,
-        "rows": records(sites[sites["kind"] == "map"]),
-        "pictures": pictures,
-        "registered": bool(len(results.table("registration"))),
-        "compared": bool(len(results.table("classification"))),
-        "doubtful": [(name, share) for name, share in shares if share > limit],
-    }
-
-
 def _sections_of_groups(results: GroupResults) -> Mapping[str, Any] | None:
     """Show the average cross-sections of the groups."""
     alt = "Average cross-sections of the groups, from posterior to anterior"
@@ -288,10 +263,8 @@ SECTIONS: tuple[Section[GroupResults], ...] = (
     Section("peaks", "Clusters and peaks", "group/peaks.html", group_tables.peaks),
     Section("summaries", "Summary measures", "group/summaries.html", group_tables.summaries),
     Section("classification", "Classification", "group/classification.html", _classification),
-    Section("scores", "w-scores", "group/scores.html", group_tables.scores),
     Section("model", "Model", "group/model.html", design),
     Section("registration", "Registration", "group/registration.html", _registration),
-    Section("harmonization", "Harmonization", "group/harmonization.html", _harmonization),
     Section("sections", "Average cross-sections", "group/sections.html", _sections_of_groups),
     Section("surrogate", "Surrogate thickness", "comparison/table.html", _surrogate),
     Section("methods", "Methods paragraph", "group/methods.html", methods),
@@ -299,11 +272,18 @@ SECTIONS: tuple[Section[GroupResults], ...] = (
 )
 
 
-def _further_sections() -> Iterator[Section[GroupResults]]:
-    """Sections of extensions, which come first."""
-    for extension in find_extensions():
-        if extension.sections:
-            yield from load(extension.sections)
+def _all_sections() -> Iterator[Section[GroupResults]]:
+    """Sections of the core and of extensions, in the order of the page."""
+    further = [
+        section
+        for extension in find_extensions()
+        if extension.sections
+        for section in load(extension.sections)
+    ]
+    yield from (section for section in further if not section.after)
+    for section in SECTIONS:
+        yield section
+        yield from (follower for follower in further if follower.after == section.key)
 
 
 def write_group_report(

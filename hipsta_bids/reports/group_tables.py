@@ -16,7 +16,7 @@ from hipsta_bids.types import DIFFERENCE, FAMILY, JOINT, SIDES, p_text
 _ALPHA = 0.05  # of tests of summary measures and of models, for a word only
 _LEAST_SHARE = 0.01  # share of a map; what survives in less of it is no finding of the same rank
 _VISIBLE_ROWS = 12  # of summary measures in what was found; more are folded
-_MOST_ROWS = 200  # of lists, so that pages stay small
+MOST_ROWS = 200  # of lists, so that pages stay small
 #: Summary measures of the thickness of the whole sheet.
 _THICKNESS = ("thickness_mean", "thickness_nodes")
 #: Tests of demographics by their names in tables.
@@ -299,7 +299,7 @@ def peaks(results: GroupResults) -> Mapping[str, Any] | None:
         return None
     maps = ["measure", "contrast", "hemi"]
     file_of = results.table("maps").set_index(maps)["file"]
-    rows = records(table.assign(number=table.groupby(maps).cumcount() + 1).head(_MOST_ROWS))
+    rows = records(table.assign(number=table.groupby(maps).cumcount() + 1).head(MOST_ROWS))
     for row in rows:
         points = results.table(file_of[row["measure"], row["contrast"], row["hemi"]])
         point = None if row["measure"] == JOINT else point_of(row, points)
@@ -326,8 +326,8 @@ def participants(results: GroupResults) -> Mapping[str, Any]:
         "tests": ", ".join(demographic_tests(table)),
         "ratings": results.record.get("ratings") or {},
         "reasons": list(reasons),
-        "excluded": records(excluded.fillna("").head(_MOST_ROWS)),
-        "more": max(0, len(excluded) - _MOST_ROWS),
+        "excluded": records(excluded.fillna("").head(MOST_ROWS)),
+        "more": max(0, len(excluded) - MOST_ROWS),
     }
 
 
@@ -372,34 +372,3 @@ def summaries(results: GroupResults) -> Mapping[str, Any] | None:
         "slopes": _slopes(results, table),
         "repeated": bool((table["visits"] > table["n"]).any()),
     }
-
-
-def scores(results: GroupResults) -> Mapping[str, Any] | None:
-    """Compare the groups with the reference, and list participants far from it."""
-    table = results.everywhere("wscores")
-    if not len(table):
-        return None
-    level = (results.record.get("comparison") or {}).get("normative") or []
-    whole = table[table["region"].isna() | (table["region"] == "all")]
-    return {
-        "reference": "=".join(str(part) for part in level),
-        "rows": score_rows(whole),
-        "far": far_scores(whole),
-        "limit": cells.FAR,
-    }
-
-
-def score_rows(table: pd.DataFrame) -> list[tuple[str, str, list[pd.Series]]]:
-    """List scores ``w`` by measure and side, of the ``reference`` and of the others."""
-    return [
-        (str(measure), str(hemi), [rows.loc[members, "w"].dropna() for members in (known, ~known)])
-        for (measure, hemi), rows in table.groupby(["measure", "hemi"], sort=False)
-        for known in [rows["reference"].astype(bool)]
-    ]
-
-
-def far_scores(table: pd.DataFrame) -> list[dict[str, Any]]:
-    """List scores ``w`` far from zero, the farthest first."""
-    far = table[table["w"].abs() > cells.FAR]
-    far = far.reindex(far["w"].abs().sort_values(ascending=False, kind="stable").index)
-    return records(far.head(_MOST_ROWS))

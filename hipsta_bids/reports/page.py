@@ -37,6 +37,8 @@ class Section(Generic[_Topic]):
     """File in ``templates/``."""
     build: Callable[[_Topic], Mapping[str, Any] | None]
     """Returns what the template shows; ``None`` leaves the section out."""
+    after: str = ""
+    """Of an extension: anchor of the section that it follows; empty to be first."""
 
 
 def build_sections(

@@ -15,6 +15,7 @@ from types import MappingProxyType
 from typing import NoReturn
 
 import numpy as np
+from formulaic import Formula
 from formulaic.parser.types import Term
 
 from hipsta_bids.errors import UsageError
@@ -312,3 +313,13 @@ class _Call:
         for number, name in enumerate(self.quoted):
             part = part.replace(f"{_PLACEHOLDER}{number}", name)
         _refuse(self.text, part)
+
+
+def without_variable(formula: str, factor: str) -> str:
+    """Remove all terms in which a variable has a part."""
+    terms = [
+        term_text(term)
+        for term in Formula(closed_formula(formula).text)
+        if factor not in closed_formula(term_text(term)).names
+    ]
+    return " + ".join(terms) or "1"

@@ -9,7 +9,7 @@ import xarray as xr
 
 import hipsta_bids as hb
 from hipsta_bids.errors import ModelError
-from hipsta_bids.group.questions.analysis import register_side
+from hipsta_bids.group.questions.aligning import register_side
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.stats.arrays import SideMaps
 

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from hipsta_bids.errors import HipstaError, ModelError, UsageError
 from hipsta_bids.stats.design import build_design
 from hipsta_bids.stats.formula import model_from_shortcut, parse_model
-from hipsta_bids.stats.grammar import closed_formula
+from hipsta_bids.stats.grammar import closed_formula, without_variable
 from hipsta_bids.stats.settings import DesignSettings
 
 N = 40
@@ -313,3 +313,9 @@ def test_watch_sees_what_is_evaluated(monkeypatch):
 def test_names_are_those_of_columns():
     closed = closed_formula("log(`weight in kg`) + C(group, contr.sum):age + I(age*sex)")
     assert closed.names == ("weight in kg", "group", "age", "sex")
+
+
+def test_names_with_blanks_keep_their_backticks():
+    assert without_variable("`age at scan`*`lambda` + group", "group") == (
+        "1 + `age at scan` + `lambda` + `age at scan`:`lambda`"
+    )

@@ -364,7 +364,7 @@ def _check_model(analysis: Analysis, settings: GroupSettings) -> None:
         problem = "of --longitudinal cannot be combined; use --paired"
     elif analysis.model.maps:
         problem = "with map() cannot be combined; remove the term"
-    elif analysis.harmonization is not None:
+    elif analysis.is_adjusted:
         problem = "of harmonized values cannot be combined; leave --harmonize out"
     elif settings.glm.covariance != "ordinary":
         problem = "with HC3 standard errors cannot be combined; exclude these"

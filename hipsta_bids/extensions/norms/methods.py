@@ -1,14 +1,16 @@
 """Methods texts of norms."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import pandas as pd
 
 from hipsta_bids import __version__
+from hipsta_bids.extensions.norms import STEP
 from hipsta_bids.extensions.norms.centiles import CENTILE_FOLDS, LEVELS, SHAPE_LEVEL
 from hipsta_bids.extensions.norms.file import NormsFile
-from hipsta_bids.group.output.citations import Citations, escaped
+from hipsta_bids.group.output.citations import Citations, code, escaped
 from hipsta_bids.group.output.methods import COMMON_SHEETS
+from hipsta_bids.group.output.results import Analysis
 
 Cite = Callable[[str], str]
 """Numbers a work by its key."""
@@ -84,3 +86,17 @@ def norms_text(
             f" {escaped('='.join(controls or ()))}: {counts}. All other parameters were unchanged."
         )
     return cite.page(paragraphs, file.region)
+
+
+def scores_text(analysis: Analysis, cite: Callable[[str], str]) -> Iterator[str]:
+    """Write how participants were scored."""
+    scores, group = analysis.parts[STEP], " ".join(analysis.request.plans[STEP])
+    yield (
+        f"Each participant was scored against {scores.count} participants with {escaped(group)}."
+        " The score (w) was the difference from the value predicted by a linear model"
+        f" {code(scores.formula.removeprefix('1 + '))} of the reference, divided by its residual"
+        f" standard deviation {cite('normative')}."
+        " Members of the reference were scored by the model without themselves. Points were low or"
+        " high if the two-sided p, including the uncertainty of the model, was below"
+        f" {1 - analysis.request.settings.glm.confidence:.2g}."
+    )

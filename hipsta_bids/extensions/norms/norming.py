@@ -15,22 +15,22 @@ from hipsta_bids.derivatives import dataset
 from hipsta_bids.errors import ModelError
 from hipsta_bids.extensions.norms import centiles as normative
 from hipsta_bids.extensions.norms import sums as summed_norms
+from hipsta_bids.extensions.norms.figures import deviation_rows, draw_norms, norm_rows
 from hipsta_bids.extensions.norms.file import NormsFile, load_norms, save_norms
 from hipsta_bids.extensions.norms.methods import norms_text
+from hipsta_bids.extensions.norms.scoring import ScoredMaps, map_rows, score_rows, write_scores
 from hipsta_bids.extensions.norms.sites import with_sums
+from hipsta_bids.extensions.norms.wscores import NormativeScores
 from hipsta_bids.group.cohort.data import SHEET, Cohort, layers
 from hipsta_bids.group.model import BOTH, Comparison
 from hipsta_bids.group.output import write
 from hipsta_bids.group.output.citations import escaped
-from hipsta_bids.group.output.figures import deviation_rows, draw_norms, norm_rows
 from hipsta_bids.group.output.ground import grounds_of
 from hipsta_bids.group.output.panels import draw_pages
-from hipsta_bids.group.output.results import ScoredMaps
 from hipsta_bids.group.output.saved import templates_from_json
 from hipsta_bids.group.output.style import Drawing
 from hipsta_bids.group.questions import study as studies
 from hipsta_bids.group.questions.mixing import with_mixes
-from hipsta_bids.group.questions.scores import map_rows, score_rows
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.io import files
 from hipsta_bids.io.labels import refuse_alike
@@ -40,7 +40,6 @@ from hipsta_bids.stats.arrays import Bool, Float, Int, Key
 from hipsta_bids.stats.design import FIRST_AGE
 from hipsta_bids.stats.formula import check_names, level_labels, listed, typed
 from hipsta_bids.stats.glm import most_frequent, points_of
-from hipsta_bids.stats.scores import NormativeScores
 from hipsta_bids.stats.settings import NormSettings
 from hipsta_bids.stats.warps import Template
 from hipsta_bids.types import PARTICIPANT
@@ -214,7 +213,7 @@ def _write(study: studies.Study, scoring: _Made, notes: Iterable[str]) -> studie
                 if side.maps:
                     write.write_surface(folder, cohort, points_of(side), hemi)
             if scored := scoring.scored.get(surface):
-                write.write_scores(
+                write_scores(
                     folder, cohort, cohort.table, scored, letter="z", sheets=surface == SHEET
                 )
         files.write_text(folder / "methods.md", text)

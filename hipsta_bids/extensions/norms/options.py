@@ -34,6 +34,23 @@ def add_options(parser: Parser) -> None:
     )
 
 
+def add_normative(parser: Parser) -> None:
+    """Add the option of scores within a cohort."""
+    adder(parser.add_argument_group("scores within a cohort"))(
+        "--normative",
+        "FACTOR=LEVEL",
+        "score each participant against these, as group=CN (w-scores)",
+        type=factor_level,
+    )
+
+
+def check_normative(parsed: argparse.Namespace, settings: "GroupSettings") -> "GroupSettings":
+    """Refuse scores of visits of a trial."""
+    if parsed.endpoint and parsed.normative:
+        raise UsageError("--endpoint: not with --normative; remove one of them")
+    return settings
+
+
 def run(
     parsed: argparse.Namespace, options: "GroupOptions", settings: "GroupSettings"
 ) -> "GroupResult":

@@ -6,9 +6,8 @@ from typing import Any
 import pandas as pd
 
 from hipsta_bids.derivatives.analyses import GroupResults, records
-from hipsta_bids.reports import cells
+from hipsta_bids.reports import cells, group_tables
 from hipsta_bids.reports.group_maps import embedded
-from hipsta_bids.reports.group_tables import far_scores, score_rows
 from hipsta_bids.reports.page import Section
 
 
@@ -41,6 +40,38 @@ def norms(results: GroupResults) -> Mapping[str, Any] | None:
     }
 
 
+def scores(results: GroupResults) -> Mapping[str, Any] | None:
+    """Compare the groups with the reference, and list participants far from it."""
+    table = results.everywhere("wscores")
+    if not len(table):
+        return None
+    level = (results.record.get("comparison") or {}).get("normative") or []
+    whole = table[table["region"].isna() | (table["region"] == "all")]
+    return {
+        "reference": "=".join(str(part) for part in level),
+        "rows": score_rows(whole),
+        "far": far_scores(whole),
+        "limit": cells.FAR,
+    }
+
+
+def score_rows(table: pd.DataFrame) -> list[tuple[str, str, list[pd.Series]]]:
+    """List scores ``w`` by measure and side, of the ``reference`` and of the others."""
+    return [
+        (str(measure), str(hemi), [rows.loc[members, "w"].dropna() for members in (known, ~known)])
+        for (measure, hemi), rows in table.groupby(["measure", "hemi"], sort=False)
+        for known in [rows["reference"].astype(bool)]
+    ]
+
+
+def far_scores(table: pd.DataFrame) -> list[dict[str, Any]]:
+    """List scores ``w`` far from zero, the farthest first."""
+    far = table[table["w"].abs() > cells.FAR]
+    far = far.reindex(far["w"].abs().sort_values(ascending=False, kind="stable").index)
+    return records(far.head(group_tables.MOST_ROWS))
+
+
 SECTIONS: tuple[Section[GroupResults], ...] = (
     Section("norms", "Norms", "group/norms.html", norms),
+    Section("scores", "w-scores", "group/scores.html", scores, after="classification"),
 )

@@ -10,7 +10,7 @@ import numpy as np
 
 from hipsta_bids.extensions.norms.centiles import Norms, People, age_columns
 from hipsta_bids.stats.arrays import Bool, Float
-from hipsta_bids.stats.combat import solve_points
+from hipsta_bids.stats.solve import solve_points
 
 #: Steps of the fits, and the relative change of weights that ends them.
 _STEPS, _SETTLED = 50, 1e-12

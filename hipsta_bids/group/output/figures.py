@@ -17,17 +17,16 @@ import pandas as pd
 from hipsta_bids.derivatives.analyses import GroupResults, records
 from hipsta_bids.group.cohort.data import SHEET, Cohort
 from hipsta_bids.group.output import panels, style
-from hipsta_bids.group.output.color_bar import spanned
 from hipsta_bids.group.output.maps import draw_alignment, draw_measure
-from hipsta_bids.group.output.results import Analysis, ScoredMaps
+from hipsta_bids.group.output.results import Analysis
 from hipsta_bids.group.output.shapes import AverageShape
 from hipsta_bids.group.output.slices import draw_surrogate
+from hipsta_bids.group.output.steps import blocks
 from hipsta_bids.io.files import MISSING
-from hipsta_bids.reports import display
 from hipsta_bids.reports.cells import display_name, with_brackets
-from hipsta_bids.reports.display import COLORS, HEMISPHERE_COLORS, X_ENDS, kind_of
+from hipsta_bids.reports.display import COLORS, HEMISPHERE_COLORS, X_ENDS
 from hipsta_bids.reports.group_maps import MOST_FIGURES, measures_of
-from hipsta_bids.stats.arrays import Float, describe_known, mean_of_known
+from hipsta_bids.stats.arrays import Float, describe_known
 from hipsta_bids.stats.glm import FittedMaps
 from hipsta_bids.types import PARTICIPANT, SIDES, parts_of
 
@@ -42,9 +41,6 @@ _STYLES = ("-", ":", "-")
 _SCREEN = 150  # dots per inch of pictures that the page alone shows
 _SIDE_MARK = "\t"  # of entries of legends that have no line
 _MOST_LINES = 500  # of single warps on a panel: more hide each other
-
-#: Deviation of the 5th centile.
-_LOW = -1.645
 
 
 def mark_medial(axis: "Axes", x: Float) -> None:
@@ -348,50 +344,6 @@ def _mark_subfields(axis: "Axes", layers: Float, fitted: FittedMaps, node: int) 
             axis.text(x, y, name, fontsize=style.SMALL, ha="center", va="center", bbox=box)
 
 
-def draw_sites(cohort: Cohort, analysis: Analysis) -> "list[Figure]":
-    """Draw means and SDs of the residuals of sites over points, before and after harmonization."""
-    harmonization = analysis.harmonization
-    if harmonization is None:
-        raise ValueError("nothing was harmonized")
-    shown_sites = [site for site in harmonization.plan.sites if site in harmonization.plan.counts]
-    height = 2 * (20 + 5 * len(shown_sites))
-    maps = {key: pair for key, pair in harmonization.effects.items() if key[0] == "map"}
-    figure, axes = style.new_panels(2, len(maps), (style.TWO_COLUMNS, height))
-    for j, ((_, hemi, measure), (effects, moments)) in enumerate(maps.items()):
-        states = {"before": moments, "after": moments.after(effects)}
-        unit = cohort.units.get(measure, "1")
-        for number, (name, state) in enumerate(states.items()):
-            for axis, values in ((axes[0, j], state.mean * effects.sd), (axes[1, j], state.sd)):
-                for row, site in enumerate(shown_sites):
-                    _spread(axis, values[harmonization.plan.sites.index(site)], row, number, name)
-        for axis, label, ideal in (
-            (axes[0, j], f"mean, {display_name(measure)} [{unit}]", 0.0),
-            (axes[1, j], "SD, over the SD of all", 1.0),
-        ):
-            axis.axvline(ideal, color="black", linewidth=0.5)
-            axis.set_yticks(
-                range(len(shown_sites)), shown_sites if j == 0 else [""] * len(shown_sites)
-            )
-            axis.set_ylim(len(shown_sites) - 0.5, -0.5)
-            axis.locator_params(axis="x", nbins=4)
-            axis.set_xlabel(label)
-        axes[0, j].set_title(f"{display_name(measure)}, {SIDES[hemi]}")
-    style.explain(figure, axes[0, 0])
-    return [figure]
-
-
-def _spread(axis: "Axes", values: Float, row: int, number: int, name: str) -> None:
-    """Draw the 5th to the 95th percentile, the quartiles and the median of points as lines."""
-    finite = values[np.isfinite(values)]
-    if not finite.size:
-        return
-    low, first, middle, third, high = np.percentile(finite, [5, 25, 50, 75, 95])
-    y, color = row - 0.16 + 0.32 * number, ("0.6", COLORS[0])[number]
-    axis.plot([low, high], [y, y], color=color, linewidth=1.0)
-    axis.plot([first, third], [y, y], color=color, linewidth=4.5, label=name, solid_capstyle="butt")
-    axis.plot([middle], [y], "|", color="white", markersize=4.5)
-
-
 def draw_norms(lines: pd.DataFrame, dots: pd.DataFrame) -> "list[Figure]":
     """Draw centiles over age, a row for each sex, a column for each side, and participants.
 
@@ -438,47 +390,6 @@ def draw_norms(lines: pd.DataFrame, dots: pd.DataFrame) -> "list[Figure]":
     return [figure]
 
 
-def norm_rows(
-    centers: Mapping[str, tuple[Float, Float]], age: float, measure: str, unit: str
-) -> Iterator[panels.Row]:
-    """Show mean and SD of norms by side, at an age."""
-    kind = kind_of(measure)
-    for i, (quantity, colors) in enumerate({"mean": kind.colors, "SD": "magma"}.items()):
-        values = {hemi: pair[i].ravel() for hemi, pair in centers.items()}
-        scale = spanned(colors, values)
-        if kind.centered and quantity == "mean":
-            low, high = display.span_of(kind, list(values.values()))
-            scale = {"cmap": colors, "vmin": low, "vmax": high}
-        title = f"{quantity[0].upper()}{quantity[1:]} at {age:g} years"
-        label = with_brackets(f"{quantity},\n{display_name(measure)}", unit)
-        yield panels.Row(
-            kind="expected", index=i, title=title, label=label, scale=scale, values=values
-        )
-
-
-def deviation_rows(scored: Mapping[str, ScoredMaps], measure: str) -> Iterator[panels.Row]:
-    """Show mean deviations, and shares of low ones, of participants whom no site was adapted to."""
-    z = {
-        hemi: side.scores[measure].w[~side.reference]
-        for hemi, side in scored.items()
-        if measure in side.scores
-    }
-    means = {hemi: mean_of_known(own, 0) for hemi, own in z.items()}
-    below = _LOW
-    low = {
-        hemi: 100 * mean_of_known(np.where(np.isfinite(own), own < below, np.nan), 0)
-        for hemi, own in z.items()
-    }
-    reach = max(1.0, *(np.nanmax(np.abs(one), initial=0.0) for one in means.values()))
-    highest = max(20.0, *(np.nanmax(one, initial=0.0) for one in low.values()))
-    for kind, title, label, colors, ends, values in (
-        ("effect", "Mean deviation", "mean z", "RdBu_r", (-reach, reach), means),
-        ("error", "Below the 5th centile", "participants [%]", "magma", (0.0, highest), low),
-    ):
-        scale: dict[str, Any] = {"cmap": colors, "vmin": ends[0], "vmax": ends[1]}
-        yield panels.Row(kind=kind, index=0, title=title, label=label, scale=scale, values=values)
-
-
 def draw_figures(
     saved: GroupResults,
     cohorts: Mapping[str, Cohort],
@@ -493,9 +404,7 @@ def draw_figures(
     for measure in measures:
         yield f"{measure}_maps", partial(draw_measure, saved, measure, views, dpi)
     for surface, analysis in analyses.items():
-        if analysis.harmonization is not None and analysis.fitted:
-            name = "sites" if analysis.registered else f"{next(iter(analysis.measured.maps))}_sites"
-            yield name, partial(draw_sites, cohorts[surface], analysis)
+        yield from blocks("figures", analysis.request, cohorts[surface], analysis)
     analysis = analyses[SHEET]
     templates = [one.template for one in analysis.registrations.values()]
     if templates and None not in templates:

@@ -13,6 +13,7 @@ from hipsta_bids.group.cohort.data import SIZES, Cohort
 from hipsta_bids.group.cohort.read import LEAST_SHARE
 from hipsta_bids.group.output.citations import Citations, code, escaped, joined
 from hipsta_bids.group.output.results import Analysis
+from hipsta_bids.group.output.steps import blocks
 from hipsta_bids.group.output.tables import opposite_notes
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.protocols import EXPERIMENTAL
@@ -76,14 +77,12 @@ def methods_text(
         paragraphs.append(" ".join(aligned))
     if region in EXPERIMENTAL and analysis.fitted:
         paragraphs.append(_rims(analysis))
-    paragraphs += _harmonization(analysis, settings, cite)
+    paragraphs += blocks("methods", analysis.request, analysis, cite)
     paragraphs.append(_models(analysis, settings, cite))
     paragraphs += [_joint(settings, cite)] if settings.joint.measures else []
     if analysis.comparison.asymmetry:
         paragraphs.append(_asymmetry(analysis, settings, cite))
-    if analysis.reference is not None:
-        group = " ".join(analysis.comparison.normative or ())
-        paragraphs.append(_normative(*analysis.reference, group, settings, cite("normative")))
+    paragraphs += blocks("methods-after", analysis.request, analysis, cite)
     if analysis.pairs:
         paragraphs.append(_classification(analysis, settings, cite))
     if analysis.found:
@@ -197,55 +196,6 @@ def _rims(analysis: Analysis) -> str:
         f"{span}. Profiles for registration were means of available values, interpolated at"
         " positions without any."
     )
-
-
-def _harmonization(
-    analysis: Analysis, settings: GroupSettings, cite: Callable[[str], str]
-) -> list[str]:
-    harmonization = analysis.harmonization
-    if harmonization is None:
-        return []
-    plan = harmonization.plan
-    counts = ", ".join(f"{escaped(site)} {n}" for site, n in plan.counts.items())
-    column = escaped(plan.column)
-    sources = f"{cite('johnson')}, {cite('combat')}"
-    preserved = code(plan.formula) if plan.names else "no variable"
-    if plan.icv is not None:
-        preserved += f", and for {SIZES} also {escaped(plan.icv)}"
-    text = (
-        f"Effects of {column} ({counts} participants) on"
-        f"{' registered' if analysis.registered else ''} maps and summary measures were removed by"
-        f" ComBat {sources}. ComBat estimated a shift and a scale of each {column} from the"
-        f" residuals of a linear model at each point, and preserved {preserved}."
-    )
-    if plan.estimated and settings.harmonization.pooling:
-        text += (
-            " Shifts and scales were pooled over the points of each map by empirical Bayes;"
-            " summary measures were harmonized separately."
-        )
-    if plan.visits.participant is not None:
-        text += (
-            " Random intercepts of participants were preserved; the scale describes variation"
-            f" within participants {cite('beer')}."
-        )
-    if plan.saved is not None:
-        saved_sites = sum(site in plan.saved.sites for site in plan.counts)
-        text += f" Parameters of {saved_sites} levels were taken from an earlier analysis"
-        new = escaped(", ".join(plan.estimated))
-        text += f"; parameters of {new} were estimated here." if new else "."
-    if plan.estimated and not analysis.comparison.pair:
-        columns_lost = len(plan.counts) - 1
-        text += (
-            f" Because shifts were estimated from the same participants, {column} was also a factor"
-            f" of the model, at a cost of {columns_lost}"
-            f" degree{'s' if columns_lost > 1 else ''} of freedom {cite('nygaard')}."
-        )
-    if analysis.pairs and analysis.groups and harmonization.leaks(analysis.groups.column):
-        text += (
-            " Classifiers used the measures before harmonization, because parameters estimated"
-            " with known groups would leak group membership into the cross-validation."
-        )
-    return [text]
 
 
 def _models(analysis: Analysis, settings: GroupSettings, cite: Callable[[str], str]) -> str:
@@ -470,20 +420,6 @@ def _asymmetry(analysis: Analysis, settings: GroupSettings, cite: Citations) -> 
     return (
         f"{definition} Points of the registered sheets correspond between sides. The contrast"
         " `mean` tested the mean asymmetry of all participants."
-    )
-
-
-def _normative(
-    formula: str, n_reference: int, group: str, settings: GroupSettings, source: str
-) -> str:
-    return (
-        f"Each participant was scored against {n_reference} participants with {escaped(group)}. The"
-        " score (w) was the difference from the value predicted by a linear model"
-        f" {code(formula.removeprefix('1 + '))} of the reference, divided by its residual standard"
-        f" deviation {source}."
-        " Members of the reference were scored by the model without themselves. Points were low or"
-        " high if the two-sided p, including the uncertainty of the model, was below"
-        f" {1 - settings.glm.confidence:.2g}."
     )
 
 

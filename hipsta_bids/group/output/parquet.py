@@ -9,17 +9,16 @@ import pyarrow as pa
 from pyarrow import parquet as pq
 
 from hipsta_bids.group.cohort.data import SHEET, Cohort
-from hipsta_bids.group.output import results
 from hipsta_bids.io import files
 from hipsta_bids.stats.arrays import Float, Int, SideMaps, blocks, some_sheets
 from hipsta_bids.types import PARTICIPANT, SESSION
 
 #: Name of the surface of the sheets in files.
 _SHEET_NAME = "sheet"
-#: Values per row group of maps, and participants per row group of scores; bounds the memory.
-_BLOCK, _ROWS_OF_SCORES = 500_000, 500
+#: Values per row group of maps; bounds the memory.
+_BLOCK = 500_000
 
-_WORD = pa.dictionary(pa.int32(), pa.string())
+WORD = pa.dictionary(pa.int32(), pa.string())
 _SUFFIXES = {
     "": "as measured",
     "_registered": "after registration",
@@ -36,9 +35,9 @@ def write_maps(
 
     The states of the sheets are before and after each step; none without sheets.
     """
-    fields = [pa.field(name, _WORD) for name in (PARTICIPANT, SESSION, "hemi")]
+    fields = [pa.field(name, WORD) for name in (PARTICIPANT, SESSION, "hemi")]
     about = {"description": f"{_SHEET_NAME}, or the name of maps with points of their own"}
-    fields.append(pa.field("surface", _WORD, metadata=about))
+    fields.append(pa.field("surface", WORD, metadata=about))
     about = {"description": "point of the surface, the first is 0; on the sheet y is the faster"}
     fields.append(pa.field("vertex", pa.int32(), metadata=about))
     about = {"description": "node of the sheet, the first is 1"}
@@ -48,7 +47,7 @@ def write_maps(
     measures = list(next(iter(states[0].values())).maps) if states else []
     for suffix, text in list(_SUFFIXES.items())[: len(states)]:
         if suffix != "_harmonized":
-            fields.append(pa.field(f"subfield{suffix}", _WORD, metadata={"description": text}))
+            fields.append(pa.field(f"subfield{suffix}", WORD, metadata={"description": text}))
         fields += [_number(f"{name}{suffix}", cohorts[SHEET], name, text) for name in measures]
     fields += [
         _number(name, one, name, "as given") for name, one in cohorts.items() if name != SHEET
@@ -58,7 +57,7 @@ def write_maps(
         "y posterior to anterior; empty without the measure"
     }
     rows = _map_blocks(cohorts, states)
-    _write(path, pa.schema(fields, metadata=about), rows)
+    write_blocks(path, pa.schema(fields, metadata=about), rows)
 
 
 def _number(column: str, cohort: Cohort, measure: str, text: str) -> pa.Field:
@@ -66,8 +65,8 @@ def _number(column: str, cohort: Cohort, measure: str, text: str) -> pa.Field:
     return pa.field(column, pa.float32(), metadata=about)
 
 
-def _write(path: Path, schema: pa.Schema, rows: Iterable[Columns]) -> None:
-    """Write blocks of columns; those that a block lacks are empty.
+def write_blocks(path: Path, schema: pa.Schema, rows: Iterable[Columns]) -> None:
+    """Write blocks of columns; a column that a block lacks is empty.
 
     Measured values hardly repeat: a dictionary of them takes longer than it saves.
     """
@@ -96,22 +95,22 @@ def _map_blocks(
             for part in blocks(len(side.rows), max(_BLOCK // points, 1)):
                 rows = side.rows[part]
                 name = surface or _SHEET_NAME
-                columns = _visit_columns(cohort.table, rows, points, hemi=hemi, surface=name)
+                columns = visit_columns(cohort.table, rows, points, hemi=hemi, surface=name)
                 vertices = np.tile(np.arange(points, dtype=np.int32), len(rows))
                 columns["vertex"] = pa.array(vertices)
                 if side.mesh is None:
-                    columns |= _node_columns(cohort, side.shape, len(rows))
+                    columns |= node_columns(cohort, side.shape, len(rows))
                 if surface == SHEET:
                     for suffix, state in zip(_SUFFIXES, states, strict=False):
                         columns[f"subfield{suffix}"] = _subfields(state[hemi], part)
                         own_maps = some_sheets(state[hemi].maps, part)
-                        columns |= _value_columns(own_maps, slice(None), suffix)
+                        columns |= value_columns(own_maps, slice(None), suffix)
                 else:
-                    columns |= _value_columns(side.maps, part)
+                    columns |= value_columns(side.maps, part)
                 yield columns
 
 
-def _visit_columns(table: pd.DataFrame, rows: Int, points: int, **words: str) -> Columns:
+def visit_columns(table: pd.DataFrame, rows: Int, points: int, **words: str) -> Columns:
     """Participants and sessions of all points of some rows, and words that all have."""
     visits = table.iloc[rows]
     texts = {
@@ -126,7 +125,7 @@ def _visit_columns(table: pd.DataFrame, rows: Int, points: int, **words: str) ->
     }
 
 
-def _node_columns(cohort: Cohort, shape: tuple[int, int], n_rows: int) -> Columns:
+def node_columns(cohort: Cohort, shape: tuple[int, int], n_rows: int) -> Columns:
     """Nodes of the sheet and their coordinates, for some rows."""
     x, y = np.divmod(np.tile(np.arange(shape[0] * shape[1]), n_rows), shape[1])
     return {
@@ -137,7 +136,8 @@ def _node_columns(cohort: Cohort, shape: tuple[int, int], n_rows: int) -> Column
     }
 
 
-def _value_columns(maps: Mapping[str, Float], part: slice, suffix: str = "") -> Columns:
+def value_columns(maps: Mapping[str, Float], part: slice, suffix: str = "") -> Columns:
+    """Values of maps at all points of some rows."""
     return {
         f"{name}{suffix}": pa.array(values[part].ravel(), pa.float32(), from_pandas=True)
         for name, values in maps.items()
@@ -148,33 +148,3 @@ def _subfields(side: SideMaps, part: slice) -> pa.Array:
     codes = side.subfield[part].ravel().astype(np.int32)
     indices = pa.array(codes, pa.int32(), mask=codes < 0)
     return pa.DictionaryArray.from_arrays(indices, pa.array(side.names, pa.string()))
-
-
-def write_scores(
-    folder: Path,
-    cohort: Cohort,
-    table: pd.DataFrame,
-    sides: Mapping[str, results.ScoredMaps],
-    letter: str,
-) -> None:
-    """Write each participant's scores at the points of the sheet."""
-    shape = len(cohort.x), len(cohort.y)
-    measures = list(next(iter(sides.values())).scores)
-    about = {"unit": "1"}
-    fields = [pa.field(name, _WORD) for name in (PARTICIPANT, SESSION, "hemi")]
-    fields += [pa.field(name, pa.int16()) for name in ("node_x", "node_y")]
-    fields += [pa.field(f"{name}_{letter}", pa.float32(), metadata=about) for name in measures]
-    about = {
-        "description": f"{letter}-scores, one row per participant, hemisphere and registered "
-        "node; nodes from medial to lateral, posterior to anterior"
-    }
-    rows = (
-        {
-            **_visit_columns(table, side.rows[part], shape[0] * shape[1], hemi=hemi),
-            **_node_columns(cohort, shape, len(side.rows[part])),
-            **_value_columns({n: one.w for n, one in side.scores.items()}, part, f"_{letter}"),
-        }
-        for hemi, side in sides.items()
-        for part in blocks(len(side.rows), _ROWS_OF_SCORES)
-    )
-    _write(folder / f"{letter}scores.parquet", pa.schema(fields, metadata=about), rows)

@@ -12,10 +12,11 @@ import pandas as pd
 from hipsta_bids.group.cohort.data import Cohort, hemispheres, participants_with, summary_values
 from hipsta_bids.group.output import columns, results
 from hipsta_bids.group.output.columns import find_clusters, frame_of
+from hipsta_bids.group.output.steps import blocks
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.reports import cells
 from hipsta_bids.reports.group_tables import opposite_changes
-from hipsta_bids.stats.arrays import Float, describe_known, mean_of_known
+from hipsta_bids.stats.arrays import Float, describe_known
 from hipsta_bids.stats.classify import ClassifierResult
 from hipsta_bids.stats.clusters import edges_of
 from hipsta_bids.stats.formula import file_label
@@ -60,13 +61,11 @@ def result_tables(
         yield f"{prefix}means", _stacked(_means(cohort, analysis))
     if analysis.registrations:
         yield from _registration_tables(cohort, analysis)
-    yield from _sites(f"{prefix}sites", cohort, analysis)
     if analysis.measures:
         yield "measures", summary_tests(cohort, analysis, settings)
         if analysis.groups is not None:
             yield "descriptives", _stacked(_descriptives(analysis))
-    if len(analysis.scores):
-        yield f"{prefix}wscores", analysis.scores
+    yield from blocks("tables", analysis.request, cohort, analysis, prefix)
     if analysis.pairs:
         yield "classification", _classification(analysis, settings)
         yield "roc", _stacked(_curves(analysis, _roc))
@@ -336,44 +335,6 @@ def _warps(cohort: Cohort, registrations: Mapping[str, Registration]) -> Iterato
             "extreme": result.extreme,
             **{f"node_{i}": column for i, column in enumerate(result.warps.T, start=1)},
         }
-
-
-def _sites(name: str, cohort: Cohort, analysis: results.Analysis) -> Iterator[Named]:
-    harmonization = analysis.harmonization
-    if harmonization is not None and (rows := list(_site_rows(harmonization, cohort.units))):
-        yield name, pd.DataFrame(rows)
-
-
-def _site_rows(harmonization: results.Harmonization, units: Mapping[str, str]) -> Iterator[Columns]:
-    """List shifts and scales of sites: means over the points of a map, or of a summary measure."""
-    for (kind, hemi, measure), (effects, moments) in harmonization.effects.items():
-        shift, after = effects.shift * effects.sd, moments.after(effects)
-        for number, site in enumerate(harmonization.plan.sites):
-            if moments.n[number].any():
-                yield {
-                    "measure": measure,
-                    "unit": units.get(measure, "1"),
-                    "kind": kind,
-                    "hemi": hemi,
-                    "site": site,
-                    "estimated": site in harmonization.plan.estimated,
-                    "n": int(moments.n[number].max()),
-                    "site_shift": _mean_known(shift[number]),
-                    "site_shift_rms": _root_mean_square(shift[number]),
-                    "site_scale": _mean_known(effects.scale[number]),
-                    "offset_before": _root_mean_square(moments.mean[number]),
-                    "offset_after": _root_mean_square(after.mean[number]),
-                    "spread_before": _mean_known(moments.sd[number]),
-                    "spread_after": _mean_known(after.sd[number]),
-                }
-
-
-def _mean_known(values: Float) -> float:
-    return float(mean_of_known(values, 0))
-
-
-def _root_mean_square(values: Float) -> float:
-    return float(np.sqrt(mean_of_known(values**2, 0)))
 
 
 def _curves(analysis: results.Analysis, curve: CurveOf) -> Iterator[Columns]:

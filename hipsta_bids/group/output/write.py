@@ -25,12 +25,14 @@ from hipsta_bids.group.output.demographics import demographics_of
 from hipsta_bids.group.output.figures import draw_figures
 from hipsta_bids.group.output.methods import methods_text
 from hipsta_bids.group.output.shapes import AverageShape
+from hipsta_bids.group.output.steps import blocks
 from hipsta_bids.group.output.style import KINDS, Drawing, encode
 from hipsta_bids.group.output.tables import JointMap, joint_peaks, joint_points
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.io import files, gifti
 from hipsta_bids.progress import tell
-from hipsta_bids.stats.arrays import Float, blocks, return_memory
+from hipsta_bids.stats.arrays import Float, return_memory
+from hipsta_bids.stats.arrays import blocks as split_rows
 from hipsta_bids.stats.glm import FittedMaps, PointTest
 from hipsta_bids.stats.inference import Discoveries, MapKey
 from hipsta_bids.types import FAMILY, JOINT, PARTICIPANT, SESSION
@@ -103,25 +105,21 @@ def write_results(
     write_table(folder, "demographics", people, meaning=tables.DEMOGRAPHIC_COLUMNS)
     write_table(folder, "design", tables.design_table(analysis), described=False)
     registered = analysis.registered
-    if (registered or len(cohorts) > 1) and _parquet_possible():
+    if (registered or len(cohorts) > 1) and can_write_parquet():
         from hipsta_bids.group.output import parquet  # noqa: PLC0415  (an optional extra)
 
         states = [cohort.sides, registered]
-        if analysis.harmonization is not None:
-            states.append(analysis.harmonization.cohort.sides)
+        if analysis.is_adjusted:
+            states.append(analysis.cohort.sides)
         parquet.write_maps(folder / "maps.parquet", cohorts, states if registered else [])
     if templates := results.templates_of(analysis.registrations):
         files.write_json(folder / "template.json", templates)
-    if analysis.harmonization is not None:
-        parts = [one.harmonization for one in analyses.values() if one.harmonization is not None]
-        if effects := results.effects_of(parts, results.digests(analysis.registrations)):
-            effects = effects.model_copy(update={"labels": dict(labels)})
-            files.write_json(folder / "harmonization.json", effects.model_dump(by_alias=True))
-    for surface, one in analyses.items():
-        _write_surfaces(folder, cohorts[surface], one)
-        write_stats(folder, stats_of(results.tested_maps(one)), _about_tests(one, settings))
-        table, sheets = one.compared.table, bool(one.registered)
-        write_scores(folder, cohorts[surface], table, one.scored, letter="w", sheets=sheets)
+    for surface, of_surface in analyses.items():
+        _write_surfaces(folder, cohorts[surface], of_surface)
+        tests = stats_of(results.tested_maps(of_surface))
+        write_stats(folder, tests, _about_tests(of_surface, settings))
+    for write in blocks("files", analysis.request, cohorts, analyses, labels):
+        write(folder)
     _write_joint(folder, joint, settings, averages)
     text = methods_text(
         cohort,
@@ -201,7 +199,7 @@ def write_table(
     """Write a table, with a sidecar unless the columns are the user's or the model's."""
     columns = [str(column) for column in table.columns]
     lines = ["\t".join(columns)]
-    for part in blocks(len(table), _ROWS):
+    for part in split_rows(len(table), _ROWS):
         rows = zip(*(_cells(values.iloc[part]) for _, values in table.items()), strict=True)
         lines += map("\t".join, rows)
     files.write_text(folder / f"{name}.tsv", "\n".join(lines) + "\n")
@@ -364,33 +362,9 @@ def write_surface(folder: Path, cohort: Cohort, fitted: FittedMaps, hemi: str) -
     files.write_bytes(folder / f"hemi-{hemi}_space-{space}_midthickness.surf.gii", content)
 
 
-def write_scores(
-    folder: Path,
-    cohort: Cohort,
-    table: pd.DataFrame,
-    sides: Mapping[str, results.ScoredMaps],
-    *,
-    letter: str,
-    sheets: bool,
-) -> None:
-    """Write each participant's scores as maps; maps of the sheet also as one Parquet file."""
-    for hemi, side in sides.items():
-        names = [str(name) for name in table.index[side.rows]]
-        for measure, scored in side.scores.items():
-            content = gifti.maps_bytes(scored.w.T, hemi=hemi, names=names, series=False)
-            name = (
-                f"hemi-{hemi}_stat-{letter}_desc-{tables.entity_label(measure)}_statmap.shape.gii"
-            )
-            files.write_bytes(folder / name, content)
-    if sheets and sides and _parquet_possible():
-        from hipsta_bids.group.output import parquet  # noqa: PLC0415  (an optional extra)
-
-        parquet.write_scores(folder, cohort, table, sides, letter)
-
-
 @cache
-def _parquet_possible() -> bool:
-    """Return whether pyarrow is installed; say once what is missing without it."""
+def can_write_parquet() -> bool:
+    """Return whether pyarrow is installed; report once which files are missing without it."""
     possible = find_spec("pyarrow") is not None
     if not possible:
         _LOGGER.info(

@@ -27,10 +27,10 @@ from hipsta_bids.group.output.results import templates_of
 from hipsta_bids.group.output.saved import templates_from_json
 from hipsta_bids.group.output.tables import DEMOGRAPHIC_COLUMNS, registration_tables
 from hipsta_bids.group.output.template import template_file
-from hipsta_bids.group.questions import analysis
+from hipsta_bids.group.questions.aligning import register_side
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.io import files
-from hipsta_bids.joints import Part
+from hipsta_bids.joints import Part, find_steps
 from hipsta_bids.progress import each, tell
 from hipsta_bids.protocols.toml import resolve
 from hipsta_bids.stats.arrays import Bool
@@ -64,11 +64,11 @@ class GroupOptions:
     measures: tuple[str, ...] = ()
     """What to fit the model to; empty for the default or the formula's left-hand side."""
     template: Path | None = None
-    harmonize_model: Path | None = None
-    """Parameters of the harmonization of another analysis."""
     comparison: modeling.Comparison = field(default_factory=modeling.Comparison)
     parts: tuple[tuple[Part, str], ...] = ()
     """Parts of the results that extensions add, and the values of their options."""
+    further: Mapping[str, Any] = field(default_factory=dict)
+    """Values of the options of steps of extensions, by their names in Python."""
     allow_missing: bool = False
     """Whether many participants may be without a row in participants.tsv."""
     part: str = ""
@@ -191,7 +191,7 @@ class Study:
         cohort = self.cohort
         with_maps = list(cohort.sides) if self.measures.maps else []
         sides = {
-            hemi: analysis.register_side(
+            hemi: register_side(
                 cohort, hemi, groups=None, settings=self.settings, templates=templates
             )
             for hemi in each("registration", with_maps)
@@ -269,7 +269,7 @@ class Study:
                     "volumes": dict(options.volumes),
                     "covariates": [str(path) for path in options.covariates],
                     "template": options.template and str(options.template),
-                    "harmonization": options.harmonize_model and str(options.harmonize_model),
+                    **_further_inputs(options),
                 },
                 "mixes": self.mixes,
                 **fill(folder),
@@ -464,6 +464,13 @@ def _describe_dataset(options: GroupOptions) -> None:
         names = dataset.source_names((root.resolve().name, root) for root in roots)
         dataset.write_description(options.out_dir, names)
     dataset.write_notes(options.out_dir)
+
+
+def _further_inputs(options: GroupOptions) -> dict[str, str | None]:
+    """Record the files that options of extensions name."""
+    names = {key: name for step in find_steps() for name, key in step.inputs.items()}
+    paths = {key: options.further.get(name) for key, name in names.items()}
+    return {key: path and str(path) for key, path in paths.items()}
 
 
 def read_templates(path: Path | None, cohort: Cohort) -> Mapping[str, Template] | None:

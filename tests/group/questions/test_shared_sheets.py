@@ -15,7 +15,7 @@ from hipsta_bids.group.cohort.collect import (
     grid_of,
 )
 from hipsta_bids.group.cohort.data import Cohort
-from hipsta_bids.group.questions.analysis import register_side
+from hipsta_bids.group.questions.aligning import register_side
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.settings import SheetSettings
 from hipsta_bids.stats.arrays import SideMaps

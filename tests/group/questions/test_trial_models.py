@@ -234,12 +234,12 @@ def test_equivalence_has_two_sides_of_one_difference(trial, capsys):
         (
             ["--longitudinal", "visits", "--correction", "permutation-max"],
             65,
-            "--longitudinal visits: not with --correction permutation-max; remove it",
+            "--longitudinal visits: not with --correction by permutation; remove one of them",
         ),
         (
             ["--endpoint", "mmrm", *SESSIONS, "--correction", "permutation-tfce"],
             65,
-            "--endpoint mmrm: not with --correction permutation-tfce; remove it",
+            "--endpoint: not with --correction by permutation; remove one of them",
         ),
         (
             ["--longitudinal", "visits", "--formula", "arm * visit + map(curvature)"],
@@ -255,7 +255,11 @@ def test_equivalence_has_two_sides_of_one_difference(trial, capsys):
             "one-sided tests are not permuted",
         ),
         (["--contrast", "age > 0.1", "--measures", "curvature"], 65, "a margin has one unit"),
-        (["--endpoint", "mmrm", *SESSIONS, "--harmonize", "arm"], 65, "not with --harmonize"),
+        (
+            ["--endpoint", "mmrm", *SESSIONS, "--harmonize", "arm"],
+            65,
+            "--harmonize: not with --endpoint",
+        ),
         pytest.param(
             ["--endpoint", "mmrm", "base", "m12", "--retest"],
             64,

@@ -21,11 +21,12 @@ from small_cohorts import (
 )
 
 from hipsta_bids.cli.main import main
+from hipsta_bids.extensions.sites.harmonize import harmonize_cohort
+from hipsta_bids.extensions.sites.output import draw_sites
+from hipsta_bids.extensions.sites.planning import plan_sites
 from hipsta_bids.group.cohort.data import Cohort, Measures
-from hipsta_bids.group.model import Comparison
 from hipsta_bids.group.output import write
-from hipsta_bids.group.output.figures import draw_sites
-from hipsta_bids.group.questions.harmonize import harmonize_cohort, plan_sites
+from hipsta_bids.group.request import Request
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.io import files
 from hipsta_bids.reports.group import group_page
@@ -384,16 +385,17 @@ def test_variables_that_sites_explain_are_noted():
     )
     settings = GroupSettings().changed(harmonization={"column": "site"})
     model = parse_model(model_from_shortcut("age + site", [], "test"))
-    plan = plan_sites(
-        cohort,
-        model,
-        settings,
+    measures = Measures(maps=("thickness",))
+    request = Request(
+        cohort=cohort,
+        model=model,
+        groups=None,
+        settings=settings,
+        measures=measures,
         references={},
-        comparison=Comparison(),
-        icv=None,
-        saved=None,
     )
-    done = harmonize_cohort(cohort, plan, settings, Measures(maps=("thickness",)), {})
+    plan = plan_sites(request)
+    done = harmonize_cohort(cohort, plan, settings, measures, {})
     # Ages of the sites are 30 years apart, and vary by 5.
     assert plan.explained == {"age": pytest.approx(0.9, abs=0.03)}
     assert any("site explains 9" in note and "of age" in note for note in done.notes)

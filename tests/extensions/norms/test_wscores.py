@@ -6,7 +6,7 @@ from scipy import stats
 from statsmodels.regression.linear_model import OLS
 
 from hipsta_bids.errors import ModelError
-from hipsta_bids.stats.scores import w_scores
+from hipsta_bids.extensions.norms.wscores import w_scores
 from hipsta_bids.stats.settings import GlmSettings
 
 SETTINGS = GlmSettings()

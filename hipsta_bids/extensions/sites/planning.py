@@ -1,55 +1,79 @@
-"""Harmonization of a cohort: which sites, what is kept, and what cannot be told apart."""
+"""The plan of a harmonization: which sites, what is kept, and what is inseparable."""
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
 from formulaic import Formula
 
 from hipsta_bids.errors import ModelError
-from hipsta_bids.group.cohort.data import SIZES, Cohort, Measures, grows_with_head, modeled_table
-from hipsta_bids.group.model import Comparison
-from hipsta_bids.group.output.results import Harmonization, SitePlan, digests
-from hipsta_bids.group.output.saved import SavedEffects, damaged
-from hipsta_bids.group.questions.scores import without_variable
+from hipsta_bids.extensions.sites import combat
+from hipsta_bids.extensions.sites.saved import SavedEffects, damaged, load_effects
+from hipsta_bids.group.cohort.data import SIZES
+from hipsta_bids.group.output.results import Analysis
+from hipsta_bids.group.request import Request
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.io.labels import refuse_alike
-from hipsta_bids.stats import combat
 from hipsta_bids.stats import formula as formulas
 from hipsta_bids.stats.arrays import Bool, Float
 from hipsta_bids.stats.design import DEPENDENCE, Design, build_design
-from hipsta_bids.stats.grammar import closed_formula, term_text
-from hipsta_bids.stats.registration import Registration
+from hipsta_bids.stats.grammar import closed_formula, term_text, without_variable
 from hipsta_bids.types import PARTICIPANT, SESSION
 
 #: Share of a contrast's weights that counts as rounding.
 _UNTOUCHED = 1e-8
 
 
-def plan_sites(
-    cohort: Cohort,
-    model: formulas.ModelSpec,
-    settings: GroupSettings,
-    *,
-    references: Mapping[str, str],
-    comparison: Comparison,
-    icv: str | None,
-    saved: SavedEffects | None,
-) -> SitePlan | None:
-    """Plan the harmonization, or refuse inseparable effects; ``None`` if there is none.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SitePlan:
+    """Effects to remove, and effects to keep."""
+
+    column: str
+    sites: tuple[str, ...]
+    """Known ones of a file first."""
+    estimated: tuple[str, ...]
+    """Sites whose effects are estimated from this cohort."""
+    counts: Mapping[str, int]
+    """Participants by site whose visits are harmonized."""
+    visits: combat.Visits
+    """Rows of the cohort's table; columns whose effects are kept, without an intercept."""
+    names: tuple[str, ...]
+    """Columns whose effects are kept, by this formula and these levels of factors."""
+    formula: str
+    levels: Mapping[str, Sequence[str]]
+    portable: bool
+    """Whether the columns of other people can be made from the formula."""
+    icv: str | None
+    """Column that volumes keep besides."""
+    icv_values: Float
+    """(visits,) NaN where not known or not used."""
+    explained: Mapping[str, float]
+    """Share of the variance of each column that sites explain."""
+    saved: SavedEffects | None
+    lost: int
+    """Visits without a site or a variable that is kept."""
+
+
+def is_asked(request: Request) -> bool:
+    """Check whether effects of sites are taken out."""
+    return bool(request.options.get("harmonize_model") or request.settings.harmonization.column)
+
+
+def plan_sites(request: Request) -> SitePlan:
+    """Plan the harmonization, or refuse inseparable effects.
 
     All terms of the model without the site are kept; in changes between two sessions, also their
     interactions with the session. Of an earlier analysis, its own terms are. ModelError if sites
     are too small, or explain a column of the model.
     """
+    cohort, model, settings = request.cohort, request.model, request.settings
+    path = request.options.get("harmonize_model")
+    saved = load_effects(path) if path else None
     column = saved.column if saved else settings.harmonization.column
-    if not column:
-        return None
     formulas.check_names([column], cohort.table.columns)
     _check_terms(model, column)
-    if comparison.pair:
+    if request.comparison.pair:
         _check_constant(cohort.table, column)
     levels: Mapping[str, Sequence[str]]
     if saved:
@@ -58,9 +82,7 @@ def plan_sites(
     else:
         formula = without_variable(model.formula, column).removeprefix("1 + ")
         spec = replace(model, formula=formula, contrasts=(), dummy=None)
-        matrix, names, levels, portable = _own_columns(
-            cohort, spec, settings, references, comparison
-        )
+        matrix, names, levels, portable = _own_columns(request, spec)
     labels = formulas.level_labels(cohort.table[column])
     usable = labels.notna().to_numpy() & np.isfinite(matrix).all(axis=1)
     old = tuple(saved.sites) if saved else ()
@@ -77,7 +99,7 @@ def plan_sites(
     columns = dict(zip(names, matrix[usable].T, strict=True))
     explained = _explained(column, member, columns, refuse=saved is None)
     repeated = pd.Series(people[usable]).duplicated().any() if saved is None else saved.repeated
-    volume = saved.icv if saved else icv
+    volume = saved.icv if saved else request.icv
     volume, values = _icv(cohort.table, usable, volume, formula)
     if saved and saved.icv and volume is None:
         raise ModelError(
@@ -120,20 +142,16 @@ def _saved_columns(table: pd.DataFrame, saved: SavedEffects) -> tuple[Float, tup
 
 
 def _own_columns(
-    cohort: Cohort,
-    spec: formulas.ModelSpec,
-    settings: GroupSettings,
-    references: Mapping[str, str],
-    comparison: Comparison,
+    request: Request, spec: formulas.ModelSpec
 ) -> tuple[Float, tuple[str, ...], Mapping[str, Sequence[str]], bool]:
     """Make the columns of a model without the site; of two sessions, with their interactions.
 
     Returns columns, names, levels of factors, and whether other people's can be made from these.
     """
-    table = modeled_table(cohort.table, comparison)
+    table, comparison, visits = request.table, request.comparison, request.cohort.table
     variables = closed_formula(spec.formula).names
-    levels = {name: text for name, text in references.items() if name in variables}
-    design = build_design(table, spec, settings.design, levels)
+    levels = {name: text for name, text in request.references.items() if name in variables}
+    design = build_design(table, spec, request.settings.design, levels)
     positions = [i for i, name in enumerate(design.columns) if name != formulas.INTERCEPT]
     names = tuple(design.columns[i] for i in positions)
     values = np.full((len(table), len(names)), np.nan)
@@ -141,8 +159,8 @@ def _own_columns(
     portable = not comparison.pair and _is_portable(table, spec.formula, design)
     if comparison.pair:
         session = comparison.pair[1]
-        values = values[table.index.get_indexer(pd.Index(cohort.table[PARTICIPANT]))]
-        is_later = (cohort.table[SESSION] == session).to_numpy(np.float64)[:, None]
+        values = values[table.index.get_indexer(pd.Index(visits[PARTICIPANT]))]
+        is_later = (visits[SESSION] == session).to_numpy(np.float64)[:, None]
         values = np.hstack([values, is_later, is_later * values])
         names = (*names, session, *(f"{name} x {session}" for name in names))
     return values, names, design.levels, portable
@@ -246,9 +264,7 @@ def _icv(
     return (icv if np.isfinite(values_used).all() and np.ptp(values_used) > 0 else None), values
 
 
-def without_tests_of_sites(
-    plan: SitePlan, design: Design, model: formulas.ModelSpec, comparison: Comparison
-) -> Design:
+def without_tests_of_sites(analysis: Analysis, plan: SitePlan) -> Analysis:
     """Refuse a model without the sites' degrees of freedom, or a test of sites.
 
     Tests of single columns that are about sites are omitted where no contrast was named. A test
@@ -256,8 +272,11 @@ def without_tests_of_sites(
     often where groups are not balanced over sites (Nygaard et al. 2016,
     doi:10.1093/biostatistics/kxv027). With the sites in the model, it pays for them.
     """
-    if comparison.pair or not plan.estimated:
-        return design
+    # Effects of sites from a file are those of registered nodes.
+    request = replace(analysis.request, has_unregistered=plan.saved is None)
+    analysis, design = replace(analysis, request=request), analysis.design
+    if request.comparison.pair or not plan.estimated:
+        return analysis
     member = np.eye(len(plan.sites))[plan.visits.site[design.rows]]
     joined = np.hstack([design.matrix, member])
     if np.linalg.matrix_rank(joined) > np.linalg.matrix_rank(design.matrix):
@@ -271,120 +290,11 @@ def without_tests_of_sites(
         for one in design.contrasts
         if np.abs(one.weights @ weights).max() > _UNTOUCHED * np.abs(one.weights).max()
     ]
-    named = {spec.name for spec in model.contrasts}
+    named = {spec.name for spec in request.model.contrasts}
     if about and (named.intersection(about) or len(about) == len(design.contrasts)):
         raise ModelError(
             f"--harmonize {plan.column}: contrast {about[0]} tests an effect that is "
             "removed; choose other contrasts by --contrast"
         )
     contrasts = tuple(one for one in design.contrasts if one.name not in about)
-    return replace(design, contrasts=contrasts)
-
-
-def harmonize_cohort(
-    cohort: Cohort,
-    plan: SitePlan,
-    settings: GroupSettings,
-    measures: Measures,
-    registrations: Mapping[str, Registration],
-) -> Harmonization:
-    """Estimate or take effects of sites, and take them out of maps and summary measures."""
-    if plan.saved and registrations:
-        _check_templates(plan.saved, registrations)
-    effects: dict[tuple[str, str, str], tuple[combat.SiteEffects, combat.SiteMoments]] = {}
-    sides, unknown = {}, set()
-    for hemi, side in cohort.sides.items():
-        visits = plan.visits.take(side.rows)
-        changed, summary = dict(side.maps), side.summary.astype(np.float64)
-        for measure in measures.maps:
-            key = "map", hemi, measure
-            values = side.maps[measure].reshape(len(side.rows), -1)
-            effects[key] = _effects(values, visits, plan, settings, key)
-            harmonized = combat.harmonize(values, visits, effects[key][0])
-            changed[measure] = harmonized.reshape(side.maps[measure].shape)
-        for name in summary.columns:
-            key = "summary", hemi, name
-            values = summary[[name]].to_numpy()
-            saved = plan.saved and plan.saved.effects_on_summaries.get((hemi, name))
-            # Earlier files adjust volumes alone.
-            is_adjusted = len(saved.slopes) > len(plan.names) if saved else grows_with_head(name)
-            adjusted = _with_icv(visits, plan, side.rows) if is_adjusted else visits
-            if plan.saved and not saved:
-                unknown.add(name)
-                summary[name] = np.nan
-            elif len(np.unique(values[np.isfinite(values)])) > 1:
-                effects[key] = _effects(values, adjusted, plan, settings, key)
-                summary[name] = combat.harmonize(values, adjusted, effects[key][0])[:, 0]
-        sides[hemi] = replace(side, maps=changed, summary=summary)
-    maps = [("map", hemi, name) for name in measures.maps for hemi in sides]
-    return Harmonization(
-        plan=plan,
-        cohort=replace(cohort, sides=sides),
-        effects={key: effects.pop(key) for key in maps} | effects,
-        notes=tuple(_notes(plan, settings, unknown)),
-    )
-
-
-def _with_icv(visits: combat.Visits, plan: SitePlan, rows: Any) -> combat.Visits:  # noqa: ANN401  (an array)
-    if plan.icv is None:
-        return visits
-    icv = plan.icv_values[rows]
-    columns = np.column_stack([visits.columns, icv])
-    return replace(visits, site=np.where(np.isfinite(icv), visits.site, -1), columns=columns)
-
-
-def _effects(
-    values: Float,
-    visits: combat.Visits,
-    plan: SitePlan,
-    settings: GroupSettings,
-    key: tuple[str, str, str],
-) -> tuple[combat.SiteEffects, combat.SiteMoments]:
-    kind, hemi, measure = key
-    pooled = settings.harmonization.pooling and kind == "map"
-    if plan.saved is None:
-        n, longitudinal = len(plan.sites), settings.longitudinal
-        return combat.fit_effects(values, visits, n, longitudinal, pooled=pooled)
-    known_effects = plan.saved.effects_on_maps if kind == "map" else plan.saved.effects_on_summaries
-    effects = known_effects.get((hemi, measure))
-    if effects is None:
-        raise ModelError(
-            f"{plan.saved.file}: has no map of {measure} of hemisphere {hemi}; choose other maps"
-            " by --measures, or harmonize anew"
-        )
-    if len(effects.mean) != values.shape[1]:
-        raise ModelError(
-            f"{plan.saved.file}: its map of {measure} has {len(effects.mean)} points, these "
-            f"participants {values.shape[1]}; use one grid"
-        )
-    return combat.extend_effects(effects, values, visits, pooled=pooled)
-
-
-def _notes(plan: SitePlan, settings: GroupSettings, unknown: set[str]) -> Iterator[str]:
-    if plan.lost:
-        yield (
-            f"{plan.lost} visits lack {plan.column} or an effect that is kept, and are not "
-            "harmonized"
-        )
-    for name, share in plan.explained.items():
-        if share > settings.harmonization.explained:
-            yield f"{plan.column} explains {share:.0%} of {name}: its effect is poorly known"
-    if unknown and plan.saved:
-        names = formulas.listed(unknown)
-        yield f"{plan.saved.file} lacks these measures, which are excluded: {names}"
-    if plan.saved is None and not plan.portable:
-        yield "harmonization.json is not written: this model's columns depend on all participants"
-
-
-def _check_templates(saved: SavedEffects, registrations: Mapping[str, Registration]) -> None:
-    """Refuse parameters of other points than those of this cohort."""
-    for hemi, digest in digests(registrations).items():
-        if saved.templates.get(hemi) != digest:
-            is_unregistered = saved.templates.get(hemi) == "none"
-            remedy = (
-                "--align none" if is_unregistered else "--template with the template.json beside it"
-            )
-            raise ModelError(
-                f"{saved.file}: hemisphere {hemi} was registered to another template there; give"
-                f" {remedy}"
-            )
+    return replace(analysis, design=replace(design, contrasts=contrasts))

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from statsmodels.regression.mixed_linear_model import MixedLM
 
-from hipsta_bids.stats import combat
-from hipsta_bids.stats.combat import Visits, extend_effects, fit_effects, harmonize
+from hipsta_bids.extensions.sites import combat
+from hipsta_bids.extensions.sites.combat import Visits, extend_effects, fit_effects, harmonize
 from hipsta_bids.stats.settings import LongitudinalSettings
 
 SETTINGS = LongitudinalSettings()

@@ -1,0 +1,75 @@
+"""Steps that extensions add to the line of an analysis, and what they add to its results."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from typing import Any
+
+from hipsta_bids.errors import ModelError
+from hipsta_bids.group.output.results import Analysis
+from hipsta_bids.group.request import Request
+from hipsta_bids.joints import Step, find_steps, load
+from hipsta_bids.stats.formula import listed
+from hipsta_bids.stats.inference import PERMUTATIONS
+
+#: Flags of the core, and those that they exclude; steps of extensions have their own.
+EXCLUDED: Mapping[str, tuple[str, ...]] = {
+    "map() in the formula": ("summary measures alone",),
+    "--endpoint": ("--correction by permutation", "--joint", "map() in the formula"),
+    "--longitudinal visits": ("--correction by permutation", "--joint", "map() in the formula"),
+}
+
+
+def plan_steps(request: Request) -> Request:
+    """Plan the steps that are asked; ModelError if two of them exclude each other."""
+    steps = [step for step in find_steps() if load(step.condition)(request)]
+    check_flags({*_flags(request), *(step.flag for step in steps)})
+    plans = {step.name: load(step.plan)(request) for step in steps}
+    return replace(request, plans=plans)
+
+
+def check_flags(flags: set[str]) -> None:
+    """Refuse flags of which one excludes another."""
+    excluded = {**EXCLUDED, **{step.flag: step.excludes for step in find_steps()}}
+    for flag, rivals in excluded.items():
+        if flag in flags and (problems := [name for name in rivals if name in flags]):
+            raise ModelError(f"{flag}: not with {listed(problems)}; remove one of them")
+
+
+def _flags(request: Request) -> Iterator[str]:
+    """Name what the core is asked beyond the default."""
+    settings, comparison = request.settings, request.comparison
+    is_asked = {
+        "map() in the formula": bool(request.model.maps),
+        "summary measures alone": not request.measures.maps,
+        "--correction by permutation": settings.multiplicity.method in PERMUTATIONS,
+        "--joint": bool(settings.joint.measures),
+        "--endpoint": bool(comparison.endpoint),
+        "--longitudinal visits": request.has_categories and not comparison.endpoint,
+    }
+    return (flag for flag, answer in is_asked.items() if answer)
+
+
+def _active(request: Request) -> Iterator[Step]:
+    return (step for step in find_steps() if step.name in request.plans)
+
+
+def extend(place: str, analysis: Analysis) -> Analysis:
+    """Pass an analysis through what extensions do at a place of the line."""
+    for step in _active(analysis.request):
+        if place in step.places:
+            analysis = load(step.places[place])(analysis, analysis.request.plans[step.name])
+    return analysis
+
+
+def blocks(place: str, request: Request, *values: object) -> Iterator[Any]:
+    """Collect what extensions make of results at a place: tables, paragraphs, figures, files."""
+    for step in _active(request):
+        if place in step.blocks:
+            yield from load(step.blocks[place])(*values)
+
+
+def plan_blocks(place: str, request: Request) -> Iterator[Any]:
+    """Collect what extensions know from their plans."""
+    for step in _active(request):
+        if place in step.blocks:
+            yield from load(step.blocks[place])(request.plans[step.name])
