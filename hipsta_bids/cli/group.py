@@ -22,7 +22,7 @@ from hipsta_bids.cli.parser import (
 )
 from hipsta_bids.cli.participant import REGIONS
 from hipsta_bids.errors import ExitCode, NothingToDoError, UsageError
-from hipsta_bids.joints import find_parts, find_questions, load
+from hipsta_bids.joints import find_extensions, find_parts, find_protocols, find_questions, load
 from hipsta_bids.participant.pool import processors
 
 if TYPE_CHECKING:
@@ -108,8 +108,8 @@ def _add_sheets(parser: Parser) -> None:
     add(
         "--seg",
         "NAME...",
-        "segmentation protocol, where there are several; two or more are analyzed each, and "
-        "compared",
+        "segmentation protocol, where there are several"
+        + ("; two or more are analyzed each, and compared" if find_protocols() else ""),
     )
     add(
         "--mixed",
@@ -420,14 +420,14 @@ def _run(parsed: argparse.Namespace, arguments: Sequence[str]) -> ExitCode:
 
 def _rebuild_reports(root: Path, name: str | None) -> ExitCode:
     """Make the pages of analyses and comparisons again from their files, of all or of one."""
-    from hipsta_bids.derivatives.names import COMPARISON, group_report  # noqa: PLC0415  (start-up time)
+    from hipsta_bids.derivatives.names import group_report  # noqa: PLC0415  (start-up time)
     from hipsta_bids.io.files import check_writable  # noqa: PLC0415  (start-up time)
     from hipsta_bids.reports import group as pages  # noqa: PLC0415  (heavy)
-    from hipsta_bids.reports.comparison import comparison_page  # noqa: PLC0415  (heavy)
 
     makers = dict.fromkeys(pages.group_models(root), pages.group_page)
     # Last, as they link the pages of analyses that exist.
-    makers |= dict.fromkeys(pages.group_models(root, COMPARISON), comparison_page)
+    for page in (page for extension in find_extensions() for page in extension.pages):
+        makers |= dict.fromkeys(pages.group_models(root, page.record), load(page.make))
     models = [model for model in makers if name in {None, model}]
     if not models:
         raise NothingToDoError(
