@@ -12,7 +12,6 @@ _MODULES = {
     "measure": "hipsta_bids.api.maps",
     "load": "hipsta_bids.api.datasets",
     "example": "hipsta_bids.api.datasets",
-    "correlate": "hipsta_bids.group.questions.correlate",
     "register": "hipsta_bids.group.questions.models",
     "figure": "hipsta_bids.api.figures",
     "plot_sheet": "hipsta_bids.api.plots",
@@ -26,7 +25,7 @@ if TYPE_CHECKING:
     from hipsta_bids.api.figures import figure
     from hipsta_bids.api.maps import measure
     from hipsta_bids.api.plots import plot_group, plot_sheet, plot_surface
-    from hipsta_bids.group.questions.correlate import correlate
+    from hipsta_bids.extensions.agreement.correlate import correlate
     from hipsta_bids.group.questions.models import group, register
 else:
 
@@ -35,13 +34,19 @@ else:
 
         if name == "group":  # the folder of that name is called as a function
             return import_module("hipsta_bids.group")
-        if name not in _MODULES:
-            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        value = globals()[name] = getattr(import_module(_MODULES[name]), name)
+        module = _MODULES.get(name)
+        if module is None and name in __all__:
+            from hipsta_bids.joints import find_functions  # noqa: PLC0415  (as above)
+
+            module = find_functions().get(name)
+        if module is None:
+            deleted = " (its extension was deleted)" if name in __all__ else ""
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}{deleted}")
+        value = globals()[name] = getattr(import_module(module), name)
         return value
 
     def __dir__() -> list[str]:
-        return sorted({*globals(), *_MODULES, "group"})
+        return sorted({*globals(), *__all__})
 
 
 __all__ = [

@@ -115,6 +115,16 @@ class Step:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Page:
+    """A page that ``--reports-only`` makes again, beside the pages of analyses."""
+
+    record: str
+    """File of a folder of the group level that has this page."""
+    make: str
+    """Function of the folder; returns the page."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Extension:
     """What a folder adds to the program."""
 
@@ -125,6 +135,11 @@ class Extension:
     parts: tuple[Part, ...] = ()
     questions: tuple[Question, ...] = ()
     steps: tuple[Step, ...] = ()
+    pages: tuple[Page, ...] = ()
+    protocols: str = ""
+    """Function of the options and settings of the group level, and of protocols: runs each."""
+    functions: tuple[str, ...] = ()
+    """Functions of the Python interface, as ``module:name``."""
     sections: str = ""
     """Sections of the page of an analysis, as ``module:tuple``."""
     has_templates: bool = False
@@ -149,6 +164,17 @@ def is_present(name: str) -> bool:
 def find_parts() -> tuple[Part, ...]:
     """Find what extensions add to the results of a comparison."""
     return tuple(part for extension in find_extensions() for part in extension.parts)
+
+
+def find_protocols() -> str:
+    """Find the function that analyzes several protocols; empty without an extension."""
+    return next((found.protocols for found in find_extensions() if found.protocols), "")
+
+
+def find_functions() -> dict[str, str]:
+    """Find functions of the Python interface: their modules, by name."""
+    places = [place.split(":") for extension in find_extensions() for place in extension.functions]
+    return {name: module for module, name in places}
 
 
 def find_questions() -> tuple[Question, ...]:

@@ -24,8 +24,8 @@ from hipsta_bids.phantom import Hemisphere, PhantomSpec
 from hipsta_bids.phantom import write_dataset as write_phantoms
 from validation.group import simulate_cohort
 
-# Without the extension, its pages are not made.
-CONSORTIA = "consortia" in PRESENT
+# Without an extension, its pages are not made.
+CONSORTIA, AGREEMENT = "consortia" in PRESENT, "agreement" in PRESENT
 #: Twelve of each group at each site, as many as summaries of sites take.
 SITES = {"a": (*range(1, 13), *range(25, 37)), "b": (*range(13, 25), *range(37, 49))}
 GROUP = "cohort/bids cohort/out group --settings quick.toml --align none --measures thickness"
@@ -81,24 +81,30 @@ COMMANDS = [
         )
     ]
     * CONSORTIA,
-    (
-        "compare cohort/out/group/a cohort/out/group/b compared",
-        0,
-        ["compared.html", "compared/figures/*.svg"],
-    ),
+    *[
+        (
+            "compare cohort/out/group/a cohort/out/group/b compared",
+            0,
+            ["compared.html", "compared/figures/*.svg"],
+        )
+    ]
+    * AGREEMENT,
     (
         "figure contrast cohort/out --name default -o contrast.svg --measures thickness",
         0,
         ["contrast.svg"],
     ),
-    (
+    *[
         (
-            f"correlate {MAPS}_thickness.shape.gii {MAPS}_curv.shape.gii correlated"
-            f" --surface {MAPS}_midthickness.surf.gii --permutations 100"
-        ),
-        0,
-        ["correlated/figures/*.svg"],
-    ),
+            (
+                f"correlate {MAPS}_thickness.shape.gii {MAPS}_curv.shape.gii correlated"
+                f" --surface {MAPS}_midthickness.surf.gii --permutations 100"
+            ),
+            0,
+            ["correlated/figures/*.svg"],
+        )
+    ]
+    * AGREEMENT,
     (
         f"{TRIAL} --longitudinal --no-classification --settings quick.toml --name slopes",
         0,

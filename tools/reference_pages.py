@@ -7,11 +7,8 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 
 from hipsta_bids.cli.commands import (
-    compare_parser,
-    correlate_parser,
     figure_parser,
     phantom_parser,
-    replicate_parser,
     resample_parser,
     surrogate_parser,
 )
@@ -29,10 +26,9 @@ from hipsta_bids.derivatives.names import (
 from hipsta_bids.derivatives.results import LAYERS, NODES, POSITION, STATE
 from hipsta_bids.errors import EXIT_MEANINGS
 from hipsta_bids.geometry.catalog import MAPS, PER_SUBFIELD, SECTIONS, SUMMARY, Column
-from hipsta_bids.group.output.tables import COLUMNS, JOINT_COLUMNS, REPLICATE_COLUMNS
-from hipsta_bids.group.questions.replicate import PUBLISHED
+from hipsta_bids.group.output.tables import COLUMNS, JOINT_COLUMNS
 from hipsta_bids.group.settings import GroupSettings
-from hipsta_bids.joints import find_extensions, load
+from hipsta_bids.joints import find_extensions, is_present, load
 from hipsta_bids.reports.page import read_table
 from hipsta_bids.settings import Settings
 
@@ -309,10 +305,7 @@ def options_page() -> str:
         ("Group level", group_parser()),
         ("hipsta-bids phantom", phantom_parser()),
         ("hipsta-bids surrogate", surrogate_parser()),
-        ("hipsta-bids compare", compare_parser()),
-        ("hipsta-bids replicate", replicate_parser()),
         ("hipsta-bids figure", figure_parser()),
-        ("hipsta-bids correlate", correlate_parser()),
         ("hipsta-bids resample", resample_parser()),
         *(
             (f"hipsta-bids {command.name}", load(command.parser)())
@@ -370,8 +363,19 @@ def _page(parts: Iterable[str]) -> str:
     return "\n\n".join([NOTE, *(part for part in parts if part)]) + "\n"
 
 
+def published_table() -> str:
+    """Return the published numbers."""
+    from hipsta_bids.extensions.agreement.replicate import PUBLISHED  # noqa: PLC0415  (may be absent)
+
+    return PUBLISHED.read_text("utf-8")
+
+
 def replicate_sidecar() -> str:
     """Describe the columns of the published numbers, and of own numbers beside them."""
+    from hipsta_bids.extensions.agreement.columns import (  # noqa: PLC0415  (may be absent)
+        REPLICATE_COLUMNS,
+    )
+
     columns = {name: {"Description": text} for name, text in REPLICATE_COLUMNS.items()}
     return json.dumps(columns, indent=2) + "\n"
 
@@ -383,6 +387,8 @@ PAGES: Mapping[str, Callable[[], str]] = {
     "settings-all.md": all_settings_page,
     "reasons.md": reasons_page,
     "command-line.md": options_page,
-    "replicate.tsv": lambda: PUBLISHED.read_text("utf-8"),
-    "replicate.json": replicate_sidecar,
-}
+} | (
+    {"replicate.tsv": published_table, "replicate.json": replicate_sidecar}
+    if is_present("agreement")
+    else {}
+)

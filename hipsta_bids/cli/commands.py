@@ -4,10 +4,9 @@ import argparse
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from hipsta_bids.cli import parser as parsing
 from hipsta_bids.cli import participant
 from hipsta_bids.cli.console import echo, echo_table, warn
-from hipsta_bids.cli.parser import Parser, bids_label, from_namespace, parser_of, site_path
+from hipsta_bids.cli.parser import Parser, bids_label, from_namespace, parser_of
 from hipsta_bids.errors import ArgumentError, ExitCode, MissingFileError, UsageError
 
 _DEMO_PROTOCOL = "freesurfer"  # the layout that the demo dataset has
@@ -45,24 +44,6 @@ def surrogate_parser() -> Parser:
     return parser
 
 
-def compare_parser() -> Parser:
-    """Describe ``hipsta-bids compare``."""
-    parser, add = parser_of("compare")
-    add("analyses", "FOLDER", nargs="+")
-    add("out", "OUT", type=Path)
-    add("--figures")
-    return parser
-
-
-def replicate_parser() -> Parser:
-    """Describe ``hipsta-bids replicate``."""
-    parser, add = parser_of("replicate")
-    add("analysis", "FOLDER", type=Path)
-    add("out", "OUT", type=Path)
-    add("--groups", "CU MCI DAT")
-    return parser
-
-
 def resample_parser() -> Parser:
     """Describe ``hipsta-bids resample``."""
     parser, add = parser_of("resample")
@@ -87,17 +68,6 @@ def export_parser() -> Parser:
     add("--region", "NAME", default="body")
     add("--participant-label", "LABEL", nargs="+", type=bids_label("sub-"), default=[])
     add("--space-of", "PATTERN", default="")
-    return parser
-
-
-def correlate_parser() -> Parser:
-    """Describe ``hipsta-bids correlate``."""
-    parser, add = parser_of("correlate")
-    add("maps", "MAP", nargs=2)
-    add("out", "OUT", type=Path)
-    add("--surface", "FILE", type=Path, required=True)
-    add("--permutations", "N", type=parsing.positive_int, default=10_000)
-    add("--seed", "N", type=int, default=0)
     return parser
 
 
@@ -242,31 +212,6 @@ def run_surrogate(arguments: Sequence[str]) -> ExitCode:
     return crosscheck(findings.items, options.output_dir, settings, echo, warn)
 
 
-def run_compare(arguments: Sequence[str]) -> ExitCode:
-    """Compare finished analyses."""
-    options = compare_parser().parse_intermixed_args(arguments)
-    from hipsta_bids.group.questions import several  # noqa: PLC0415  (heavy)
-
-    several.check_folder(options.out)
-    entries = several.read_entries([site_path(text) for text in options.analyses])
-    command = "hipsta-bids", "compare", *arguments
-    for note in several.compare_analyses(entries, options.out, command, figures=options.figures):
-        echo(f"note: {note}")
-    echo(f"results: {options.out}")
-    echo(f"report: {options.out}.html")
-    return ExitCode.OK
-
-
-def run_replicate(arguments: Sequence[str]) -> ExitCode:
-    """Put the published numbers beside the numbers of an analysis."""
-    options = replicate_parser().parse_intermixed_args(arguments)
-    from hipsta_bids.group.questions.replicate import replicate  # noqa: PLC0415  (heavy)
-
-    echo_table(replicate(options.analysis, options.out, options.groups))
-    echo(f"results: {options.out / 'replicate.tsv'}")
-    return ExitCode.OK
-
-
 #: Options of ``figure`` that have another name than its arguments in Python.
 _FIGURE_OPTIONS = {
     "file": "output",
@@ -340,19 +285,6 @@ def run_export(arguments: Sequence[str]) -> ExitCode:
             image=options.space_of,
         )
     echo(f"{options.folder}: {len(paths)} files")
-    return ExitCode.OK
-
-
-def run_correlate(arguments: Sequence[str]) -> ExitCode:
-    """Correlate two maps of the group level."""
-    options = correlate_parser().parse_intermixed_args(arguments)
-    from hipsta_bids.group.questions.correlate import correlate  # noqa: PLC0415  (heavy)
-
-    first, second = options.maps
-    numbers = {"permutations": options.permutations, "seed": options.seed}
-    row = correlate(first, second, options.surface, **numbers, out=options.out)
-    echo(f"r = {row['pearson']:.3f}, p = {row['pearson_p']:.3g}, {row['n']} points")
-    echo(f"results: {options.out}")
     return ExitCode.OK
 
 

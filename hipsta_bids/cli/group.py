@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hipsta_bids import __version__
+from hipsta_bids import __version__, joints
 from hipsta_bids.cli import questions
 from hipsta_bids.cli.console import Progress, echo, echo_start, quiet, warn
 from hipsta_bids.cli.parser import (
@@ -22,7 +22,6 @@ from hipsta_bids.cli.parser import (
 )
 from hipsta_bids.cli.participant import REGIONS
 from hipsta_bids.errors import ExitCode, NothingToDoError, UsageError
-from hipsta_bids.joints import find_parts, find_questions, find_steps, load
 from hipsta_bids.participant.pool import processors
 
 if TYPE_CHECKING:
@@ -61,10 +60,10 @@ def group_parser() -> Parser:
     _add_model(parser)
     _add_comparison(parser)
     _add_methods(parser)
-    for step in find_steps():
-        load(step.options)(parser)
+    for step in joints.find_steps():
+        joints.load(step.options)(parser)
     questions.add_questions(parser)
-    for part in find_parts():
+    for part in joints.find_parts():
         adder(parser.add_argument_group(part.heading))(
             part.option, part.value, part.text, nargs="?", const=""
         )
@@ -110,8 +109,8 @@ def _add_sheets(parser: Parser) -> None:
     add(
         "--seg",
         "NAME...",
-        "segmentation protocol, where there are several; two or more are analyzed each, and "
-        "compared",
+        "segmentation protocol, where there are several"
+        + ("; two or more are analyzed each, and compared" if joints.find_protocols() else ""),
     )
     add(
         "--mixed",
@@ -404,14 +403,14 @@ def _run(parsed: argparse.Namespace, arguments: Sequence[str]) -> ExitCode:
 
 def _rebuild_reports(root: Path, name: str | None) -> ExitCode:
     """Make the pages of analyses and comparisons again from their files, of all or of one."""
-    from hipsta_bids.derivatives.names import COMPARISON, group_report  # noqa: PLC0415  (start-up time)
+    from hipsta_bids.derivatives.names import group_report  # noqa: PLC0415  (start-up time)
     from hipsta_bids.io.files import check_writable  # noqa: PLC0415  (start-up time)
     from hipsta_bids.reports import group as pages  # noqa: PLC0415  (heavy)
-    from hipsta_bids.reports.comparison import comparison_page  # noqa: PLC0415  (heavy)
 
     makers = dict.fromkeys(pages.group_models(root), pages.group_page)
     # Last, as they link the pages of analyses that exist.
-    makers |= dict.fromkeys(pages.group_models(root, COMPARISON), comparison_page)
+    for page in (page for extension in joints.find_extensions() for page in extension.pages):
+        makers |= dict.fromkeys(pages.group_models(root, page.record), joints.load(page.make))
     models = [model for model in makers if name in {None, model}]
     if not models:
         raise NothingToDoError(
@@ -452,14 +451,14 @@ def _settings(parsed: argparse.Namespace) -> "GroupSettings":
             "sides": parsed.joint_sides or None,
         },
     }
-    for question in find_questions():
+    for question in joints.find_questions():
         if question.settings:
-            choices |= load(question.settings)(parsed)
+            choices |= joints.load(question.settings)(parsed)
     settings = load_group_settings(parsed.settings)
     settings = settings.changed(**given_settings(choices))
-    for step in find_steps():
+    for step in joints.find_steps():
         if step.settings:
-            settings = load(step.settings)(parsed, settings)
+            settings = joints.load(step.settings)(parsed, settings)
     return settings
 
 
@@ -507,10 +506,12 @@ def _options(parsed: argparse.Namespace, arguments: Sequence[str]) -> "GroupOpti
         surfaces=tuple(parsed.maps_surface),
         measures=tuple(dict.fromkeys(parsed.measures)),
         reports=not parsed.no_reports,
-        further={name: getattr(parsed, name) for step in find_steps() for name in step.names},
+        further={
+            name: getattr(parsed, name) for step in joints.find_steps() for name in step.names
+        },
         parts=tuple(
             (part, value)
-            for part in find_parts()
+            for part in joints.find_parts()
             if (value := getattr(parsed, part.name)) is not None
         ),
         command=("hipsta-bids", *arguments),

@@ -33,12 +33,9 @@ _CORE = (
     ("demo", "run_demo", "DIR", "write it, run on it, and compare with the truth"),
     ("phantom", "write_phantoms", "DIR", "write a synthetic cohort with a known effect"),
     ("surrogate", "run_surrogate", "IN OUT", "measure thickness in single slices to check maps"),
-    ("compare", "run_compare", "FOLDER... OUT", "compare finished analyses (group level)"),
-    ("replicate", "run_replicate", "FOLDER OUT", "compare an analysis with Diers et al. (2023)"),
     ("figure", "draw_figure", "WHAT OUT", "draw a figure for a paper from results"),
     ("resample", "run_resample", "MAP... OUT", "move maps to HippUnfold's surfaces, or from there"),
     ("export", "run_export", "OUT_DIR DIR", "write surfaces for FreeSurfer, or as VTK or PLY"),
-    ("correlate", "run_correlate", "MAP MAP OUT", "correlate two maps of the group level"),
     ("validate", "run_validation", "", None),
 )
 COMMANDS = {

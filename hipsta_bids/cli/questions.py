@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from hipsta_bids.cli.parser import Parser, adder, factor_level
 from hipsta_bids.errors import UsageError
-from hipsta_bids.joints import find_parts, find_questions, find_steps, load
+from hipsta_bids.joints import find_parts, find_protocols, find_questions, find_steps, load
 
 if TYPE_CHECKING:
     from hipsta_bids.group.questions.study import GroupOptions, GroupResult
@@ -66,11 +66,13 @@ def run_comparison(
             f" {multiplicity.alpha:g}; at least {math.ceil(1 / multiplicity.alpha)}"
             " are needed, and thousands are better"
         )
-    if protocols := tuple(dict.fromkeys(parsed.seg))[1:]:
-        from hipsta_bids.group.questions.several import run_protocols  # noqa: PLC0415  (heavy)
-
-        return run_protocols(options, settings, (parsed.seg[0], *protocols))
-    return run_group(options, settings)
+    protocols = tuple(dict.fromkeys(parsed.seg))
+    if len(protocols) < 2:  # noqa: PLR2004  (to compare)
+        return run_group(options, settings)
+    if not find_protocols():
+        raise UsageError("--seg: name one protocol")
+    result: GroupResult = load(find_protocols())(options, settings, protocols)
+    return result
 
 
 def run_question(

@@ -241,9 +241,6 @@ DATASET_FILES: dict[str, str] = {
     "report": "report.html",
 }
 
-#: Record of a comparison of analyses, in its folder.
-COMPARISON = "comparison.json"
-
 #: Lines of ``.bidsignore``, and why BIDS has no name for what each hides.
 IGNORED: dict[str, str] = TEXTS["ignored"]
 

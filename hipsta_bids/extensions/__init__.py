@@ -4,4 +4,4 @@
 """
 
 #: Folders, in the order of the help.
-NAMES = ("sites", "consortia", "trials", "norms")
+NAMES = ("sites", "consortia", "trials", "norms", "agreement")

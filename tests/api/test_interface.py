@@ -7,6 +7,7 @@ import sys
 from importlib import import_module
 
 import pytest
+from extension_marks import PRESENT, needs
 
 import hipsta_bids as hb
 
@@ -64,7 +65,13 @@ def test_group_has_the_signature_and_text_of_its_function():
         hb.group(None)
 
 
-@pytest.mark.parametrize("name", hb.__all__)
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=needs("agreement")) if name == "correlate" else name
+        for name in hb.__all__
+    ],
+)
 def test_every_name_is_there_and_documented(name):
     found = getattr(hb, name)
     assert name in dir(hb)
@@ -76,3 +83,9 @@ def test_every_name_is_there_and_documented(name):
 def test_other_names_are_refused():
     with pytest.raises(AttributeError, match="sheet_plot"):
         _ = hb.sheet_plot
+
+
+@pytest.mark.skipif("agreement" in PRESENT, reason="the extension is there")
+def test_the_name_of_a_deleted_function_is_refused():
+    with pytest.raises(AttributeError, match="its extension was deleted"):
+        _ = hb.correlate

@@ -12,10 +12,7 @@ from stand_ins import make_input, stand_in_job
 from hipsta_bids import __version__
 from hipsta_bids.cli import main
 from hipsta_bids.cli.commands import (
-    compare_parser,
-    correlate_parser,
     phantom_parser,
-    replicate_parser,
     resample_parser,
     surrogate_parser,
 )
@@ -230,10 +227,7 @@ def test_spellings_of_other_bids_apps(alias, field, value):
         ("participant", build_parser),
         ("surrogate", surrogate_parser),
         ("phantom", phantom_parser),
-        ("compare", compare_parser),
-        ("replicate", replicate_parser),
         ("resample", resample_parser),
-        ("correlate", correlate_parser),
     ],
 )
 def test_the_texts_of_the_help_have_no_leftovers(command, make):

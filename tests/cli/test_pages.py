@@ -58,7 +58,10 @@ def lose(monkeypatch):
         ("labels labels/shared", "cohort.html", "labels/shared/measures.tsv"),
         (f"{GROUP} --name a", "group/model.html", "cohort/out/group/a/peaks.tsv"),
         pytest.param(("meta ", "meta/sites.html", "meta/meta/sites.tsv"), marks=needs("consortia")),
-        ("compare ", "comparison/found.html", "compared/agreement.tsv"),
+        pytest.param(
+            ("compare ", "comparison/found.html", "compared/agreement.tsv"),
+            marks=needs("agreement"),
+        ),
     ],
 )
 def test_a_page_that_cannot_be_made_is_told_by_the_exit_code(

@@ -3,10 +3,11 @@
 from typing import get_args
 
 import pytest
+from extension_marks import PRESENT
 
 from hipsta_bids.cli.group import group_parser, is_group_level
 from hipsta_bids.cli.main import main
-from hipsta_bids.errors import UsageError
+from hipsta_bids.errors import ExitCode, UsageError
 from hipsta_bids.group.cohort.exclusions import fulfilled
 from hipsta_bids.group.settings import GroupSettings, load_group_settings
 from hipsta_bids.protocols.toml import settings_toml
@@ -86,3 +87,11 @@ def test_other_conditions_are_refused(text):
     with pytest.raises(UsageError, match=r"--exclude-qc: .* is not of the form") as refusal:
         group_parser().parse_args(["in", "out", "group", "--exclude-qc", text])
     assert len(str(refusal.value)) < 400  # one message line, whatever the text
+
+
+@pytest.mark.skipif("agreement" in PRESENT, reason="the extension compares protocols")
+def test_one_protocol_is_named(capsys, tmp_path):
+    (tmp_path / "participants.tsv").write_text("participant_id\n")
+    folders = str(tmp_path), str(tmp_path)
+    assert main([*folders, "group", "--seg", "ashs", "freesurfer"]) == ExitCode.USAGE
+    assert "--seg: name one protocol" in capsys.readouterr().err

@@ -5,7 +5,6 @@ from pathlib import Path
 from hipsta_bids.derivatives.names import group_report
 from hipsta_bids.io import files
 from hipsta_bids.progress import tell
-from hipsta_bids.reports.comparison import write_comparison_report
 from hipsta_bids.reports.group import write_group_report
 
 
@@ -18,10 +17,3 @@ def write_page(out_dir: Path, name: str, *, reports: bool) -> tuple[Path | None,
     tell("page")
     problem = write_group_report(out_dir, name)
     return (path if problem is None else None), problem
-
-
-def write_comparison_page(folder: Path, *, reports: bool) -> None:
-    """Write the page of a comparison beside its folder."""
-    files.remove([folder.with_name(f"{folder.name}.html")])  # it may be that of an earlier one
-    if reports:
-        write_comparison_report(folder)

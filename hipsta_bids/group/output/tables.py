@@ -35,16 +35,10 @@ CurveOf = Callable[[ClassifierResult], Columns]
 _MEANINGS = tomllib.loads((files("hipsta_bids.group.output") / "columns.toml").read_text("utf-8"))
 #: Meaning of every column; the unit is that of the measure unless said.
 COLUMNS: Mapping[str, str] = _MEANINGS["group"]
-#: The same of analyses that are compared.
-COMPARISON_COLUMNS: Mapping[str, str] = COLUMNS | _MEANINGS["comparison"]
 #: The same of measures that are tested together.
 JOINT_COLUMNS: Mapping[str, str] = COLUMNS | _MEANINGS["joint"]
 #: The same of participants by group.
 DEMOGRAPHIC_COLUMNS: Mapping[str, str] = COLUMNS | _MEANINGS["demographics"]
-#: The same of a correlation of maps.
-CORRELATION_COLUMNS: Mapping[str, str] = _MEANINGS["correlation"]
-#: The same of published numbers beside own numbers.
-REPLICATE_COLUMNS: Mapping[str, str] = _MEANINGS["replicate"]
 
 
 def result_tables(

@@ -9,7 +9,7 @@ from scipy import stats
 from scipy.ndimage import gaussian_filter
 
 from hipsta_bids.errors import ModelError
-from hipsta_bids.stats.correlation import correlate_maps
+from hipsta_bids.extensions.agreement.correlation import correlate_maps
 from hipsta_bids.types import Mesh
 
 NODES, SIZE = (21, 13), np.array([20.0, 25.0])  # mm

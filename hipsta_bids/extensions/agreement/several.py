@@ -6,16 +6,18 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+import pandas as pd
+
 from hipsta_bids import __version__
 from hipsta_bids.derivatives.analyses import GroupResults, read_group
-from hipsta_bids.derivatives.names import COMPARISON
 from hipsta_bids.errors import MissingFileError, ModelError, OutputError, UsageError
-from hipsta_bids.group.output import agreement, write
-from hipsta_bids.group.output.agreement import Entry
+from hipsta_bids.extensions.agreement import COMPARISON, tables
+from hipsta_bids.extensions.agreement.columns import COMPARISON_COLUMNS
+from hipsta_bids.extensions.agreement.page import write_comparison_page
+from hipsta_bids.extensions.agreement.tables import Entry
+from hipsta_bids.group.output import write
 from hipsta_bids.group.output.citations import joined
-from hipsta_bids.group.output.pages import write_comparison_page
 from hipsta_bids.group.output.panels import draw_pages
-from hipsta_bids.group.output.tables import COMPARISON_COLUMNS
 from hipsta_bids.group.questions.compare import run_group
 from hipsta_bids.group.questions.study import GroupOptions, GroupResult
 from hipsta_bids.group.settings import GroupSettings
@@ -101,51 +103,67 @@ def compare_analyses(
     reports: bool = True,
 ) -> list[str]:
     """Compare finished analyses, write tables, a figure and a page, and return notes."""
-    tables = {
-        "analyses": agreement.analyses_table(entries),
-        "effects": agreement.effects_table(entries),
-        "classification": agreement.joined_tables(entries, "classification", _PAIRS),
-        "agreement": agreement.agreement_table(entries),
+    contents = _tables(entries)
+    pairs = contents["agreement"]
+    notes = list(tables.differences(entries))
+    region = entries[0].inputs.get("region") or "body"
+    record = _record(entries, folder, contents["analyses"], command, region)
+    with write.whole_folder(folder) as scratch:
+        for name, content in contents.items():
+            if len(content):
+                write.write_table(scratch, name, content, meaning=COMPARISON_COLUMNS)
+        drawings = [
+            (f"{measure}_maps", partial(draw_pages, *tables.effect_rows(entries, measure)))
+            for measure in dict.fromkeys(pairs["measure"] if len(pairs) else ())
+        ]
+        notes += write.write_figures(scratch, drawings, prints=figures)
+        methods = tables.agreement_methods(entries, pairs, notes, region)
+        files.write_text(scratch / "methods.md", methods)
+        files.write_json(scratch / COMPARISON, {**record, "notes": notes})
+    write_comparison_page(folder, reports=reports)
+    return notes
+
+
+def _tables(entries: Sequence[Entry]) -> dict[str, pd.DataFrame]:
+    """Make the tables of a comparison; refuse analyses without a contrast of one name."""
+    contents = {
+        "analyses": tables.analyses_table(entries),
+        "effects": tables.effects_table(entries),
+        "classification": tables.joined_tables(entries, "classification", _PAIRS),
+        "agreement": tables.agreement_table(entries),
     }
-    effects = tables["effects"]
+    effects = contents["effects"]
     tests = effects.groupby(["contrast", "measure"])["analysis"].nunique() if len(effects) else [0]
-    if not len(tables["agreement"]) and max(tests) < 2:  # noqa: PLR2004 -- analyses
+    if not len(contents["agreement"]) and max(tests) < 2:  # noqa: PLR2004 -- analyses
         raise ModelError(
             "compare: two analyses have no contrast of one name; give both the same --contrast"
         )
-    notes = list(agreement.differences(entries))
-    table = tables["agreement"]
-    measures = dict.fromkeys(table["measure"]) if len(table) else {}
-    region = entries[0].inputs.get("region") or "body"
-    record = {
+    return contents
+
+
+def _record(
+    entries: Sequence[Entry],
+    folder: Path,
+    analyses: pd.DataFrame,
+    command: Sequence[str],
+    region: str,
+) -> dict[str, object]:
+    """Record what is compared; folders are relative to that of the comparison."""
+    return {
         "command": list(command),
         "version": __version__,
         "analyses": {
             entry.name: os.path.relpath(entry.results.folder, folder.parent) for entry in entries
         },
         "maps": {entry.name: entry.measure for entry in entries if entry.measure},
-        "formula": joined(list(dict.fromkeys(tables["analyses"]["formula"].astype(str)))),
-        "participants": joined(tables["analyses"]["n"].astype(str).tolist()),
+        "formula": joined(list(dict.fromkeys(analyses["formula"].astype(str)))),
+        "participants": joined(analyses["n"].astype(str).tolist()),
         "inputs": {
             "datasets": [str(entry.results.folder.resolve()) for entry in entries],
             "region": region,
             **dict.fromkeys(("versions", "seg", "settings_hash")),
         },
     }
-    with write.whole_folder(folder) as scratch:
-        for name, content in tables.items():
-            if len(content):
-                write.write_table(scratch, name, content, meaning=COMPARISON_COLUMNS)
-        drawings = [
-            (f"{measure}_maps", partial(draw_pages, *agreement.effect_rows(entries, measure)))
-            for measure in measures
-        ]
-        notes += write.write_figures(scratch, drawings, prints=figures)
-        methods = agreement.agreement_methods(entries, table, notes, region)
-        files.write_text(scratch / "methods.md", methods)
-        files.write_json(scratch / COMPARISON, {**record, "notes": notes})
-    write_comparison_page(folder, reports=reports)
-    return notes
 
 
 def check_folder(folder: Path) -> None:

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from hipsta_bids.derivatives.analyses import GroupResults, records
-from hipsta_bids.derivatives.names import COMPARISON
+from hipsta_bids.extensions.agreement import COMPARISON
 from hipsta_bids.io import files
 from hipsta_bids.reports import cells
 from hipsta_bids.reports.group import heading, methods, origin
@@ -160,6 +160,9 @@ def comparison_page(folder: Path) -> str:
     )
 
 
-def write_comparison_report(folder: Path) -> None:
-    """Write the page of a comparison, beside its folder."""
-    files.write_text(folder.with_name(f"{folder.name}.html"), comparison_page(folder))
+def write_comparison_page(folder: Path, *, reports: bool) -> None:
+    """Write the page of a comparison beside its folder."""
+    path = folder.with_name(f"{folder.name}.html")
+    files.remove([path])  # it may be that of an earlier comparison
+    if reports:
+        files.write_text(path, comparison_page(folder))

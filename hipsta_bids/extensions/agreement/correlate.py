@@ -10,12 +10,12 @@ import pandas as pd
 from numpy.typing import ArrayLike
 
 from hipsta_bids.errors import InputError, UsageError, did_you_mean, in_python
+from hipsta_bids.extensions.agreement.columns import CORRELATION_COLUMNS
+from hipsta_bids.extensions.agreement.correlation import correlate_maps
 from hipsta_bids.group.output import style, write
 from hipsta_bids.group.output.citations import Citations, escaped
-from hipsta_bids.group.output.tables import CORRELATION_COLUMNS
 from hipsta_bids.io import files, gifti
 from hipsta_bids.stats.arrays import Float
-from hipsta_bids.stats.correlation import correlate_maps
 from hipsta_bids.stats.formula import listed
 from hipsta_bids.types import Mesh
 
@@ -70,36 +70,34 @@ def correlate(
         hb.correlate("means.tsv:mean:measure=thickness:hemi=L:group=CN", "pet.shape.gii",
                      "hemi-L_desc-average_midthickness.surf.gii")
     """
-    side = "L"
-    if isinstance(surface, tuple):
-        points, triangles = np.asarray(surface[0], np.float64), np.asarray(surface[1], np.int64)
-        mesh = Mesh(points=points, triangles=triangles)
-    else:
-        mesh = gifti.read_mesh(Path(surface))
-        side = gifti.structure_side(Path(surface)) or side
-    is_file = [isinstance(one, str | Path) for one in (first, second)]
+    mesh, side = _surface(surface)
+    names = [str(one) if isinstance(one, str | Path) else "array" for one in (first, second)]
     maps = [
-        _read(str(values), side) if by_name else np.asarray(values, np.float64).ravel()
-        for values, by_name in zip((first, second), is_file, strict=True)
+        _read(str(one), side)
+        if isinstance(one, str | Path)
+        else np.asarray(one, np.float64).ravel()
+        for one in (first, second)
     ]
     columns = correlate_maps(maps[0], maps[1], mesh, permutations, seed)
-    names = [
-        str(one) if by_name else "array"
-        for one, by_name in zip((first, second), is_file, strict=True)
-    ]
-    row = pd.Series(
-        {
-            "first": names[0],
-            "second": names[1],
-            **columns,
-            "permutations": permutations,
-            "seed": seed,
-        },
-        dtype=object,
-    )
+    content = {
+        **dict(zip(("first", "second"), names, strict=True)),
+        **columns,
+        "permutations": permutations,
+        "seed": seed,
+    }
+    row = pd.Series(content, dtype=object)
     if out is not None:
         _write(Path(out), row, partial(_drawn, row, maps, mesh))
     return row
+
+
+def _surface(surface: tuple[ArrayLike, ArrayLike] | str | Path) -> tuple[Mesh, str]:
+    """Return a surface and its hemisphere; L where arrays and files name none."""
+    if isinstance(surface, tuple):
+        points, triangles = np.asarray(surface[0], np.float64), np.asarray(surface[1], np.int64)
+        return Mesh(points=points, triangles=triangles), "L"
+    path = Path(surface)
+    return gifti.read_mesh(path), gifti.structure_side(path) or "L"
 
 
 def _read(text: str, hemi: str) -> Float:

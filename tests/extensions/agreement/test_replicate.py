@@ -20,21 +20,17 @@ from small_cohorts import (
     write_hemisphere,
     write_participants,
 )
-from test_tutorials import DOCS, commands, whole
+from tutorial_pages import commands, whole
 
-from hipsta_bids.cli.commands import (
-    compare_parser,
-    phantom_parser,
-    replicate_parser,
-    surrogate_parser,
-)
+from hipsta_bids.cli.commands import phantom_parser, surrogate_parser
 from hipsta_bids.cli.group import group_parser
 from hipsta_bids.cli.main import main
 from hipsta_bids.cli.participant import build_parser
+from hipsta_bids.extensions.agreement.columns import REPLICATE_COLUMNS
+from hipsta_bids.extensions.agreement.commands import compare_parser, replicate_parser
+from hipsta_bids.extensions.agreement.replicate import GROUPS, PUBLISHED
 from hipsta_bids.geometry.catalog import MAPS, PER_SUBFIELD, SUMMARY
 from hipsta_bids.group.output import write
-from hipsta_bids.group.output.tables import REPLICATE_COLUMNS
-from hipsta_bids.group.questions.replicate import GROUPS, PUBLISHED
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.io import files
 from hipsta_bids.io.files import read_tsv
@@ -42,6 +38,7 @@ from hipsta_bids.protocols.protocol import Tissue
 from hipsta_bids.settings import PUBLISHED as PUBLISHED_SETTINGS
 from hipsta_bids.settings import Settings
 
+DOCS = Path(__file__).parents[3] / "docs"
 PAGE = (DOCS / "replicate.md").read_text()
 ROWS = read_tsv(PUBLISHED)
 #: Items of the paper with numbers, and the rows of each.

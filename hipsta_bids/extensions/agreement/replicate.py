@@ -10,10 +10,10 @@ import pandas as pd
 
 from hipsta_bids.derivatives.analyses import GroupResults, records, short_contrast
 from hipsta_bids.errors import ModelError
+from hipsta_bids.extensions.agreement.columns import REPLICATE_COLUMNS
+from hipsta_bids.extensions.agreement.several import open_analysis
 from hipsta_bids.group.output.citations import joined
-from hipsta_bids.group.output.tables import REPLICATE_COLUMNS
 from hipsta_bids.group.output.write import write_table
-from hipsta_bids.group.questions.several import open_analysis
 from hipsta_bids.io.files import MISSING, read_tsv
 from hipsta_bids.types import p_text
 
@@ -48,25 +48,11 @@ def replicate(folder: Path, out: Path, groups: Sequence[str] | None = None) -> l
         If the folder has no analysis, or the analysis no published contrast.
     """
     results, own_groups = open_analysis(folder), groups or GROUPS
-    contrasts, signs = [*(results.record.get("contrasts") or ())], dict[str, tuple[str, int]]()
-    for name, title in zip(own_groups[1:], GROUPS[1:], strict=True):
-        signs[f"{own_groups[0]}-{name}"] = f"{GROUPS[0]}-{title}", 1
-        signs[f"{name}-{own_groups[0]}"] = f"{GROUPS[0]}-{title}", -1
-    if signs.keys().isdisjoint(map(short_contrast, contrasts)):
-        raise ModelError(
-            f"{folder}: no contrast {' or '.join([*signs][::2])}; there is"
-            f" {joined(contrasts) or 'none'}; check --contrast and --groups"
-        )
-    numbers = _of_tests(results, signs)
+    numbers = _of_tests(results, _signs(results, own_groups))
     numbers |= _of_groups(results, dict(zip(own_groups, GROUPS, strict=True)))
     rows, printed = list[dict[str, Any]](), list[dict[str, str]]()
     for row in read_tsv(PUBLISHED):
-        model = "with" if row["file"] == "measures" and "icv" in row["model"] else "without"
-        key = row["file"], row["measure"], row["hemi"], row["contrast"], model
-        lengths = range(1, len(key) + 1)
-        lacking = [n for n in lengths if all(other[:n] != key[:n] for other in numbers)]
-        reason = _REASONS[lacking[0] - 1].format(*key) if lacking else ""
-        values = {} if lacking else numbers[key]
+        values, reason = _counterpart(row, numbers)
         rows.append(row | {f"own_{name}": v for name, v in values.items()} | {"reason": reason})
         paper = " ".join(row[name] for name in ("item", "dataset", "segmentation"))
         contrast = f"{row['contrast']} {row['hemi']}".removesuffix(" LR")
@@ -76,6 +62,31 @@ def replicate(folder: Path, out: Path, groups: Sequence[str] | None = None) -> l
     content = pd.DataFrame(rows, columns=[*REPLICATE_COLUMNS])
     write_table(out, "replicate", content, meaning=REPLICATE_COLUMNS)
     return printed
+
+
+def _signs(results: GroupResults, own_groups: Sequence[str]) -> dict[str, tuple[str, int]]:
+    """Return the published contrast, and the sign that turns to it, by the own contrast."""
+    contrasts, signs = [*(results.record.get("contrasts") or ())], dict[str, tuple[str, int]]()
+    for name, title in zip(own_groups[1:], GROUPS[1:], strict=True):
+        signs[f"{own_groups[0]}-{name}"] = f"{GROUPS[0]}-{title}", 1
+        signs[f"{name}-{own_groups[0]}"] = f"{GROUPS[0]}-{title}", -1
+    if signs.keys().isdisjoint(map(short_contrast, contrasts)):
+        raise ModelError(
+            f"{results.folder}: no contrast {' or '.join([*signs][::2])}; there is"
+            f" {joined(contrasts) or 'none'}; check --contrast and --groups"
+        )
+    return signs
+
+
+def _counterpart(row: Mapping[str, str], numbers: _Numbers) -> tuple[dict[str, Any], str]:
+    """Return the own numbers of a published row, or the reason why none are there."""
+    model = "with" if row["file"] == "measures" and "icv" in row["model"] else "without"
+    key = row["file"], row["measure"], row["hemi"], row["contrast"], model
+    lengths = range(1, len(key) + 1)
+    lacking = [n for n in lengths if all(other[:n] != key[:n] for other in numbers)]
+    if lacking:
+        return {}, _REASONS[lacking[0] - 1].format(*key)
+    return numbers[key], ""
 
 
 def _of_tests(results: GroupResults, signs: Mapping[str, tuple[str, int]]) -> _Numbers:
