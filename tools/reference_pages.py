@@ -134,9 +134,9 @@ beside it gives place and numbers. This page lists the reasons by the action tha
 OPTIONS_TEXT = """\
 `hipsta-bids BIDS_DIR OUTPUT_DIR participant` measures; `hipsta-bids BIDS_DIR OUTPUT_DIR group`
 analyzes. The commands `demo`, `demo-data`, `phantom`, `surrogate`, `meta`, `compare`, `replicate`,
-`correlate`, `resample`, `settings` and `protocols` print their options with `--help`, as both
-levels do; `--version` prints the version. Options accept underscores instead of hyphens
-(`--n_procs`)."""
+`correlate`, `resample`, `settings` and `protocols` print their options with `--help`. For both
+levels `--help` prints the options that a first run needs, and `--help all` all options.
+`--version` prints the version. Options accept underscores instead of hyphens (`--n_procs`)."""
 
 _SHARED_TEXT = "properties of all images with these suffixes"
 

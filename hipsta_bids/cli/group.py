@@ -29,6 +29,12 @@ if TYPE_CHECKING:
     from hipsta_bids.group.settings import GroupSettings
 
 LEVEL = "group"
+#: Options that a first run may need.
+_FIRST = (
+    *("--help", "--version", "--participant-label", "--exclude-look", "--ratings"),
+    *("--covariates", "--formula", "--contrast", "--reference", "--measures", "--name"),
+    *("--longitudinal", "--correction", "--settings"),
+)
 
 _EPILOG = """\
 without --model and --formula: group + age + sex (+ site) from BIDS_DIR/participants.tsv
@@ -48,6 +54,7 @@ def group_parser() -> Parser:
     """Describe ``hipsta-bids BIDS_DIR OUT_DIR group``."""
     parser = Parser(
         prog="hipsta-bids BIDS_DIR OUT_DIR group",
+        first=_FIRST,
         usage="hipsta-bids BIDS_DIR OUT_DIR group [options]",
         description="compare maps and summary measures of participants",
         epilog=_EPILOG.format(questions=questions.listed_questions()),

@@ -3,6 +3,7 @@
 import argparse
 import math
 import re
+import sys
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
@@ -28,17 +29,51 @@ _WORDS = 5  # of a call that a message repeats
 
 
 class Parser(argparse.ArgumentParser):
-    """Accepts underscores for hyphens in options; raises instead of exiting."""
+    """Accepts underscores for hyphens in options; raises instead of exiting.
 
-    def __init__(self, prog: str, description: str, **options: Any) -> None:  # noqa: ANN401  (argparse's)
+    With ``first`` options, ``--help`` shows these alone, and ``--help all`` shows all.
+    """
+
+    def __init__(
+        self,
+        prog: str,
+        description: str,
+        *,
+        first: Sequence[str] = (),
+        **options: Any,  # noqa: ANN401  (argparse's)
+    ) -> None:
         super().__init__(
             prog=prog,
             description=description,
             formatter_class=argparse.RawDescriptionHelpFormatter,
             allow_abbrev=False,
+            add_help=not first,
             **options,
         )
         self._words: list[str] = []
+        if first:
+            self.first = frozenset(first)
+            self.add_argument(
+                "-h",
+                "--help",
+                action=_Help,
+                nargs="?",
+                metavar="all",
+                help="show the options that a first run needs, or all, and exit",
+            )
+
+    def format_first_help(self) -> str:
+        """Return the help with the first options alone."""
+        texts = {action: action.help for action in self._actions}
+        for action in self._actions:
+            if action.option_strings and self.first.isdisjoint(action.option_strings):
+                action.help = argparse.SUPPRESS
+        hidden = sum(action.help != texts[action] for action in self._actions)
+        content = self.format_help()
+        for action, text in texts.items():
+            action.help = text
+        hint = f"{hidden} more options: {self.prog} --help all"
+        return content.replace(self.epilog or "", f"{hint}\n\n{self.epilog or ''}")
 
     def parse_known_args(self, args: Sequence[str], namespace: Any = None) -> Any:  # type: ignore[override]  # noqa: ANN401  (as in argparse, but without its overloads)
         """Parse options in either spelling; the value of ``--slurm`` may begin with a dash.
@@ -97,6 +132,23 @@ class Parser(argparse.ArgumentParser):
                 options[-1][1].append(word)
                 room -= 1
         return max(options, key=lambda pair: len(pair[1]))
+
+
+class _Help(argparse.Action):
+    """Print the help, and end."""
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        _namespace: argparse.Namespace,
+        values: object,
+        _option: str | None = None,
+    ) -> None:
+        content = parser.format_help()
+        if isinstance(parser, Parser) and values != "all":
+            content = parser.format_first_help()
+        sys.stdout.write(content)
+        parser.exit()
 
 
 def accept(parser: argparse.ArgumentParser, options: Mapping[str, str]) -> None:

@@ -40,6 +40,12 @@ if TYPE_CHECKING:
 _HELP = "participant"
 """Texts of the help."""
 
+#: Options that a first run may need.
+_FIRST = (
+    *("--help", "--version", "--dry-run", "--participant-label", "--session-label"),
+    *("--derivatives", "--freesurfer-dir", "--ashs-dir", "--hippunfold-dir", "--ashs-atlas"),
+    *("--settings", "--n-procs", "--mem", "--work-dir"),
+)
 COLLECT = "collect"
 LEVELS = ("participant", COLLECT)
 REGIONS = ("body", "extended", "entorhinal", *EXPERIMENTAL)
@@ -49,7 +55,13 @@ _GIGABYTES = {"K": 1e-6, "M": 1e-3, "G": 1.0, "T": 1e3}
 
 def build_parser(epilog: str | None = None) -> Parser:
     """Describe the participant level's command line."""
-    parser = Parser("hipsta-bids", help_texts()[_HELP]["description"], epilog=epilog)
+    parser = Parser(
+        "hipsta-bids",
+        help_texts()[_HELP]["description"],
+        first=_FIRST,
+        usage="hipsta-bids BIDS_DIR OUT_DIR participant [options]",
+        epilog=epilog,
+    )
     add = adder(parser, _HELP)
     add("bids_dir", type=Path)
     add("output_dir", type=Path)

@@ -1,5 +1,6 @@
 import json
 import os
+import re
 import subprocess
 import sys
 import tempfile
@@ -98,6 +99,21 @@ def test_every_command_has_help_and_is_loaded_by_its_name(command, capsys):
     assert end.value.code == 0
     assert "usage: hipsta-bids" in capsys.readouterr().out
     assert f"hipsta-bids {command}" in EPILOG or f"also: {command}" in EPILOG
+
+
+@pytest.mark.parametrize("level", [["participant"], ["group"]])
+def test_help_begins_with_what_a_first_run_needs(level, capsys):
+    texts = []
+    for more in ([], ["all"]):
+        with pytest.raises(SystemExit) as end:
+            main.main(["in", "out", *level, "--help", *more])
+        assert end.value.code == 0
+        texts.append(capsys.readouterr().out)
+    short, whole = (re.findall(r"^  (-\S.*?)(?:  |$)", text, re.MULTILINE) for text in texts)
+    assert 8 <= len(short) <= 14 < len(whole)
+    assert set(short) < set(whole)
+    assert f"{len(whole) - len(short)} more options" in texts[0]
+    assert "--help all" in texts[0]
 
 
 def test_help_of_the_group_level(capsys):
