@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hipsta_bids import __version__
+from hipsta_bids import __version__, joints
 from hipsta_bids.cli import questions
 from hipsta_bids.cli.console import Progress, echo, echo_start, quiet, warn
 from hipsta_bids.cli.parser import (
@@ -17,12 +17,10 @@ from hipsta_bids.cli.parser import (
     factor_level,
     from_namespace,
     given_settings,
-    named_pattern,
     positive_int,
 )
 from hipsta_bids.cli.participant import REGIONS
 from hipsta_bids.errors import ExitCode, NothingToDoError, UsageError
-from hipsta_bids.joints import find_extensions, find_parts, find_protocols, find_questions, load
 from hipsta_bids.participant.pool import processors
 
 if TYPE_CHECKING:
@@ -58,11 +56,13 @@ def group_parser() -> Parser:
     parser.add_argument("analysis_level", choices=[LEVEL], help=LEVEL)
     parser.add_argument("--version", action="version", version=f"hipsta_bids {__version__}")
     _add_sheets(parser)
+    for source in joints.find_sources():
+        joints.load(source.options)(parser)
     _add_model(parser)
     _add_comparison(parser)
     _add_methods(parser)
     questions.add_questions(parser)
-    for part in find_parts():
+    for part in joints.find_parts():
         adder(parser.add_argument_group(part.heading))(
             part.option, part.value, part.text, nargs="?", const=""
         )
@@ -85,31 +85,10 @@ def _add_sheets(parser: Parser) -> None:
         "level; for volumes",
     )
     add(
-        "--maps",
-        "NAME=PATTERN...",
-        "maps of other programs (GIFTI, CIFTI, TSV), also without sheets: path, also in "
-        "BIDS_DIR, with {subject}, {session}, {hemi} (or {side}), *. CIFTI (.dscalar.nii) has "
-        "both sides.",
-        type=named_pattern,
-    )
-    add(
-        "--maps-surface",
-        "[NAME=]PATTERN...",
-        "surfaces (.surf.gii) whose vertices these points are (default: HippUnfold's unfolded"
-        " surface beside a map, or the grid of the sheets)",
-        type=_maybe_named,
-    )
-    add(
-        "--maps-crop",
-        "",
-        "crop --maps to the sheets: sample them at the nodes of each participant's sheet, by "
-        "surfaces in scanner space",
-    )
-    add(
         "--seg",
         "NAME...",
         "segmentation protocol, where there are several"
-        + ("; two or more are analyzed each, and compared" if find_protocols() else ""),
+        + ("; two or more are analyzed each, and compared" if joints.find_protocols() else ""),
     )
     add(
         "--mixed",
@@ -160,12 +139,6 @@ def _add_sheets(parser: Parser) -> None:
         "exclude: columns participant_id, perhaps session_id, hemi, protocol, region, reason",
     )
     add(
-        "--mask",
-        "MASK...",
-        "grid points to exclude: repaired (by the program), or a table with x, y (node numbers),"
-        " perhaps participant_id, session_id, hemi",
-    )
-    add(
         "--ratings",
         "FILE.tsv",
         (
@@ -182,13 +155,6 @@ def _add_model(parser: Parser) -> None:
         "FILE.tsv...",
         "more tables with participant_id (participants.tsv, sessions.tsv and phenotype/*.tsv"
         " are read anyway)",
-    )
-    add(
-        "--volumes",
-        "NAME=PATTERN...",
-        "tables of volumes (beside segmentations: found anyway): path, also in BIDS_DIR, "
-        "with {subject}, {session}, {hemi} or {side}, *",
-        type=named_pattern,
     )
     add("--model", "FILE.json", "BIDS Stats Model with one dataset node")
     add("--formula", "TEXT", 'such as "thickness ~ group + age + sex"')
@@ -336,11 +302,6 @@ def _folder(text: str) -> Path:
     return Path(text.partition("=")[2] or text)
 
 
-def _maybe_named(text: str) -> tuple[str | None, str]:
-    name, equals, pattern = text.partition("=")
-    return (name, pattern) if equals and name.isalnum() else (None, text)
-
-
 def _condition(text: str) -> tuple[str, str, float]:
     """Read ``METRIC OPERATOR NUMBER``."""
     number = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
@@ -426,8 +387,8 @@ def _rebuild_reports(root: Path, name: str | None) -> ExitCode:
 
     makers = dict.fromkeys(pages.group_models(root), pages.group_page)
     # Last, as they link the pages of analyses that exist.
-    for page in (page for extension in find_extensions() for page in extension.pages):
-        makers |= dict.fromkeys(pages.group_models(root, page.record), load(page.make))
+    for page in (page for extension in joints.find_extensions() for page in extension.pages):
+        makers |= dict.fromkeys(pages.group_models(root, page.record), joints.load(page.make))
     models = [model for model in makers if name in {None, model}]
     if not models:
         raise NothingToDoError(
@@ -469,9 +430,9 @@ def _settings(parsed: argparse.Namespace) -> "GroupSettings":
             "sides": parsed.joint_sides or None,
         },
     }
-    for question in find_questions():
+    for question in joints.find_questions():
         if question.settings:
-            choices |= load(question.settings)(parsed)
+            choices |= joints.load(question.settings)(parsed)
     settings = load_group_settings(parsed.settings)
     settings = settings.changed(**given_settings(choices))
     if parsed.harmonize:
@@ -496,7 +457,6 @@ def _options(parsed: argparse.Namespace, arguments: Sequence[str]) -> "GroupOpti
         excluded=tuple(parsed.exclude_participant_label),
         sessions=tuple(parsed.session_label),
         exclude_table=parsed.exclude,
-        masks=tuple(parsed.mask or ()),
     )
     model = from_namespace(
         ModelRequest,
@@ -523,12 +483,14 @@ def _options(parsed: argparse.Namespace, arguments: Sequence[str]) -> "GroupOpti
         sheets=sheets,
         model=model,
         comparison=comparison,
-        surfaces=tuple(parsed.maps_surface),
+        sources=tuple(
+            one for source in joints.find_sources() for one in joints.load(source.make)(parsed)
+        ),
         measures=tuple(dict.fromkeys(parsed.measures)),
         reports=not parsed.no_reports,
         parts=tuple(
             (part, value)
-            for part in find_parts()
+            for part in joints.find_parts()
             if (value := getattr(parsed, part.name)) is not None
         ),
         command=("hipsta-bids", *arguments),

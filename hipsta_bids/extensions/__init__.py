@@ -4,4 +4,4 @@
 """
 
 #: Folders, in the order of the help.
-NAMES = ("consortia", "trials", "norms", "agreement")
+NAMES = ("consortia", "trials", "norms", "agreement", "maps")

@@ -12,7 +12,6 @@ from hipsta_bids.derivatives.analyses import GroupResults
 from hipsta_bids.group import model as modeling
 from hipsta_bids.group.cohort import collect
 from hipsta_bids.group.cohort.data import SHEET, modeled_table
-from hipsta_bids.group.cohort.masks import mask_note
 from hipsta_bids.group.cohort.quality import quality_notes, quality_table
 from hipsta_bids.group.output.results import Analysis, harmonization_record
 from hipsta_bids.group.output.saved import load_effects
@@ -106,9 +105,7 @@ def _analyze(options: studies.GroupOptions, settings: GroupSettings) -> studies.
     notes = [*study.notes, *_notes(study, analysis)]
     quality = quality_table(study.quality, groups.column) if groups else pd.DataFrame()
     notes += quality_notes(quality)
-    if study.masked is not None:
-        shares = study.masked[study.masked["visit"].isin(cohort.table.index)]
-        notes.append(mask_note(shares, cohort.table[groups.column] if groups else None))
+    notes += [remark(cohort.table, groups.column if groups else None) for remark in study.remarks]
     writers, notes_of_parts = _parts(study, analysis)
     notes += notes_of_parts
     in_slices = surrogate_table(study.collection.records, analysis, settings.glm.confidence)
@@ -131,11 +128,7 @@ def _analyze(options: studies.GroupOptions, settings: GroupSettings) -> studies.
             region=options.sheets.region,
             ratings=study.collection.ratings,
             labels=study.labels,
-            cropped=[
-                name
-                for name, pattern in options.maps
-                if options.maps_crop and name in study.maps and not pattern.endswith(".tsv")
-            ],
+            sentences=study.sentences(),
         )
         files.write_json(folder / "model.json", document)
         if len(in_slices):
@@ -152,7 +145,7 @@ def _analyze(options: studies.GroupOptions, settings: GroupSettings) -> studies.
             folder=folder,
             record={
                 **record,
-                "inputs": {"maps": dict(options.maps)},
+                "inputs": options.record_of_sources,
                 "settings": resolve(settings),
             },
         )
