@@ -115,6 +115,16 @@ class Step:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Source:
+    """What a study has beside the sheets: another kind of map, of summary measure, or a mask."""
+
+    options: str
+    """Function that adds its options to the parser of the group level."""
+    make: str
+    """Function of the parsed options; returns sources (`hipsta_bids.group.cohort.sources`)."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Page:
     """A page that ``--reports-only`` makes again, beside the pages of analyses."""
 
@@ -135,6 +145,7 @@ class Extension:
     parts: tuple[Part, ...] = ()
     questions: tuple[Question, ...] = ()
     steps: tuple[Step, ...] = ()
+    sources: tuple[Source, ...] = ()
     pages: tuple[Page, ...] = ()
     protocols: str = ""
     """Function of the options and settings of the group level, and of protocols: runs each."""
@@ -175,6 +186,11 @@ def find_functions() -> dict[str, str]:
     """Find functions of the Python interface: their modules, by name."""
     places = [place.split(":") for extension in find_extensions() for place in extension.functions]
     return {name: module for module, name in places}
+
+
+def find_sources() -> tuple[Source, ...]:
+    """Find what extensions read beside the sheets, in the order of reading."""
+    return tuple(source for extension in find_extensions() for source in extension.sources)
 
 
 def find_questions() -> tuple[Question, ...]:

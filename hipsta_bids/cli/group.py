@@ -17,7 +17,6 @@ from hipsta_bids.cli.parser import (
     factor_level,
     from_namespace,
     given_settings,
-    named_pattern,
     positive_int,
 )
 from hipsta_bids.cli.participant import REGIONS
@@ -64,6 +63,8 @@ def group_parser() -> Parser:
     parser.add_argument("analysis_level", choices=[LEVEL], help=LEVEL)
     parser.add_argument("--version", action="version", version=f"hipsta_bids {__version__}")
     _add_sheets(parser)
+    for source in joints.find_sources():
+        joints.load(source.options)(parser)
     _add_model(parser)
     _add_comparison(parser)
     _add_methods(parser)
@@ -91,27 +92,6 @@ def _add_sheets(parser: Parser) -> None:
         "DIR...",
         "folders of FreeSurfer, ASHS or HippUnfold that have moved since the participant "
         "level; for volumes",
-    )
-    add(
-        "--maps",
-        "NAME=PATTERN...",
-        "maps of other programs (GIFTI, CIFTI, TSV), also without sheets: path, also in "
-        "BIDS_DIR, with {subject}, {session}, {hemi} (or {side}), *. CIFTI (.dscalar.nii) has "
-        "both sides.",
-        type=named_pattern,
-    )
-    add(
-        "--maps-surface",
-        "[NAME=]PATTERN...",
-        "surfaces (.surf.gii) whose vertices these points are (default: HippUnfold's unfolded"
-        " surface beside a map, or the grid of the sheets)",
-        type=_maybe_named,
-    )
-    add(
-        "--maps-crop",
-        "",
-        "crop --maps to the sheets: sample them at the nodes of each participant's sheet, by "
-        "surfaces in scanner space",
     )
     add(
         "--seg",
@@ -168,12 +148,6 @@ def _add_sheets(parser: Parser) -> None:
         "exclude: columns participant_id, perhaps session_id, hemi, protocol, region, reason",
     )
     add(
-        "--mask",
-        "MASK...",
-        "grid points to exclude: repaired (by the program), or a table with x, y (node numbers),"
-        " perhaps participant_id, session_id, hemi",
-    )
-    add(
         "--ratings",
         "FILE.tsv",
         (
@@ -190,13 +164,6 @@ def _add_model(parser: Parser) -> None:
         "FILE.tsv...",
         "more tables with participant_id (participants.tsv, sessions.tsv and phenotype/*.tsv"
         " are read anyway)",
-    )
-    add(
-        "--volumes",
-        "NAME=PATTERN...",
-        "tables of volumes (beside segmentations: found anyway): path, also in BIDS_DIR, "
-        "with {subject}, {session}, {hemi} or {side}, *",
-        type=named_pattern,
     )
     add("--model", "FILE.json", "BIDS Stats Model with one dataset node")
     add("--formula", "TEXT", 'such as "thickness ~ group + age + sex"')
@@ -324,11 +291,6 @@ def _add_reports(parser: Parser) -> None:
 
 def _folder(text: str) -> Path:
     return Path(text.partition("=")[2] or text)
-
-
-def _maybe_named(text: str) -> tuple[str | None, str]:
-    name, equals, pattern = text.partition("=")
-    return (name, pattern) if equals and name.isalnum() else (None, text)
 
 
 def _condition(text: str) -> tuple[str, str, float]:
@@ -483,7 +445,6 @@ def _options(parsed: argparse.Namespace, arguments: Sequence[str]) -> "GroupOpti
         excluded=tuple(parsed.exclude_participant_label),
         sessions=tuple(parsed.session_label),
         exclude_table=parsed.exclude,
-        masks=tuple(parsed.mask or ()),
     )
     model = from_namespace(
         ModelRequest,
@@ -510,7 +471,9 @@ def _options(parsed: argparse.Namespace, arguments: Sequence[str]) -> "GroupOpti
         sheets=sheets,
         model=model,
         comparison=comparison,
-        surfaces=tuple(parsed.maps_surface),
+        sources=tuple(
+            one for source in joints.find_sources() for one in joints.load(source.make)(parsed)
+        ),
         measures=tuple(dict.fromkeys(parsed.measures)),
         reports=not parsed.no_reports,
         further={

@@ -266,7 +266,7 @@ SECTIONS: tuple[Section[GroupResults], ...] = (
     Section("model", "Model", "group/model.html", design),
     Section("registration", "Registration", "group/registration.html", _registration),
     Section("sections", "Average cross-sections", "group/sections.html", _sections_of_groups),
-    Section("surrogate", "Surrogate thickness", "comparison/table.html", _surrogate),
+    Section("surrogate", "Surrogate thickness", "group/table.html", _surrogate),
     Section("methods", "Methods paragraph", "group/methods.html", methods),
     Section("origin", "Origin", "group/origin.html", origin),
 )

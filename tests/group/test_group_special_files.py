@@ -6,7 +6,7 @@ import signal
 from pathlib import Path
 
 import pytest
-from extension_marks import PRESENT
+from extension_marks import PRESENT, needs
 from small_cohorts import FAST, place_of, write_dataset
 
 from hipsta_bids.cli.main import main
@@ -87,6 +87,7 @@ def test_sessions_end_at_once(tmp_path, capsys):
     assert "sub-02_sessions.tsv: not readable as a table (no regular" in capsys.readouterr().err
 
 
+@needs("maps")
 @pytest.mark.parametrize("kind", ["fifo", "zero"])
 @pytest.mark.parametrize("place", ["volumes/sub-01.tsv", "maps/sub-01_hemi-L.shape.gii"])
 def test_patterns_match_regular_files_only(study, capsys, kind, place):

@@ -13,7 +13,7 @@ from hipsta_bids.reports.group_maps import MOST_FIGURES, embedded
 from hipsta_bids.reports.page import Section, build_sections, render
 from hipsta_bids.types import SIDES, p_text
 
-_TEMPLATE = "comparison/table.html"
+_TEMPLATE = "group/table.html"
 _MOST_LINES = 12  # of findings; all are in the table of effect maps
 _HEADINGS = {
     "seg": "Protocol", "n_L": "Left", "n_R": "Right", "n_failed": "Failed", "hemi": "Side",

@@ -48,8 +48,6 @@ class GroupRequest:
     exclude_qc: tuple[Condition, ...] = ()
     exclude_table: Path | None = None
     """Participants, or single sessions and hemispheres, to leave out."""
-    masks: tuple[str, ...] = ()
-    """Grid points that count as missing: ``repaired``, or tables."""
     ratings: Path | None = None
     """Ratings of hemispheres, saved from the report."""
     segmentations: tuple[Path, ...] = ()

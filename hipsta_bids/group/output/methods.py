@@ -1,14 +1,13 @@
 """A methods and results paragraph with the numbers of one analysis filled in."""
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 import pandas as pd
 
 from hipsta_bids import __version__
-from hipsta_bids.group.cohort.crop import REACH
 from hipsta_bids.group.cohort.data import SIZES, Cohort
 from hipsta_bids.group.cohort.read import LEAST_SHARE
 from hipsta_bids.group.output.citations import Citations, code, escaped, joined
@@ -55,7 +54,7 @@ def methods_text(
     n_out: int,
     *,
     surfaces: Sequence[str] = (),
-    cropped: Sequence[str] = (),
+    sentences: Sequence[str] = (),
     region: str = "body",
     ratings: Mapping[str, int] | None = None,
     demographics: pd.DataFrame,
@@ -72,7 +71,7 @@ def methods_text(
             " were excluded."
         )
     aligned = [_registration(analysis, settings, cite)] if analysis.registrations else []
-    aligned += _other_maps(surfaces, cropped)
+    aligned += sentences
     if aligned:
         paragraphs.append(" ".join(aligned))
     if region in EXPERIMENTAL and analysis.fitted:
@@ -92,21 +91,6 @@ def methods_text(
         points = (f"- {escaped(line)}" for line in analysis.skipped)
         paragraphs.append("\n".join(["Notes:", "", *points]))
     return cite.page(paragraphs, region)
-
-
-def _other_maps(surfaces: Sequence[str], cropped: Sequence[str]) -> Iterator[str]:
-    """Say how maps of other programs were brought to points that correspond."""
-    if surfaces:
-        yield (
-            f"Maps of other programs ({', '.join(surfaces)}) were compared point by point, without"
-            " registration."
-        )
-    if cropped:
-        yield (
-            f"Maps of other programs ({', '.join(cropped)}) were sampled at the nodes of each"
-            f" participant's sheet, within {REACH:g} mm of the program's surface in scanner"
-            " space. They end at the end planes of the sheet and follow its registration."
-        )
 
 
 def _sample(

@@ -86,7 +86,7 @@ def write_results(
     region: str = "body",
     ratings: Mapping[str, int] | None = None,
     labels: Mapping[str, list[str]],
-    cropped: Sequence[str] = (),
+    sentences: Sequence[str] = (),
 ) -> None:
     """Write tables, maps and text; cohorts and analyses are by surface."""
     cohort, analysis = cohorts[SHEET], analyses[SHEET]
@@ -127,7 +127,7 @@ def write_results(
         settings,
         len(exclusions),
         surfaces=[surface for surface in cohorts if surface != SHEET],
-        cropped=cropped,
+        sentences=sentences,
         region=region,
         ratings=ratings,
         demographics=people,

@@ -12,7 +12,6 @@ from hipsta_bids.derivatives.analyses import GroupResults
 from hipsta_bids.group import model as modeling
 from hipsta_bids.group.cohort import collect
 from hipsta_bids.group.cohort.data import SHEET
-from hipsta_bids.group.cohort.masks import mask_note
 from hipsta_bids.group.cohort.quality import quality_notes, quality_table
 from hipsta_bids.group.output.results import Analysis
 from hipsta_bids.group.output.shapes import average_shapes, write_shapes
@@ -126,9 +125,7 @@ def _write(
     exclusions = [*study.exclusions, *collect.exclude_visits(table, incomplete)]
     quality = quality_table(study.quality, groups.column) if groups else pd.DataFrame()
     notes = [*study.notes, *notes_of(study, analysis), *quality_notes(quality)]
-    if study.masked is not None:
-        shares = study.masked[study.masked["visit"].isin(cohort.table.index)]
-        notes.append(mask_note(shares, cohort.table[groups.column] if groups else None))
+    notes += [remark(cohort.table, groups.column if groups else None) for remark in study.remarks]
     writers, notes_of_parts = _parts(study, analysis)
     notes += notes_of_parts
     in_slices = surrogate_table(study.collection.records, analysis, settings.glm.confidence)
@@ -151,7 +148,7 @@ def _write(
             region=options.sheets.region,
             ratings=study.collection.ratings,
             labels=study.labels,
-            cropped=_cropped(study),
+            sentences=study.sentences(),
         )
         files.write_json(folder / "model.json", document)
         for name, content in (("surrogate", in_slices), ("quality", quality)):
@@ -163,7 +160,7 @@ def _write(
         if analysis.registered and study.collection.records and not shapes:
             notes.append("no average surfaces: the surfaces of the participant level are missing")
         record = _record(analysis, study.collection.ratings)
-        inputs = {"maps": dict(options.maps)}
+        inputs = options.record_of_sources
         saved_record = {**record, "inputs": inputs, "settings": resolve(settings)}
         saved = GroupResults(folder=folder, record=saved_record)
         notes.extend(draw(saved, study.cohorts, analyses, shapes, prints=options.figures))
@@ -176,16 +173,6 @@ def _write(
         counts=(analysis.n_participants, len(exclusions)),
         fill=fill,
     )
-
-
-def _cropped(study: studies.Study) -> list[str]:
-    """Name the maps of other programs that were sampled at the nodes of sheets."""
-    options = study.options
-    return [
-        name
-        for name, pattern in options.maps
-        if options.maps_crop and name in study.maps and not pattern.endswith(".tsv")
-    ]
 
 
 def _parts(study: studies.Study, analysis: Analysis) -> tuple[list[Writer], list[str]]:

@@ -11,14 +11,13 @@ import pandas as pd
 
 from hipsta_bids import __version__
 from hipsta_bids.derivatives import dataset
-from hipsta_bids.errors import InputError, ModelError, UsageError
+from hipsta_bids.errors import InputError, ModelError
 from hipsta_bids.group import model as modeling
-from hipsta_bids.group.cohort import collect, external, read
+from hipsta_bids.group.cohort import collect, read
 from hipsta_bids.group.cohort.covariates import add_icv, add_time, read_covariates, spelled_note
-from hipsta_bids.group.cohort.crop import Places, crop_maps
 from hipsta_bids.group.cohort.data import SHEET, Cohort, Measures, choose_visits
-from hipsta_bids.group.cohort.masks import mask_sheets
 from hipsta_bids.group.cohort.order import read_in_order
+from hipsta_bids.group.cohort.sources import Reading, Remark, Search, Source
 from hipsta_bids.group.output import write
 from hipsta_bids.group.output.citations import REFERENCES
 from hipsta_bids.group.output.demographics import demographics_table
@@ -36,7 +35,7 @@ from hipsta_bids.protocols.toml import resolve
 from hipsta_bids.stats.arrays import Bool
 from hipsta_bids.stats.formula import ascii_letters, check_names, listed, with_factors
 from hipsta_bids.stats.warps import Template
-from hipsta_bids.types import PARTICIPANT, SESSION
+from hipsta_bids.types import PARTICIPANT, SESSION, VisitKey
 
 #: Share of participants that may be without a row in participants.tsv.
 _MOST_ABSENT = 0.1
@@ -53,14 +52,8 @@ class GroupOptions:
     sheets: collect.GroupRequest
     model: modeling.ModelRequest
     covariates: tuple[Path, ...] = ()
-    maps: tuple[tuple[str, str], ...] = ()
-    """Names and patterns of other programs' maps."""
-    surfaces: tuple[tuple[str | None, str], ...] = ()
-    """Patterns of the surfaces to draw these on, for one or for all."""
-    maps_crop: bool = False
-    """Whether these maps are sampled at the nodes of the sheets."""
-    volumes: tuple[tuple[str, str], ...] = ()
-    """Names and patterns of other programs' tables of volumes."""
+    sources: tuple[Source, ...] = ()
+    """Of maps and measures beside the sheets, in the order of reading."""
     measures: tuple[str, ...] = ()
     """What to fit the model to; empty for the default or the formula's left-hand side."""
     template: Path | None = None
@@ -79,6 +72,11 @@ class GroupOptions:
     """Whether figures are written for print, too, as PDF and PNG."""
     command: tuple[str, ...] = ()
     """The command line, for the record."""
+
+    @property
+    def record_of_sources(self) -> dict[str, Any]:
+        """Return names and patterns of the files of sources, for the record."""
+        return {name: value for source in self.sources for name, value in source.record.items()}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -129,8 +127,8 @@ class Study:
     """Reason and message by further visits that are left out."""
     quality: pd.DataFrame = field(default_factory=pd.DataFrame)
     """Decision and rating of each hemisphere, also of failed ones, with covariates."""
-    masked: pd.DataFrame | None = None
-    """Visit, side and share of masked points of each sheet, if a mask is asked for."""
+    remarks: tuple[Remark, ...] = ()
+    """Notes of sources that need the groups."""
     mixes: tuple[str, ...] = ()
     """In what hemispheres differ, as far as the settings allow it, one line each."""
     labels: Mapping[str, list[str]] = field(default_factory=dict)
@@ -145,6 +143,12 @@ class Study:
     def maps(self) -> list[str]:
         """Return the maps of all surfaces."""
         return [*self.measures.maps, *(name for name in self.cohorts if name != SHEET)]
+
+    def sentences(self) -> list[str]:
+        """Return sentences of the methods by the sources."""
+        surfaces = [name for name in self.cohorts if name != SHEET]
+        texts = (source.sentences(self.maps, surfaces) for source in self.options.sources)
+        return [sentence for of_source in texts for sentence in of_source]
 
     def incomplete(
         self, lacking: Mapping[str, Iterable[str]], people: pd.Series
@@ -265,8 +269,7 @@ class Study:
                     "versions": collection.versions,
                     "seg": collection.records[0].result.name.seg if collection.records else None,
                     "region": region,
-                    "maps": dict(options.maps),
-                    "volumes": dict(options.volumes),
+                    **options.record_of_sources,
                     "covariates": [str(path) for path in options.covariates],
                     "template": options.template and str(options.template),
                     **_further_inputs(options),
@@ -294,58 +297,82 @@ class Study:
 def read_study(
     options: GroupOptions, settings: GroupSettings, among: tuple[str, str] | None = None
 ) -> Study:
-    """Find and read sheets, other maps, volumes and covariates, of all or of some participants."""
+    """Find and read sheets, covariates and sources, of all or of some participants."""
     tell("reading")
-    external.check_volumes(options.volumes)
-    collection = collect.collect_sheets(options.sheets, may_lack=bool(options.maps))
-    reserved = read.SHEET_MAPS if collection.records else ()
-    requests = external.map_patterns(options.maps, options.surfaces, reserved)
-    requested = modeling.wanted_measures(options.model, options.measures)
-    measures = read.choose_measures(requested, collection.records, [one.name for one in requests])
-    covariate_maps = modeling.covariate_maps(options.model)
-    if covariate_maps:
-        known_maps = [one.name for one in requests]
-        found_maps = read.choose_measures(covariate_maps, collection.records, known_maps)
-        if found_maps.summaries:
-            raise ModelError(f"map({found_maps.summaries[0]}) in the formula: it is no map")
-    files_of, visits = external.find_all(
-        [one for one in requests if one.name in {*measures.maps, *covariate_maps}],
+    may_lack = any(source.has_maps for source in options.sources)
+    collection = collect.collect_sheets(options.sheets, may_lack=may_lack)
+    with_sheets = bool(collection.records)
+    names = [n for source in options.sources for n in source.names(with_sheets=with_sheets)]
+    measures, covariate_maps = _choose_maps(options, collection, names)
+    maps = dict.fromkeys((*measures.maps, *covariate_maps))
+    search = Search(
+        bids_dir=options.bids_dir,
+        maps=frozenset(maps),
+        visits=read.visits_of(collection.records),
+        choice=partial(collect.wanted_by, options.sheets),
+    )
+    sources = [source.find(search) for source in options.sources]
+    visits: set[VisitKey] = set(search.visits).union(*(visits for _, visits in sources))
+    collection, ordered, (covariates, absent, spelled) = read_in_order(
+        collection,
+        sorted(visits, key=lambda visit: (visit[0], visit[1] or "")),
         options.bids_dir,
-        read.visits_of(collection.records),
-        partial(collect.wanted_by, options.sheets),
+        options.covariates,
+        settings,
     )
-    collection, visits, (covariates, absent, spelled) = read_in_order(
-        collection, visits, options.bids_dir, options.covariates, settings
-    )
-    names = {one.name for one in requests}
     sheets = read.read_sheets(
         collection.records,
         collection.grid,
-        [name for name in dict.fromkeys((*measures.maps, *covariate_maps)) if name not in names],
-        visits,
+        [name for name in maps if name not in names],
+        ordered,
         max_gap=settings.registration.max_gap,
     )
-    crop = partial(crop_maps, places=_places(collection)) if options.maps_crop else None
-    sheets, surfaces, map_notes = external.add_external(sheets, files_of, visits, crop)
-    if covariate_maps and surfaces:
-        raise ModelError(
-            f"maps {listed(surfaces)} are not on the grid of the sheet, but map() in the formula"
-            " is; remove one"
-        )
-    measured, volume_notes = external.add_volumes(
-        sheets, collection.records, options.volumes, options.bids_dir
+    reading = Reading(
+        bids_dir=options.bids_dir, collection=collection, visits=ordered, measured=sheets
     )
-    mask_notes: list[str] = []
-    masked = None
-    if options.sheets.masks:
-        records = collection.records
-        measured, masked, mask_notes = mask_sheets(measured, records, options.sheets.masks)
-    read.check_summaries(measures, measured.sides)
-    quality = _with_covariates(collection.quality, covariates, options, settings)
-    table_notes = [*spelled.notes, *_absence(absent, covariates, options)]
+    for source, _ in sources:
+        reading = source.add(reading)
+    if covariate_maps and reading.surfaces:
+        raise ModelError(
+            f"maps {listed(reading.surfaces)} are not on the grid of the sheet, but map() in the"
+            " formula is; remove one"
+        )
+    read.check_summaries(measures, reading.measured.sides)
+    notes = [*spelled.notes, *_absence(absent, covariates, options)]
     if spelled:
         file = options.model.file and files.read_json(options.model.file)
-        table_notes.append(spelled_note(spelled, options.model.formula or str(file), settings))
+        notes.append(spelled_note(spelled, options.model.formula or str(file), settings))
+    study = _study(reading, covariates, measures, options, settings)
+    study = replace(study, absent=absent, among=among, notes=(*study.notes, *notes))
+    return study.take(
+        members(study.cohort.table, among), ("not-asked", "another level than --among")
+    )
+
+
+def _choose_maps(
+    options: GroupOptions, collection: collect.Collection, names: Sequence[str]
+) -> tuple[Measures, Sequence[str]]:
+    """Choose measures and the maps of covariates; ``names`` are the maps of sources."""
+    requested = modeling.wanted_measures(options.model, options.measures)
+    measures = read.choose_measures(requested, collection.records, names)
+    covariate_maps = modeling.covariate_maps(options.model)
+    if covariate_maps:
+        of_covariates = read.choose_measures(covariate_maps, collection.records, names)
+        if of_covariates.summaries:
+            raise ModelError(f"map({of_covariates.summaries[0]}) in the formula: it is no map")
+    return measures, covariate_maps
+
+
+def _study(
+    reading: Reading,
+    covariates: pd.DataFrame,
+    measures: Measures,
+    options: GroupOptions,
+    settings: GroupSettings,
+) -> Study:
+    """Choose the visits that are compared, and add ICV and time."""
+    collection, measured, surfaces = reading.collection, reading.measured, reading.surfaces
+    quality = _with_covariates(collection.quality, covariates, options, settings)
     all_visits = Cohort(
         table=with_factors(covariates, settings.design, settings.model),
         sides=measured.sides,
@@ -358,16 +385,15 @@ def read_study(
     cohorts = {SHEET: all_visits, **surfaces}
     rows = np.concatenate([side.rows for one in cohorts.values() for side in one.sides.values()])
     has_maps = np.isin(np.arange(len(all_visits.table)), rows)
-    cohort, reasons = choose_visits(all_visits.take(has_maps), options.comparison)
+    comparison = options.comparison
+    cohort, reasons = choose_visits(all_visits.take(has_maps), comparison)
     keep = all_visits.table.index.isin(cohort.table.index)
     table, icv = add_icv(cohort.table, measured.sources, settings)
-    comparison = options.comparison
     time = add_time(table, settings, comparison) if comparison.longitudinal else None
     cohort = replace(cohort, table=table if time is None else time.table)
-    is_named = comparison.pair or comparison.endpoint
-    reason = "other-session" if is_named else "later-session"
+    reason = "other-session" if comparison.pair or comparison.endpoint else "later-session"
     reasons_of = {visit: (reason, message) for visit, message in reasons.items()}
-    study = Study(
+    return Study(
         options=options,
         settings=settings,
         collection=collection,
@@ -382,17 +408,10 @@ def read_study(
             *measured.damaged,
             *collect.exclude_visits(measured.table, reasons_of),
         ),
-        notes=(
-            *(*collection.notes, *map_notes, *mask_notes, *volume_notes),
-            *(*_damaged(measured), *table_notes),
-        ),
-        masked=masked,
+        notes=(*collection.notes, *reading.notes, *_damaged(measured)),
+        remarks=reading.remarks,
         quality=quality,
-        absent=absent,
-        among=among,
     )
-    keep = members(cohort.table, among)
-    return study.take(keep, ("not-asked", "another level than --among"))
 
 
 def _absence(absent: frozenset[str], covariates: pd.DataFrame, options: GroupOptions) -> list[str]:
@@ -406,14 +425,6 @@ def _absence(absent: frozenset[str], covariates: pd.DataFrame, options: GroupOpt
         )
     note = f"participants.tsv: has no row of {names}; add it, or check its label"
     return [note] * bool(absent)
-
-
-def _places(collection: collect.Collection) -> Places:
-    """Return the sheets by visit and hemisphere."""
-    results = [record.result for record in collection.records]
-    if not results:
-        raise UsageError("--maps-crop: there are no sheets; run the participant level first")
-    return {((r.name.subject, r.name.session), r.name.hemi): r for r in results}
 
 
 def _with_covariates(
@@ -460,7 +471,8 @@ def _describe_dataset(options: GroupOptions) -> None:
     files.make_folder(options.out_dir)
     if not (options.out_dir / "dataset_description.json").exists():
         roots = [root for root in options.sheets.roots if root != options.out_dir]
-        roots += [options.bids_dir] if options.maps else []
+        has_maps = any(source.has_maps for source in options.sources)
+        roots += [options.bids_dir] if has_maps else []
         names = dataset.source_names((root.resolve().name, root) for root in roots)
         dataset.write_description(options.out_dir, names)
     dataset.write_notes(options.out_dir)

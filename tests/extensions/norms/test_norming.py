@@ -6,6 +6,7 @@ import shutil
 import nibabel as nib
 import numpy as np
 import pytest
+from extension_marks import needs
 from hippunfold_like import flat_surface, write_map, write_surface
 from norm_cohorts import write_people
 from pyarrow import parquet
@@ -334,6 +335,7 @@ def test_it_draws_charts_and_maps(people, norms):
     assert page.count("data:image/svg+xml") == 2
 
 
+@needs("maps")
 def test_maps_of_other_programs_without_sheets_or_sites(tmp_path, capsys):
     random = np.random.default_rng(0)
     points, triangles = flat_surface(12)

@@ -7,6 +7,7 @@ from functools import partial
 import numpy as np
 import pandas as pd
 import pytest
+from extension_marks import needs
 from hippunfold_like import PATTERNS, flat_surface, names, write_map, write_surface
 from pyarrow import parquet
 from small_cohorts import (
@@ -401,6 +402,7 @@ def test_variables_that_sites_explain_are_noted():
     assert any("site explains 9" in note and "of age" in note for note in done.notes)
 
 
+@needs("maps")
 def test_maps_of_other_programs(study, tmp_path, quick):
     data, _ = study
     random = np.random.default_rng(2)

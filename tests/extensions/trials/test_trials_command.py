@@ -6,6 +6,7 @@ import re
 import nibabel as nib
 import numpy as np
 import pytest
+from extension_marks import needs
 from hippunfold_like import flat_surface, names, write_map, write_surface
 from small_cohorts import NODES, place_of, table, write_participants, write_sessions
 from statsmodels.api import OLS
@@ -224,6 +225,7 @@ def test_retest_feeds_sample_sizes(dataset):
     assert any("include only the variance of measurement" in note for note in record["notes"])
 
 
+@needs("maps")
 def test_maps_of_other_programs_lie_on_their_surface(tmp_path):
     data, out, random = tmp_path / "bids", tmp_path / "out", np.random.default_rng(0)
     surface = flat_surface(60)

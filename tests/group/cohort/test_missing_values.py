@@ -10,7 +10,6 @@ from small_cohorts import place_of
 from hipsta_bids.errors import InputError, ModelError
 from hipsta_bids.group.cohort.covariates import read_covariates, spelled_note
 from hipsta_bids.group.cohort.exclusions import Choices
-from hipsta_bids.group.cohort.external import read_volumes
 from hipsta_bids.group.questions.models import group
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.inputs.edits import read_ends
@@ -247,9 +246,6 @@ def test_all_tables_of_users_share_the_list(tmp_path, word):
     assert (row.session, row.end.normal) == (None, None)
     path.write_text(f"thickness\n1.5\n{word or 'n/a'}\n")
     np.testing.assert_array_equal(gifti.read_map(path, "L", "thickness").values, [1.5, np.nan])
-    volumes = tmp_path / "sub-1_volumes.tsv"
-    volumes.write_text(f"subject\themi\tCA1\tSub\n1\tL\t{word}\t7\n")
-    assert np.isnan(read_volumes(volumes)["L"]["CA1"])
 
 
 def test_tables_of_python_are_read_alike():

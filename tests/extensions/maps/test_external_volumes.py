@@ -5,7 +5,12 @@ import pandas as pd
 import pytest
 
 from hipsta_bids.errors import InputError
-from hipsta_bids.group.cohort.external import VolumeTable, join_volumes, read_volumes, table_beside
+from hipsta_bids.extensions.maps.volumes import (
+    VolumeTable,
+    join_volumes,
+    read_volumes,
+    table_beside,
+)
 
 FREESURFER = """\
 Hippocampal_tail 563.290157
@@ -116,3 +121,10 @@ def test_same_structure_twice_is_refused(tmp_path):
     tables = [VolumeTable(name="x", visit="sub-01", path=path) for path in paths]
     with pytest.raises(InputError, match="make the pattern match one"):
         join_volumes(tables, pd.Index(["sub-01"]))
+
+
+@pytest.mark.parametrize("word", ["NA", "unknown", "-", "", "n/a"])
+def test_missing_values_are_those_of_other_tables(tmp_path, word):
+    path = tmp_path / "sub-1_volumes.tsv"
+    path.write_text(f"subject\themi\tCA1\tSub\n1\tL\t{word}\t7\n")
+    assert np.isnan(read_volumes(path)["L"]["CA1"])

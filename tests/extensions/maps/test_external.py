@@ -17,7 +17,7 @@ from hippunfold_like import (
 from nibabel.cifti2 import BrainModelAxis, Cifti2Image, ScalarAxis
 
 from hipsta_bids.errors import InputError, NothingToDoError, UsageError
-from hipsta_bids.group.cohort.external import find_maps, map_patterns, read_maps
+from hipsta_bids.extensions.maps.external import find_maps, map_patterns, read_maps
 from hipsta_bids.inputs.maps import scan
 from hipsta_bids.io import files
 from hipsta_bids.io.gifti import read_map, read_mesh

@@ -11,8 +11,8 @@ from small_cohorts import NODES, PLAN, methods_of, place_of, table, write_datase
 
 from hipsta_bids.cli.main import main
 from hipsta_bids.derivatives.results import read_sheet
-from hipsta_bids.group.cohort.crop import crop_maps
-from hipsta_bids.group.cohort.external import find_maps, map_patterns
+from hipsta_bids.extensions.maps.crop import crop_maps
+from hipsta_bids.extensions.maps.external import find_maps, map_patterns
 from hipsta_bids.inputs.maps import scan
 
 #: One person, where the shared data are present.
