@@ -13,7 +13,6 @@ from hipsta_bids.cli.commands import (
     phantom_parser,
     replicate_parser,
     resample_parser,
-    surrogate_parser,
 )
 from hipsta_bids.cli.group import group_parser
 from hipsta_bids.cli.participant import build_parser
@@ -308,7 +307,6 @@ def options_page() -> str:
         ("Participant level", build_parser()),
         ("Group level", group_parser()),
         ("hipsta-bids phantom", phantom_parser()),
-        ("hipsta-bids surrogate", surrogate_parser()),
         ("hipsta-bids compare", compare_parser()),
         ("hipsta-bids replicate", replicate_parser()),
         ("hipsta-bids figure", figure_parser()),

@@ -32,7 +32,6 @@ _CORE = (
     ("demo-data", "write_demo_data", "DIR", "write a synthetic dataset with known thickness"),
     ("demo", "run_demo", "DIR", "write it, run on it, and compare with the truth"),
     ("phantom", "write_phantoms", "DIR", "write a synthetic cohort with a known effect"),
-    ("surrogate", "run_surrogate", "IN OUT", "measure thickness in single slices to check maps"),
     ("compare", "run_compare", "FOLDER... OUT", "compare finished analyses (group level)"),
     ("replicate", "run_replicate", "FOLDER OUT", "compare an analysis with Diers et al. (2023)"),
     ("figure", "draw_figure", "WHAT OUT", "draw a figure for a paper from results"),

@@ -21,6 +21,7 @@ from hipsta_bids.derivatives.names import (
 from hipsta_bids.errors import InputError, SettingsError, UsageError
 from hipsta_bids.io import files
 from hipsta_bids.io.files import DATASET, locked
+from hipsta_bids.joints import find_texts
 from hipsta_bids.protocols.protocol import Protocol, Tissue
 from hipsta_bids.protocols.toml import flatten, resolve, settings_hash
 from hipsta_bids.settings import BodySettings, Settings
@@ -410,7 +411,7 @@ STAGE_PREFIX = "seconds_"
 #: Columns of the tables of this dataset that are no measures, by table: definition and unit.
 TABLES: dict[str, dict[str, list[str]]] = tomllib.loads(
     (resources.files("hipsta_bids.derivatives") / "columns.toml").read_text("utf-8")
-)
+) | find_texts("columns")
 COLUMNS = TABLES["status"]
 
 NOT_FINISHED = "not-finished"

@@ -18,7 +18,7 @@ from hipsta_bids.derivatives.names import DATASET_FILES, group_report
 from hipsta_bids.errors import HipstaError
 from hipsta_bids.io import files
 from hipsta_bids.io.files import hide_home
-from hipsta_bids.joints import find_extensions, load
+from hipsta_bids.joints import load_all
 from hipsta_bids.protocols import EXPERIMENTAL
 from hipsta_bids.reports import cells, group_tables
 from hipsta_bids.reports.display import DESIGN_COLORS, colors_of
@@ -146,7 +146,7 @@ def group_page(folder: Path) -> str:
         folder=folder.name,
         **heading(record),
         cohort=(folder.parent.parent / DATASET_FILES["report"]).exists(),
-        sections=build_sections((*_further_sections(), *SECTIONS), results, _PREFIX),
+        sections=build_sections(_sections(), results, _PREFIX),
     )
 
 
@@ -243,18 +243,6 @@ def _sections_of_groups(results: GroupResults) -> Mapping[str, Any] | None:
     return {"picture": pictures[0]} if pictures else None
 
 
-def _surrogate(results: GroupResults) -> Mapping[str, Any] | None:
-    """Show thickness in single slices by group."""
-    title = "Surrogate thickness by group"
-    pictures = embedded(results, "surrogate", title, f"{title}, with limits of the means")
-    text = (
-        "Thickness from the medial axis of single slices, without a mesh (`hipsta-bids surrogate`)."
-        " Means are not adjusted for covariates. Limits hold at each point, not for whole curves."
-    )
-    about = {"title": title, "text": text, "file": "surrogate.tsv", "columns": [], "rows": []}
-    return {**about, "pictures": pictures} if pictures else None
-
-
 def methods(results: GroupResults) -> Mapping[str, Any] | None:
     """Take the methods paragraph apart for the page."""
     path = results.folder / "methods.md"
@@ -280,7 +268,7 @@ def _blocks(text: str) -> list[dict[str, Any]]:
     return blocks
 
 
-#: Sections of the page, from top to bottom.
+#: Sections of the page between sections of extensions.
 SECTIONS: tuple[Section[GroupResults], ...] = (
     Section("found", "What was found", "group/found.html", group_tables.findings),
     Section("people", "Participants", "group/people.html", group_tables.participants),
@@ -293,17 +281,21 @@ SECTIONS: tuple[Section[GroupResults], ...] = (
     Section("registration", "Registration", "group/registration.html", _registration),
     Section("harmonization", "Harmonization", "group/harmonization.html", _harmonization),
     Section("sections", "Average cross-sections", "group/sections.html", _sections_of_groups),
-    Section("surrogate", "Surrogate thickness", "comparison/table.html", _surrogate),
+)
+_LAST: tuple[Section[GroupResults], ...] = (
     Section("methods", "Methods paragraph", "group/methods.html", methods),
     Section("origin", "Origin", "group/origin.html", origin),
 )
 
 
-def _further_sections() -> Iterator[Section[GroupResults]]:
-    """Sections of extensions, which come first."""
-    for extension in find_extensions():
-        if extension.sections:
-            yield from load(extension.sections)
+def _sections() -> Iterator[Section[GroupResults]]:
+    """List all sections of the page, with sections of extensions, from top to bottom."""
+    for sections in load_all("sections"):
+        yield from sections
+    yield from SECTIONS
+    for details in load_all("details"):
+        yield from details
+    yield from _LAST
 
 
 def write_group_report(

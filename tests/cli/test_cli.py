@@ -17,7 +17,6 @@ from hipsta_bids.cli.commands import (
     phantom_parser,
     replicate_parser,
     resample_parser,
-    surrogate_parser,
 )
 from hipsta_bids.cli.main import EPILOG
 from hipsta_bids.cli.parser import help_texts
@@ -228,7 +227,6 @@ def test_spellings_of_other_bids_apps(alias, field, value):
     ("command", "make"),
     [
         ("participant", build_parser),
-        ("surrogate", surrogate_parser),
         ("phantom", phantom_parser),
         ("compare", compare_parser),
         ("replicate", replicate_parser),

@@ -12,7 +12,7 @@ import pandas as pd
 
 from hipsta_bids.derivatives.results import ResultPlace, read_sheet
 from hipsta_bids.errors import InputError
-from hipsta_bids.geometry.surrogate import compare_nearby
+from hipsta_bids.geometry.agreement import compare_nearby
 from hipsta_bids.group.cohort.external import ExternalFiles, sign_notes
 from hipsta_bids.inputs.maps import fill, find
 from hipsta_bids.io import files

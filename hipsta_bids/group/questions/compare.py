@@ -17,7 +17,6 @@ from hipsta_bids.group.cohort.quality import quality_notes, quality_table
 from hipsta_bids.group.output.results import Analysis, harmonization_record
 from hipsta_bids.group.output.saved import load_effects
 from hipsta_bids.group.output.shapes import average_shapes, write_shapes
-from hipsta_bids.group.output.slices import surrogate_table
 from hipsta_bids.group.output.tables import opposite_notes
 from hipsta_bids.group.output.write import draw, write_results, write_table
 from hipsta_bids.group.questions import analysis as fitting
@@ -25,7 +24,7 @@ from hipsta_bids.group.questions import study as studies
 from hipsta_bids.group.questions.mixing import with_mixes
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.io import files
-from hipsta_bids.joints import Writer, load
+from hipsta_bids.joints import Writer, load, load_all
 from hipsta_bids.progress import tell
 from hipsta_bids.protocols.toml import resolve
 from hipsta_bids.stats.formula import folder_name
@@ -111,7 +110,6 @@ def _analyze(options: studies.GroupOptions, settings: GroupSettings) -> studies.
         notes.append(mask_note(shares, cohort.table[groups.column] if groups else None))
     writers, notes_of_parts = _parts(study, analysis)
     notes += notes_of_parts
-    in_slices = surrogate_table(study.collection.records, analysis, settings.glm.confidence)
     tell("average surfaces")
     shapes = average_shapes(study.collection.records, cohort, analysis, settings.shapes)
     # One is enough from here on, and all may take much memory.
@@ -138,8 +136,6 @@ def _analyze(options: studies.GroupOptions, settings: GroupSettings) -> studies.
             ],
         )
         files.write_json(folder / "model.json", document)
-        if len(in_slices):
-            write_table(folder, "surrogate", in_slices)
         if len(quality):
             write_table(folder, "quality", quality)
         for write_part in writers:
@@ -168,8 +164,9 @@ def _analyze(options: studies.GroupOptions, settings: GroupSettings) -> studies.
 
 
 def _parts(study: studies.Study, analysis: Analysis) -> tuple[list[Writer], list[str]]:
-    """Make the parts that options of extensions ask for, and notes."""
-    pairs = [load(part.make)(study, analysis, value) for part, value in study.options.parts]
+    """Make what extensions add, and the parts that their options ask for; with notes."""
+    pairs = [make(study, analysis) for make in load_all("addition")]
+    pairs += [load(part.make)(study, analysis, value) for part, value in study.options.parts]
     return [writer for writer, _ in pairs], [note for _, notes in pairs for note in notes]
 
 
