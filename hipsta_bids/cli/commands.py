@@ -7,7 +7,7 @@ from hipsta_bids.cli import parser as parsing
 from hipsta_bids.cli import participant
 from hipsta_bids.cli.console import echo, echo_table
 from hipsta_bids.cli.parser import Parser, bids_label, from_namespace, parser_of, site_path
-from hipsta_bids.errors import ArgumentError, ExitCode, MissingFileError, UsageError
+from hipsta_bids.errors import ArgumentError, ExitCode, UsageError
 
 _DEMO_PROTOCOL = "freesurfer"  # the layout that the demo dataset has
 
@@ -61,20 +61,6 @@ def resample_parser() -> Parser:
     add("--to-surface", "FILE", nargs="+", default=[])
     add("--column", "NAME", default="thickness")
     add("--settings", "FILE.toml")
-    return parser
-
-
-def export_parser() -> Parser:
-    """Describe ``hipsta-bids export``."""
-    parser, add = parser_of("export")
-    add("output_dir", "OUT_DIR", type=Path)
-    add("folder", "DIR", type=Path)
-    add("--format", choices=["freesurfer", "vtk", "ply", "template", "prov"], default="freesurfer")
-    add("--name", "LABEL")
-    add("--seg", "NAME")
-    add("--region", "NAME", default="body")
-    add("--participant-label", "LABEL", nargs="+", type=bids_label("sub-"), default=[])
-    add("--space-of", "PATTERN", default="")
     return parser
 
 
@@ -271,35 +257,6 @@ def run_resample(arguments: Sequence[str]) -> ExitCode:
     files = options.maps, options.out, options.surface
     between = {"sheets": options.sheet, "targets": options.to_surface}
     echo(resample(*files, sheet, column=options.column, **between))
-    return ExitCode.OK
-
-
-def run_export(arguments: Sequence[str]) -> ExitCode:
-    """Write surfaces and maps in formats of other programs."""
-    options = export_parser().parse_intermixed_args(arguments)
-    if not options.output_dir.is_dir():
-        raise MissingFileError(f"{options.output_dir}: folder not found; check its name")
-    if options.format == "template":
-        from hipsta_bids.group.output.template import export_template  # noqa: PLC0415  (heavy)
-
-        paths = export_template(options.output_dir, options.folder, options.name)
-    elif options.format == "prov":
-        from hipsta_bids.derivatives.provenance import export_provenance  # noqa: PLC0415  (heavy)
-
-        paths = export_provenance(options.output_dir, options.folder)
-    else:
-        from hipsta_bids.participant.export import export_surfaces  # noqa: PLC0415  (heavy)
-
-        paths = export_surfaces(
-            options.output_dir,
-            options.folder,
-            options.format,
-            protocol=options.seg,
-            region=options.region,
-            participants=options.participant_label,
-            image=options.space_of,
-        )
-    echo(f"{options.folder}: {len(paths)} files")
     return ExitCode.OK
 
 

@@ -176,7 +176,7 @@ def write_description(root: Path, sources: Mapping[str, Path]) -> None:
         "Name": "Hippocampal thickness and curvature maps",
         "BIDSVersion": BIDS_VERSION,
         "DatasetType": "derivative",
-        "GeneratedBy": [_maker()],
+        "GeneratedBy": [describe_maker()],
         "SourceDatasets": sorted(retained + entries, key=lambda entry: str(entry.get("URL"))),
         "DatasetLinks": dict(sorted(((read_links(root) if earlier else {}) | links).items())),
     }
@@ -191,16 +191,7 @@ def write_notes(root: Path) -> None:
         files.write_text(root / DATASET_FILES["readme"], TEXTS["readme"])
 
 
-def write_template_notes(root: Path) -> None:
-    """Write description, README and ``.bidsignore`` of a dataset of templates."""
-    texts = TEXTS["template"]
-    about = {"Name": texts["name"], "BIDSVersion": BIDS_VERSION, "DatasetType": "derivative"}
-    files.write_json(root / DATASET_FILES["description"], about | {"GeneratedBy": [_maker()]})
-    files.write_text(root / DATASET_FILES["readme"], texts["readme"])
-    files.write_text(root / DATASET_FILES["ignore"], texts["ignored"])
-
-
-def _maker() -> dict[str, Any]:
+def describe_maker() -> dict[str, Any]:
     """Say what made the dataset: an entry of ``GeneratedBy``."""
     maker: dict[str, Any] = {
         "Name": NAME,
