@@ -4,10 +4,12 @@ An extension is a folder of ``hipsta_bids.extensions``, whose ``__init__`` decla
 functions as ``module:function``; they are loaded when they are called.
 """
 
+import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from importlib import import_module
+from importlib.resources import files
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -151,8 +153,16 @@ class Extension:
     """Function of the options and settings of the group level, and of protocols: runs each."""
     functions: tuple[str, ...] = ()
     """Functions of the Python interface, as ``module:name``."""
+    participant_settings: tuple[tuple[str, str], ...] = ()
+    """Tables of the settings of the participant level: name and class."""
     sections: str = ""
     """Sections of the page of an analysis, as ``module:tuple``."""
+    addition: str = ""
+    """What each comparison adds: function of study and analysis; as ``Part.make``."""
+    figures: str = ""
+    """Function of the results of a comparison; yields its figures, by name."""
+    has_texts: bool = False
+    """Whether the folder has a ``texts.toml``: files of a hemisphere, their columns, reasons."""
     has_templates: bool = False
     """Whether the folder has templates of pages."""
 
@@ -165,6 +175,27 @@ def find_extensions() -> tuple[Extension, ...]:
     # A folder without its files has no origin.
     present = [name for name, spec in specs.items() if spec is not None and spec.origin]
     return tuple(import_module(f"{registry}.{name}").EXTENSION for name in present)
+
+
+def load_all(kind: str) -> list[Any]:
+    """Load what extensions have of a kind, the name of a field of `Extension`."""
+    places = (getattr(extension, kind) for extension in find_extensions())
+    return [load(place) for place in places if place]
+
+
+@cache
+def read_texts(package: str) -> dict[str, Any]:
+    """Read the ``texts.toml`` of an extension."""
+    return tomllib.loads((files(package) / "texts.toml").read_text(encoding="utf-8"))
+
+
+def find_texts(kind: str) -> dict[str, Any]:
+    """Collect the texts of extensions of a kind, by their keys."""
+    texts: dict[str, Any] = {}
+    for extension in find_extensions():
+        if extension.has_texts:
+            texts |= read_texts(extension.package).get(kind, {})
+    return texts
 
 
 def is_present(name: str) -> bool:

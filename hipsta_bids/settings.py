@@ -8,13 +8,16 @@ What does not change a result (jobs, verbosity, folders) is in
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Literal, Self, TypeVar
 
-from pydantic import Field, model_validator
+from pydantic import Field, create_model, model_validator
 from pydantic.types import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
+from hipsta_bids.joints import find_extensions, load
 from hipsta_bids.protocols import toml
 from hipsta_bids.types import tables
+
+_Table = TypeVar("_Table", bound=tables.SettingsTable)
 
 
 class BodySettings(tables.SettingsTable):
@@ -287,13 +290,6 @@ class UncertaintySettings(tables.SettingsTable):
     It simulates another position in the scanner."""
 
 
-class SurrogateSettings(tables.SettingsTable):
-    """Thickness from the medial axis of single slices (``hipsta-bids surrogate``)."""
-
-    positions: tables.OpenFractions = (0.5,)
-    """Where the slices are, fractions of the body's length from its posterior end."""
-
-
 #: Settings of ``--method published``: what Diers et al. 2023 describe. Topology is repaired in any
 #: case, where the original stops.
 PUBLISHED: Mapping[str, Mapping[str, str | float]] = MappingProxyType(
@@ -320,7 +316,10 @@ class Settings(tables.SettingsTable):
     checks: CheckSettings = Field(default_factory=CheckSettings)
     maps: MapSettings = Field(default_factory=MapSettings)
     uncertainty: UncertaintySettings = Field(default_factory=UncertaintySettings)
-    surrogate: SurrogateSettings = Field(default_factory=SurrogateSettings)
+
+    def table(self, kind: type[_Table]) -> _Table:
+        """Return the table of an extension."""
+        return next(table for _, table in self if isinstance(table, kind))
 
     def as_published(self) -> list[str]:
         """List the settings of ``--method published`` that hold here, as ``group.name``."""
@@ -330,6 +329,17 @@ class Settings(tables.SettingsTable):
             for name, value in values.items()
             if getattr(getattr(self, group), name) == value
         ]
+
+
+if not TYPE_CHECKING:  # type checkers know the tables of the core
+    _FURTHER = {
+        name: (load(place), Field(default_factory=load(place)))
+        for extension in find_extensions()
+        for name, place in extension.participant_settings
+    }
+    Settings = create_model(
+        "Settings", __base__=Settings, __module__=__name__, __doc__=Settings.__doc__, **_FURTHER
+    )
 
 
 def load_settings(path: Path | None) -> Settings:

@@ -26,6 +26,7 @@ from validation.group import simulate_cohort
 
 # Without an extension, its pages are not made.
 CONSORTIA, AGREEMENT = "consortia" in PRESENT, "agreement" in PRESENT
+SURROGATE = "surrogate" in PRESENT
 #: Twelve of each group at each site, as many as summaries of sites take.
 SITES = {"a": (*range(1, 13), *range(25, 37)), "b": (*range(13, 25), *range(37, 49))}
 GROUP = "cohort/bids cohort/out group --settings quick.toml --align none --measures thickness"
@@ -48,7 +49,8 @@ COMMANDS = [
         0,
         ["labels/shared/report.html", "labels/shared/sub-01_ses-[12].html"],
     ),
-    ("surrogate labels labels/out --participant-label 02 --hemi L --settings coarse.toml", 0, []),
+    *[("surrogate labels labels/out --participant-label 02 --hemi L --settings coarse.toml", 0, [])]
+    * SURROGATE,
     ("figure participant labels/out --participant-label 02 -o sheet.svg", 0, ["sheet.svg"]),
     # With tables of single slices beside the sheets, as after the command surrogate.
     (f"{GROUP} --name default", 0, ["cohort/out/group/default.html"]),
@@ -161,7 +163,7 @@ def check_pages(folder, said, patterns):
 
 def write_inputs(folder):
     """Write what the commands read, for runs in this folder."""
-    (folder / "coarse.toml").write_text("[grid]\nspacing = 0.5\n[surrogate]\npositions = [0.5]\n")
+    (folder / "coarse.toml").write_text("[grid]\nspacing = 0.5\n")
     (folder / "quick.toml").write_text("[classification]\nrepeats = 1\nfolds = 3\n")
     _write_labels(folder / "labels")
     _write_cohort(folder)
@@ -203,6 +205,11 @@ def _write_cohort(folder):
     write_participants(data, [[*row[:3], "FM"[i % 2]] for i, row in enumerate(people)])
     rows = [[f"sub-{i:02d}", site] for site, labels in SITES.items() for i in labels]
     files.write_tsv(folder / "site.tsv", ["participant_id", "site"], rows)
+    if SURROGATE:
+        _write_slices(out)
+
+
+def _write_slices(out):
     columns = list(TABLES["surrogate"])
     for i in range(1, 49):
         values = 1.5 + 0.1 * np.random.default_rng(i).standard_normal(5)

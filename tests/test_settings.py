@@ -105,8 +105,6 @@ def test_changed_values_are_checked():
         ({"grid": {"spacing": 2}}, r"grid\.spacing is 2, but has to be at most 1"),
         ({"measures": {"gaussian_window": 8}}, r"gaussian_window is 8, but has to be an odd"),
         ({"measures": {"curvature_order": 9}}, "measures: curvature_order has to be below"),
-        ({"surrogate": {"positions": []}}, "positions is .*, but has to be a list of at least 1"),
-        ({"surrogate": {"positions": [0.5, 1.0]}}, r"entry 2 of .*positions is 1\.0, .* below 1"),
         ({"body": {"region": "head"}}, r"body\.region is 'head', .* 'body', 'extended'"),
     ],
 )

@@ -10,7 +10,6 @@ from hipsta_bids.cli.commands import (
     figure_parser,
     phantom_parser,
     resample_parser,
-    surrogate_parser,
 )
 from hipsta_bids.cli.group import group_parser
 from hipsta_bids.cli.participant import build_parser
@@ -104,8 +103,8 @@ REST_TEXT = """\
 Limits, sizes and iterations, beside the [settings that users change](settings.md). The defaults are
 the values of the [validation](validation.md)."""
 
-#: Settings that users change, of the participant and of the group level.
-CHANGED: Mapping[str, str] = {
+#: Settings that users change, of the participant and of the group level, and of extensions.
+_CHANGED: Mapping[str, str] = {
     "body": "region layer_rule join_every_layer end_rule end_margin mending",
     "boundaries": "operator edges",
     "sheet": "x_nodes y_nodes z_nodes x_coordinate depths",
@@ -124,6 +123,12 @@ CHANGED: Mapping[str, str] = {
     "classification": "base added",
     "norms": "shared_knots",
     "meta": "random",
+}
+#: The same of those that are there.
+CHANGED = {
+    stage: names
+    for stage, names in _CHANGED.items()
+    if stage in Settings.model_fields or stage in GroupSettings.model_fields
 }
 
 REASONS_TEXT = """\
@@ -304,7 +309,6 @@ def options_page() -> str:
         ("Participant level", build_parser()),
         ("Group level", group_parser()),
         ("hipsta-bids phantom", phantom_parser()),
-        ("hipsta-bids surrogate", surrogate_parser()),
         ("hipsta-bids figure", figure_parser()),
         ("hipsta-bids resample", resample_parser()),
         *(

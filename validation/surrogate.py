@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hipsta_bids.errors import GeometryError
+from hipsta_bids.extensions.surrogate.crosscheck import MATCH_REACH
+from hipsta_bids.extensions.surrogate.medial_axis import surrogate_profiles
+from hipsta_bids.geometry.agreement import agreement, compare_nearby
 from hipsta_bids.geometry.body import extract_body
-from hipsta_bids.geometry.surrogate import agreement, compare_nearby, surrogate_profiles
-from hipsta_bids.participant.surrogate import MATCH_REACH
 from hipsta_bids.phantom import Phantom, PhantomSpec
 from hipsta_bids.settings import Settings
 from hipsta_bids.types import Float

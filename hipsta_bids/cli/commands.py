@@ -1,13 +1,12 @@
 """The other commands: protocols, settings, the demonstration, phantoms and others."""
 
-import argparse
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from hipsta_bids.cli import participant
-from hipsta_bids.cli.console import echo, echo_table, warn
+from hipsta_bids.cli.console import echo, echo_table
 from hipsta_bids.cli.parser import Parser, bids_label, from_namespace, parser_of
-from hipsta_bids.errors import ArgumentError, ExitCode, MissingFileError, UsageError
+from hipsta_bids.errors import ArgumentError, ExitCode, UsageError
 
 _DEMO_PROTOCOL = "freesurfer"  # the layout that the demo dataset has
 
@@ -32,15 +31,6 @@ def phantom_parser() -> Parser:
     add("--seed", default=0)
     return parser
 
-
-def surrogate_parser() -> Parser:
-    """Describe ``hipsta-bids surrogate``."""
-    parser, add = parser_of("surrogate")
-    add("bids_dir", "BIDS_DIR", type=Path)
-    add("output_dir", "OUT_DIR", type=Path)
-    participant.add_selection(parser)
-    participant.add_segmentations(parser)
-    add("--settings", "FILE.toml")
     return parser
 
 
@@ -56,18 +46,6 @@ def resample_parser() -> Parser:
     add("--settings", "FILE.toml")
     return parser
 
-
-def export_parser() -> Parser:
-    """Describe ``hipsta-bids export``."""
-    parser, add = parser_of("export")
-    add("output_dir", "OUT_DIR", type=Path)
-    add("folder", "DIR", type=Path)
-    add("--format", choices=["freesurfer", "vtk", "ply", "template", "prov"], default="freesurfer")
-    add("--name", "LABEL")
-    add("--seg", "NAME")
-    add("--region", "NAME", default="body")
-    add("--participant-label", "LABEL", nargs="+", type=bids_label("sub-"), default=[])
-    add("--space-of", "PATTERN", default="")
     return parser
 
 
@@ -184,34 +162,6 @@ def write_phantoms(arguments: Sequence[str]) -> ExitCode:
     return ExitCode.OK
 
 
-def run_surrogate(arguments: Sequence[str]) -> ExitCode:
-    """Measure thickness in single slices."""
-    parsed = surrogate_parser().parse_args(arguments)
-    # Options of the participant level that this command lacks have their defaults.
-    defaults = participant.build_parser().parse_args(
-        [str(parsed.bids_dir), str(parsed.output_dir), participant.LEVELS[0]]
-    )
-    defaults.probabilities = "never"
-    options = argparse.Namespace(**vars(defaults) | vars(parsed))
-    participant.check_folders(options)
-    from hipsta_bids.settings import load_settings  # noqa: PLC0415  (start-up time)
-
-    settings = load_settings(options.settings)
-    from hipsta_bids.inputs import account, search  # noqa: PLC0415  (heavy)
-    from hipsta_bids.participant.surrogate import crosscheck  # noqa: PLC0415  (heavy)
-
-    request = participant.input_request(options)
-    findings = search.find_inputs(request)
-    for note in (*search.dataset_notes(request, findings.items), *findings.notes):
-        echo(f"note: {note}")
-    if options.dry_run:
-        echo_table(account.selection_table(findings.items))
-        echo_table(account.ignored_table(findings.ignored))
-        return ExitCode.OK
-    participant.check_output_is_no_input(options.output_dir, findings.items)
-    return crosscheck(findings.items, options.output_dir, settings, echo, warn)
-
-
 #: Options of ``figure`` that have another name than its arguments in Python.
 _FIGURE_OPTIONS = {
     "file": "output",
@@ -258,33 +208,6 @@ def run_resample(arguments: Sequence[str]) -> ExitCode:
     echo(resample(*files, sheet, column=options.column, **between))
     return ExitCode.OK
 
-
-def run_export(arguments: Sequence[str]) -> ExitCode:
-    """Write surfaces and maps in formats of other programs."""
-    options = export_parser().parse_intermixed_args(arguments)
-    if not options.output_dir.is_dir():
-        raise MissingFileError(f"{options.output_dir}: folder not found; check its name")
-    if options.format == "template":
-        from hipsta_bids.group.output.template import export_template  # noqa: PLC0415  (heavy)
-
-        paths = export_template(options.output_dir, options.folder, options.name)
-    elif options.format == "prov":
-        from hipsta_bids.derivatives.provenance import export_provenance  # noqa: PLC0415  (heavy)
-
-        paths = export_provenance(options.output_dir, options.folder)
-    else:
-        from hipsta_bids.participant.export import export_surfaces  # noqa: PLC0415  (heavy)
-
-        paths = export_surfaces(
-            options.output_dir,
-            options.folder,
-            options.format,
-            protocol=options.seg,
-            region=options.region,
-            participants=options.participant_label,
-            image=options.space_of,
-        )
-    echo(f"{options.folder}: {len(paths)} files")
     return ExitCode.OK
 
 

@@ -32,10 +32,8 @@ _CORE = (
     ("demo-data", "write_demo_data", "DIR", "write a synthetic dataset with known thickness"),
     ("demo", "run_demo", "DIR", "write it, run on it, and compare with the truth"),
     ("phantom", "write_phantoms", "DIR", "write a synthetic cohort with a known effect"),
-    ("surrogate", "run_surrogate", "IN OUT", "measure thickness in single slices to check maps"),
     ("figure", "draw_figure", "WHAT OUT", "draw a figure for a paper from results"),
     ("resample", "run_resample", "MAP... OUT", "move maps to HippUnfold's surfaces, or from there"),
-    ("export", "run_export", "OUT_DIR DIR", "write surfaces for FreeSurfer, or as VTK or PLY"),
     ("validate", "run_validation", "", None),
 )
 COMMANDS = {

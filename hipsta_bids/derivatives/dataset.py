@@ -21,6 +21,7 @@ from hipsta_bids.derivatives.names import (
 from hipsta_bids.errors import InputError, SettingsError, UsageError
 from hipsta_bids.io import files
 from hipsta_bids.io.files import DATASET, locked
+from hipsta_bids.joints import find_texts
 from hipsta_bids.protocols.protocol import Protocol, Tissue
 from hipsta_bids.protocols.toml import flatten, resolve, settings_hash
 from hipsta_bids.settings import BodySettings, Settings
@@ -175,7 +176,7 @@ def write_description(root: Path, sources: Mapping[str, Path]) -> None:
         "Name": "Hippocampal thickness and curvature maps",
         "BIDSVersion": BIDS_VERSION,
         "DatasetType": "derivative",
-        "GeneratedBy": [_maker()],
+        "GeneratedBy": [describe_maker()],
         "SourceDatasets": sorted(retained + entries, key=lambda entry: str(entry.get("URL"))),
         "DatasetLinks": dict(sorted(((read_links(root) if earlier else {}) | links).items())),
     }
@@ -190,16 +191,7 @@ def write_notes(root: Path) -> None:
         files.write_text(root / DATASET_FILES["readme"], TEXTS["readme"])
 
 
-def write_template_notes(root: Path) -> None:
-    """Write description, README and ``.bidsignore`` of a dataset of templates."""
-    texts = TEXTS["template"]
-    about = {"Name": texts["name"], "BIDSVersion": BIDS_VERSION, "DatasetType": "derivative"}
-    files.write_json(root / DATASET_FILES["description"], about | {"GeneratedBy": [_maker()]})
-    files.write_text(root / DATASET_FILES["readme"], texts["readme"])
-    files.write_text(root / DATASET_FILES["ignore"], texts["ignored"])
-
-
-def _maker() -> dict[str, Any]:
+def describe_maker() -> dict[str, Any]:
     """Say what made the dataset: an entry of ``GeneratedBy``."""
     maker: dict[str, Any] = {
         "Name": NAME,
@@ -410,7 +402,7 @@ STAGE_PREFIX = "seconds_"
 #: Columns of the tables of this dataset that are no measures, by table: definition and unit.
 TABLES: dict[str, dict[str, list[str]]] = tomllib.loads(
     (resources.files("hipsta_bids.derivatives") / "columns.toml").read_text("utf-8")
-)
+) | find_texts("columns")
 COLUMNS = TABLES["status"]
 
 NOT_FINISHED = "not-finished"

@@ -6,7 +6,7 @@ has no rule for is listed in ``.bidsignore``, with the reason, from the table be
 
 import re
 import tomllib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
 from fnmatch import fnmatchcase
 from importlib.resources import files as files_of
@@ -15,12 +15,14 @@ from typing import Any
 
 from hipsta_bids.geometry.catalog import MAPS
 from hipsta_bids.io import files
+from hipsta_bids.joints import find_texts
 from hipsta_bids.protocols import EXPERIMENTAL
 from hipsta_bids.types import Hemisphere
 
 #: What files are, and what those of the dataset as a whole say.
 TEXTS = tomllib.loads((files_of("hipsta_bids.derivatives") / "texts.toml").read_text("utf-8"))
-_ABOUT = TEXTS["outputs"]
+_FURTHER = find_texts("outputs")
+_ABOUT = TEXTS["outputs"] | {key: row["text"] for key, row in _FURTHER.items()}
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -200,6 +202,20 @@ _TEMPLATE = (
 )
 _SAMPLED = {"table": ".tsv", "sidecar": ".json", "shape": ".shape.gii", "series": ".func.gii"}
 
+
+def _of_extensions() -> Iterator[Output]:
+    """Describe files that extensions add: tables, and images with their sidecars."""
+    images = []
+    for key, row in _FURTHER.items():
+        fields = {name: value for name, value in row.items() if name != "text"}
+        if fields:
+            images.append(_output(key, **fields))
+        else:
+            yield from _table(key, called="that table")
+    yield from images
+    yield from _sidecars(images)
+
+
 #: Files of one hemisphere that come with an option or another command. A ``*`` stands for the name
 #: that the user gave.
 EXTRA_OUTPUTS: tuple[Output, ...] = (
@@ -211,12 +227,12 @@ EXTRA_OUTPUTS: tuple[Output, ...] = (
     *_sidecars([_SPREAD]),
     *_HEADS,
     *_sidecars(_HEADS),
-    *_table("surrogate", called="that table"),
     _CHANGE,
     *_sidecars([_CHANGE]),
     *_TEMPLATE,
     *_sidecars(_TEMPLATE),
     _output("template_qc", "metrics", ".json", desc="longitudinal"),
+    *_of_extensions(),
 )
 
 #: Lists of files in a quality record, each an entry with an address.

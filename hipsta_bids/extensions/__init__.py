@@ -4,4 +4,7 @@
 """
 
 #: Folders, in the order of the help.
-NAMES = ("sites", "consortia", "trials", "norms", "agreement", "maps")
+NAMES = (
+    *("sites", "consortia", "trials", "norms", "agreement", "maps"),
+    *("surrogate", "export"),
+)

@@ -18,7 +18,7 @@ from hipsta_bids.derivatives.names import DATASET_FILES, group_report
 from hipsta_bids.errors import HipstaError
 from hipsta_bids.io import files
 from hipsta_bids.io.files import hide_home
-from hipsta_bids.joints import find_extensions, load
+from hipsta_bids.joints import load_all
 from hipsta_bids.protocols import EXPERIMENTAL
 from hipsta_bids.reports import cells, group_tables
 from hipsta_bids.reports.display import DESIGN_COLORS, colors_of
@@ -218,18 +218,6 @@ def _sections_of_groups(results: GroupResults) -> Mapping[str, Any] | None:
     return {"picture": pictures[0]} if pictures else None
 
 
-def _surrogate(results: GroupResults) -> Mapping[str, Any] | None:
-    """Show thickness in single slices by group."""
-    title = "Surrogate thickness by group"
-    pictures = embedded(results, "surrogate", title, f"{title}, with limits of the means")
-    text = (
-        "Thickness from the medial axis of single slices, without a mesh (`hipsta-bids surrogate`)."
-        " Means are not adjusted for covariates. Limits hold at each point, not for whole curves."
-    )
-    about = {"title": title, "text": text, "file": "surrogate.tsv", "columns": [], "rows": []}
-    return {**about, "pictures": pictures} if pictures else None
-
-
 def methods(results: GroupResults) -> Mapping[str, Any] | None:
     """Take the methods paragraph apart for the page."""
     path = results.folder / "methods.md"
@@ -266,7 +254,6 @@ SECTIONS: tuple[Section[GroupResults], ...] = (
     Section("model", "Model", "group/model.html", design),
     Section("registration", "Registration", "group/registration.html", _registration),
     Section("sections", "Average cross-sections", "group/sections.html", _sections_of_groups),
-    Section("surrogate", "Surrogate thickness", "group/table.html", _surrogate),
     Section("methods", "Methods paragraph", "group/methods.html", methods),
     Section("origin", "Origin", "group/origin.html", origin),
 )
@@ -274,12 +261,7 @@ SECTIONS: tuple[Section[GroupResults], ...] = (
 
 def _all_sections() -> Iterator[Section[GroupResults]]:
     """Sections of the core and of extensions, in the order of the page."""
-    further = [
-        section
-        for extension in find_extensions()
-        if extension.sections
-        for section in load(extension.sections)
-    ]
+    further = [section for sections in load_all("sections") for section in sections]
     yield from (section for section in further if not section.after)
     for section in SECTIONS:
         yield section

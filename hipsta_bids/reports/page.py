@@ -14,7 +14,7 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from hipsta_bids import __version__
-from hipsta_bids.joints import find_extensions
+from hipsta_bids.joints import find_extensions, find_texts
 from hipsta_bids.reports.cells import FILTERS
 from hipsta_bids.reports.display import HATCHING, ORIENTATION
 from hipsta_bids.settings import Settings
@@ -96,8 +96,13 @@ def _environment() -> "Environment":
 
 @cache
 def read_table(name: str) -> dict[str, Any]:
-    """Read a TOML file of this folder: ``reasons.toml`` or ``usual.toml``."""
-    return tomllib.loads((files("hipsta_bids.reports") / name).read_text(encoding="utf-8"))
+    """Read a TOML file of this folder: ``reasons.toml``, with reasons of extensions, or another."""
+    table = tomllib.loads((files("hipsta_bids.reports") / name).read_text(encoding="utf-8"))
+    if name == "reasons.toml":
+        sections = {section["title"]: section["reasons"] for section in table["section"]}
+        for title, reasons in find_texts("reasons").items():
+            sections[title] |= reasons
+    return table
 
 
 def usual_ranges(

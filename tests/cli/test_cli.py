@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from extension_marks import needs
 from stand_ins import make_input, stand_in_job
 
 from hipsta_bids import __version__
@@ -15,7 +16,6 @@ from hipsta_bids.cli import main
 from hipsta_bids.cli.commands import (
     phantom_parser,
     resample_parser,
-    surrogate_parser,
 )
 from hipsta_bids.cli.main import EPILOG
 from hipsta_bids.cli.parser import help_texts
@@ -241,7 +241,6 @@ def test_spellings_of_other_bids_apps(alias, field, value):
     ("command", "make"),
     [
         ("participant", build_parser),
-        ("surrogate", surrogate_parser),
         ("phantom", phantom_parser),
         ("resample", resample_parser),
     ],
@@ -304,7 +303,11 @@ def test_options_without_meaning_are_remembered_with_the_reason():
             "--participant-label: its values are ... 2 3 in out participant; write",
         ),
         ("in out --participant_label 01 participant", "--participant-label after analysis_level"),
-        ("export --participant-label 01 out dir", "write --participant-label after OUT_DIR, DIR"),
+        pytest.param(
+            "export --participant-label 01 out dir",
+            "write --participant-label after OUT_DIR, DIR",
+            marks=needs("export"),
+        ),
         ("figure --measures thickness group out -o a.pdf", "write --measures after what, OUT_DIR"),
         ("figure group out --measures thickness", "are required: -o/--output"),
     ],

@@ -6,6 +6,7 @@ from dataclasses import replace
 import nibabel as nib
 import numpy as np
 import pytest
+from extension_marks import needs
 from input_cases import describe, find, save
 from measured_phantoms import measure, results, spiral
 
@@ -364,6 +365,7 @@ def test_command(data, volume, tmp_path, capsys):
     assert row["reason"] == "bad-probabilities"
 
 
+@needs("surrogate")
 def test_surrogate_takes_labels_alone(data, volume, tmp_path):
     write(data, volume, lambda share: 255 * share)
     assert main.main(["surrogate", str(data), str(tmp_path / "out")]) == ExitCode.OK

@@ -12,7 +12,7 @@ from scipy import stats
 
 from hipsta_bids import __version__
 from hipsta_bids.derivatives.analyses import GroupResults, records
-from hipsta_bids.geometry.surrogate import agreement
+from hipsta_bids.geometry.agreement import agreement
 from hipsta_bids.group.output.citations import Citations, code, escaped, joined
 from hipsta_bids.group.output.ground import Ground, read_grounds
 from hipsta_bids.group.output.maps import ContrastMap, read_tests

@@ -13,7 +13,7 @@ import pandas as pd
 from hipsta_bids.derivatives.results import ResultPlace, read_sheet
 from hipsta_bids.errors import InputError
 from hipsta_bids.extensions.maps.external import ExternalFiles, sign_notes
-from hipsta_bids.geometry.surrogate import compare_nearby
+from hipsta_bids.geometry.agreement import compare_nearby
 from hipsta_bids.inputs.maps import fill, find
 from hipsta_bids.io import files
 from hipsta_bids.io.gifti import read_map, read_surface

@@ -20,9 +20,9 @@ from hipsta_bids.group.output import panels, style
 from hipsta_bids.group.output.maps import draw_alignment, draw_measure
 from hipsta_bids.group.output.results import Analysis
 from hipsta_bids.group.output.shapes import AverageShape
-from hipsta_bids.group.output.slices import draw_surrogate
 from hipsta_bids.group.output.steps import blocks
 from hipsta_bids.io.files import MISSING
+from hipsta_bids.joints import load_all
 from hipsta_bids.reports.cells import display_name, with_brackets
 from hipsta_bids.reports.display import COLORS, HEMISPHERE_COLORS, X_ENDS
 from hipsta_bids.reports.group_maps import MOST_FIGURES, measures_of
@@ -414,8 +414,8 @@ def draw_figures(
         yield f"{measure}_alignment", partial(draw_alignment, saved, measure)
     if shapes:
         yield "sections", partial(draw_sections, cohorts[SHEET], analysis, shapes)
-    if len(saved.table("surrogate")):
-        yield "surrogate", partial(draw_surrogate, saved)
+    for list_figures in load_all("figures"):
+        yield from list_figures(saved)
     if analysis.pairs:
         yield "roc", partial(draw_roc, saved)
         if any(one.full.calibration.judged for *_, one in analysis.pairs):

@@ -15,7 +15,6 @@ from hipsta_bids.group.cohort.data import SHEET
 from hipsta_bids.group.cohort.quality import quality_notes, quality_table
 from hipsta_bids.group.output.results import Analysis
 from hipsta_bids.group.output.shapes import average_shapes, write_shapes
-from hipsta_bids.group.output.slices import surrogate_table
 from hipsta_bids.group.output.steps import blocks, plan_blocks, plan_steps
 from hipsta_bids.group.output.tables import JointMap
 from hipsta_bids.group.output.write import draw, write_results, write_table
@@ -27,7 +26,7 @@ from hipsta_bids.group.questions.notes import notes_of
 from hipsta_bids.group.request import Request
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.io import files
-from hipsta_bids.joints import Writer, find_steps, load
+from hipsta_bids.joints import Writer, find_steps, load, load_all
 from hipsta_bids.progress import tell
 from hipsta_bids.protocols.toml import resolve
 from hipsta_bids.stats.formula import folder_name
@@ -128,7 +127,6 @@ def _write(
     notes += [remark(cohort.table, groups.column if groups else None) for remark in study.remarks]
     writers, notes_of_parts = _parts(study, analysis)
     notes += notes_of_parts
-    in_slices = surrogate_table(study.collection.records, analysis, settings.glm.confidence)
     tell("average surfaces")
     shapes = average_shapes(study.collection.records, cohort, analysis, settings.shapes)
     # One is enough from here on, and all may take much memory.
@@ -151,9 +149,8 @@ def _write(
             sentences=study.sentences(),
         )
         files.write_json(folder / "model.json", document)
-        for name, content in (("surrogate", in_slices), ("quality", quality)):
-            if len(content):
-                write_table(folder, name, content)
+        if len(quality):
+            write_table(folder, "quality", quality)
         for write_part in writers:
             write_part(folder)
         write_shapes(folder, shapes)
@@ -176,8 +173,9 @@ def _write(
 
 
 def _parts(study: studies.Study, analysis: Analysis) -> tuple[list[Writer], list[str]]:
-    """Make the parts that options of extensions ask for, and notes."""
-    pairs = [load(part.make)(study, analysis, value) for part, value in study.options.parts]
+    """Make what extensions add, and the parts that their options ask for; with notes."""
+    pairs = [make(study, analysis) for make in load_all("addition")]
+    pairs += [load(part.make)(study, analysis, value) for part, value in study.options.parts]
     return [writer for writer, _ in pairs], [note for _, notes in pairs for note in notes]
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from extension_marks import needs
 from small_cohorts import (
     NODES,
     begin_dataset,
@@ -22,7 +23,7 @@ from small_cohorts import (
 )
 from tutorial_pages import commands, whole
 
-from hipsta_bids.cli.commands import phantom_parser, surrogate_parser
+from hipsta_bids.cli.commands import phantom_parser
 from hipsta_bids.cli.group import group_parser
 from hipsta_bids.cli.main import main
 from hipsta_bids.cli.participant import build_parser
@@ -94,8 +95,6 @@ def test_the_commands_of_the_page_are_understood():
         if "participant" in line:
             options = build_parser().parse_args(line)
             assert options.method == "published"
-        elif line[0] == "surrogate":
-            surrogate_parser().parse_args(line[1:])
         elif line[0] == "compare":
             names = [
                 text.partition("=")[0] for text in compare_parser().parse_args(line[1:]).analyses
@@ -308,6 +307,7 @@ def study(tmp_path_factory):
     os.chdir(before)
 
 
+@needs("surrogate")
 @whole
 def test_every_file_and_column_of_the_page_is_there(study):
     rows = re.findall(r"^\| .*? \| (`.*?) \| (.*?) \|$", PAGE, re.MULTILINE)
@@ -327,6 +327,7 @@ def test_every_file_and_column_of_the_page_is_there(study):
     assert list((study / "out").rglob("*_desc-surrogate_morph.tsv"))
 
 
+@needs("surrogate")
 @whole
 def test_the_planted_loss_is_found_with_both_segmentations(study):
     for out in ("out", "out-ashs"):
@@ -336,6 +337,7 @@ def test_the_planted_loss_is_found_with_both_segmentations(study):
         assert ((thin.estimate > 0) & (thin.p_fdr < 0.05)).all()
 
 
+@needs("surrogate")
 @whole
 def test_both_segmentations_are_in_one_table(study):
     """The planted loss is in both, so that effect maps of the dementia group go together."""
@@ -345,6 +347,7 @@ def test_both_segmentations_are_in_one_table(study):
     assert (thickness.r > 0).all()
 
 
+@needs("surrogate")
 @whole
 def test_the_published_numbers_stand_beside_those_of_the_cohort(study):
     """The protocol of the first cohort has one label for CA2 and CA3; ASHS has all subfields."""

@@ -10,6 +10,7 @@ import nibabel as nib
 import numpy as np
 import pandas as pd
 import pytest
+from extension_marks import needs
 from small_cohorts import NODES, PLAN, place_of, write_dataset
 
 from hipsta_bids.cli.main import main
@@ -69,6 +70,7 @@ def test_average_surface_is_that_of_all_and_takes_the_maps(results):
     assert not (results / "hemi-R_desc-average_midthickness.surf.gii").exists()
 
 
+@needs("export")
 def test_template_is_a_dataset_to_which_others_are_registered(results, tmp_path, capsys):
     """Registration to the dataset is that to the file of the analysis."""
     data, out = results.parents[2] / "bids", results.parents[1]
@@ -101,6 +103,7 @@ def test_template_is_a_dataset_to_which_others_are_registered(results, tmp_path,
     assert "has 2 templates of registration" in capsys.readouterr().err
 
 
+@needs("export")
 def test_template_is_not_written_into_other_datasets(results, tmp_path, capsys):
     data, out = results.parents[2] / "bids", results.parents[1]
     command = ["export", str(results), "--format", "template"]

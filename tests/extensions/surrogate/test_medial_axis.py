@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from hipsta_bids.errors import GeometryError
-from hipsta_bids.geometry import surrogate
+from hipsta_bids.extensions.surrogate import medial_axis
+from hipsta_bids.extensions.surrogate.medial_axis import draw_slice, surrogate_profiles
+from hipsta_bids.geometry.agreement import agreement, compare_nearby
 from hipsta_bids.geometry.body import extract_body
-from hipsta_bids.geometry.surrogate import agreement, compare_nearby, draw_slice, surrogate_profiles
 from hipsta_bids.phantom import Phantom, PhantomSpec
 from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.settings import Settings
@@ -75,7 +76,7 @@ def test_it_runs_from_medial_to_lateral_at_the_given_place():
 
 def test_samplings_are_proportional_and_equidistant(monkeypatch):
     _, body = drawn(spec())
-    monkeypatch.setattr(surrogate, "SAMPLING_STEP", 0.7)
+    monkeypatch.setattr(medial_axis, "SAMPLING_STEP", 0.7)
     even, steps = profiles(body)
     nodes = (np.linspace(-0.9, 0.9, 41) + 1) / 2
     np.testing.assert_allclose(even.fraction, nodes, rtol=1e-12)
@@ -91,7 +92,7 @@ def test_samplings_are_proportional_and_equidistant(monkeypatch):
 def test_the_pixels_hardly_matter(monkeypatch):
     _, body = drawn(spec(variation=0.3))
     coarse = profiles(body)[0]
-    monkeypatch.setattr(surrogate, "PIXEL", surrogate.PIXEL / 2)
+    monkeypatch.setattr(medial_axis, "PIXEL", medial_axis.PIXEL / 2)
     fine = profiles(body)[0]
     assert np.abs(coarse.thickness - fine.thickness)[3:-3].mean() < 0.02  # mm, a fifth of a pixel
 
@@ -109,7 +110,7 @@ def test_small_holes_are_filled_and_loops_refused(monkeypatch):
     whole, _ = profiles(body)
     holed, _ = profiles(without(0.5))  # 0.8 mm2
     np.testing.assert_allclose(holed.thickness, whole.thickness, atol=0.05)
-    monkeypatch.setattr(surrogate, "HOLE_AREA", 0.1)
+    monkeypatch.setattr(medial_axis, "HOLE_AREA", 0.1)
     with pytest.raises(GeometryError, match="closes on itself") as error:
         profiles(without(0.5))
     assert error.value.reason == "no-medial-axis"
@@ -120,7 +121,7 @@ def test_slices_without_labels_or_without_a_line_are_refused(monkeypatch):
     with pytest.raises(GeometryError) as error:
         draw_slice(replace(body, tissue=np.zeros_like(body.tissue)), 0.5)
     assert error.value.reason == "no-medial-axis"
-    monkeypatch.setattr(surrogate, "FORK_LENGTH", 6.0)
+    monkeypatch.setattr(medial_axis, "FORK_LENGTH", 6.0)
     with pytest.raises(GeometryError) as error:
         profiles(body)
     assert error.value.reason == "no-medial-axis"
@@ -156,7 +157,7 @@ def test_values_nearby_are_those_of_the_surface():
 def test_the_axis_is_extended_in_steps_of_a_pixel_to_the_edge():
     inside = np.zeros((9, 9), dtype=bool)
     inside[4, :7] = True
-    found = surrogate._to_the_edge(
+    found = medial_axis._to_the_edge(
         SimpleNamespace(inside=inside), np.array([4.0, 2.0]), np.array([0.0, 3.0])
     )
     np.testing.assert_array_equal(found, [[4, 3], [4, 4], [4, 5], [4, 6]])
@@ -166,5 +167,5 @@ def test_the_axis_is_extended_in_steps_of_a_pixel_to_the_edge():
 def test_labels_tell_which_end_of_the_axis_is_medial(labels):
     body = SimpleNamespace(tissue=np.array([labels]), to_voxels=lambda points: points)
     axis = np.array([[0.0, 0.0], [0.0, 1.0], [0.0, 2.0]])
-    found = surrogate._from_medial(body, SimpleNamespace(to_ras=lambda points: points), axis)
+    found = medial_axis._from_medial(body, SimpleNamespace(to_ras=lambda points: points), axis)
     np.testing.assert_array_equal(found, axis if labels[0] == 1 else axis[::-1])

@@ -1,7 +1,9 @@
 """Surrogate thickness by group, from the tables of ``hipsta-bids surrogate``, without a mesh."""
 
 from collections.abc import Iterator, Sequence
+from functools import partial
 from itertools import cycle
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,7 +15,11 @@ from hipsta_bids.group.cohort.collect import SheetRecord
 from hipsta_bids.group.cohort.read import visit_name
 from hipsta_bids.group.output import style
 from hipsta_bids.group.output.results import Analysis, members_of
+from hipsta_bids.group.output.tables import COLUMNS
+from hipsta_bids.group.output.write import write_table
+from hipsta_bids.group.questions.study import Study
 from hipsta_bids.io import files
+from hipsta_bids.joints import Writer, read_texts
 from hipsta_bids.reports.display import COLORS, X_ENDS, Y_ENDS
 from hipsta_bids.stats.arrays import describe_known
 from hipsta_bids.types import SIDES
@@ -76,6 +82,25 @@ def _rows(
                 "mean_high": mean + reach,
                 "sheet_mean": sheet_mean,
             }
+
+
+def describe_groups(study: Study, analysis: Analysis) -> tuple[Writer, list[str]]:
+    """Prepare the table of groups, if there are tables of single slices."""
+    confidence = study.settings.glm.confidence
+    table = surrogate_table(study.collection.records, analysis, confidence)
+
+    def write(folder: Path) -> None:
+        if len(table):
+            meaning = COLUMNS | read_texts("hipsta_bids.extensions.surrogate")["groups"]
+            write_table(folder, "surrogate", table, meaning=meaning)
+
+    return write, []
+
+
+def list_figures(results: GroupResults) -> Iterator[tuple[str, style.Drawing]]:
+    """List the figure, if there is a table of groups."""
+    if len(results.table("surrogate")):
+        yield "surrogate", partial(draw_surrogate, results)
 
 
 def draw_surrogate(results: GroupResults) -> "list[Figure]":

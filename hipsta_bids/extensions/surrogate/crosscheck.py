@@ -11,7 +11,9 @@ from hipsta_bids.derivatives.hemisphere import format_column
 from hipsta_bids.derivatives.names import HemisphereName
 from hipsta_bids.derivatives.results import ResultPlace, read_sheet
 from hipsta_bids.errors import ExitCode, HipstaError, InputError, OutputError, ProtocolError
-from hipsta_bids.geometry import surrogate
+from hipsta_bids.extensions.surrogate.medial_axis import SurrogateProfile, surrogate_profiles
+from hipsta_bids.extensions.surrogate.settings import SurrogateSettings
+from hipsta_bids.geometry.agreement import agreement, compare_nearby
 from hipsta_bids.geometry.body import extract_body
 from hipsta_bids.inputs.labels import read_label_volume
 from hipsta_bids.inputs.scan import HemisphereInput
@@ -66,11 +68,11 @@ def _measure(item: HemisphereInput, result: ResultPlace, settings: Settings) -> 
     sheet = _read_sheet(result)
     rows: list[list[str]] = []
     lines = []
-    for position in settings.surrogate.positions:
-        for profile in surrogate.surrogate_profiles(body, position, settings.sheet):
+    for position in settings.table(SurrogateSettings).positions:
+        for profile in surrogate_profiles(body, position, settings.sheet):
             mesh = np.full(len(profile.points), np.nan)
             if sheet is not None:
-                mesh = surrogate.compare_nearby(profile.points, *sheet, MATCH_REACH)
+                mesh = compare_nearby(profile.points, *sheet, MATCH_REACH)
             rows += _rows(profile, mesh)
             if profile.sampling == "proportional":
                 lines.append(_line(profile, mesh))
@@ -89,16 +91,16 @@ def _read_sheet(result: ResultPlace) -> tuple[Float, Float] | None:
     return None
 
 
-def _rows(profile: surrogate.SurrogateProfile, mesh: Float) -> Iterator[list[str]]:
+def _rows(profile: SurrogateProfile, mesh: Float) -> Iterator[list[str]]:
     places = (profile.fraction, profile.distance, *profile.points.T)
     columns = (format_column(column, _DIGITS) for column in (*places, profile.thickness, mesh))
     for number, cells in enumerate(zip(*columns, strict=True), start=1):
         yield [f"{profile.position:g}", profile.sampling, str(number), *cells]
 
 
-def _line(profile: surrogate.SurrogateProfile, mesh: Float) -> str:
+def _line(profile: SurrogateProfile, mesh: Float) -> str:
     line = f"slice at {profile.position:.0%}: mean thickness {profile.thickness.mean():.3f} mm"
-    comparison = surrogate.agreement(profile.thickness, mesh)
+    comparison = agreement(profile.thickness, mesh)
     if not comparison.count:
         return f"{line} (no sheet to compare with)"
     return (
