@@ -107,11 +107,15 @@ class Extension:
     parts: tuple[Part, ...] = ()
     questions: tuple[Question, ...] = ()
     sources: tuple[Source, ...] = ()
+    settings: tuple[tuple[str, str], ...] = ()
+    """Tables of the settings of the group level: name, and class as ``module:name``."""
     pages: tuple[Page, ...] = ()
     protocols: str = ""
     """Function of the options and settings of the group level, and of protocols: runs each."""
     functions: tuple[str, ...] = ()
     """Functions of the Python interface, as ``module:name``."""
+    columns: str = ""
+    """Meaning of the columns of its tables, as ``module:mapping``, for the documentation."""
     sections: str = ""
     """Sections of the page of an analysis, as ``module:tuple``."""
     has_templates: bool = False
@@ -152,6 +156,11 @@ def find_functions() -> dict[str, str]:
 def find_sources() -> tuple[Source, ...]:
     """Find what extensions read beside the sheets, in the order of reading."""
     return tuple(source for extension in find_extensions() for source in extension.sources)
+
+
+def find_settings() -> dict[str, str]:
+    """Find tables of settings by name; two extensions may share one."""
+    return {name: place for found in find_extensions() for name, place in found.settings}
 
 
 def find_questions() -> tuple[Question, ...]:

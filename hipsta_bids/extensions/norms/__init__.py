@@ -14,6 +14,11 @@ EXTENSION = Extension(
             run=f"{__name__}.options:run",
         ),
     ),
+    settings=(
+        ("norms", f"{__name__}.settings:NormSettings"),
+        ("exchange", "hipsta_bids.stats.settings:ExchangeSettings"),
+    ),
+    columns=f"{__name__}.columns:COLUMNS",
     sections=f"{__name__}.page:SECTIONS",
     has_templates=True,
 )

@@ -14,11 +14,11 @@ import numpy as np
 from scipy import special
 
 from hipsta_bids.errors import ModelError
+from hipsta_bids.extensions.norms.settings import NormSettings
 from hipsta_bids.stats.arrays import Bool, Float, Int
 from hipsta_bids.stats.combat import solve_weighted
 from hipsta_bids.stats.glm import chunks
 from hipsta_bids.stats.scores import tail_probability
-from hipsta_bids.stats.settings import NormSettings
 
 #: Values at a point are transformed if a likelihood-ratio test rejects the normal distribution
 #: at this level.

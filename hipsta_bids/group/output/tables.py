@@ -40,6 +40,11 @@ JOINT_COLUMNS: Mapping[str, str] = COLUMNS | _MEANINGS["joint"]
 DEMOGRAPHIC_COLUMNS: Mapping[str, str] = COLUMNS | _MEANINGS["demographics"]
 
 
+def read_columns(package: str) -> dict[str, str]:
+    """Read the meaning of the columns of an extension, beside the columns of all analyses."""
+    return {**COLUMNS, **tomllib.loads((files(package) / "columns.toml").read_text("utf-8"))}
+
+
 def result_tables(
     surface: str,
     cohort: Cohort,
