@@ -148,6 +148,8 @@ class Extension:
     questions: tuple[Question, ...] = ()
     steps: tuple[Step, ...] = ()
     sources: tuple[Source, ...] = ()
+    group_settings: tuple[tuple[str, str], ...] = ()
+    """Tables of the settings of the group level: name, and class as ``module:name``."""
     pages: tuple[Page, ...] = ()
     protocols: str = ""
     """Function of the options and settings of the group level, and of protocols: runs each."""
@@ -155,6 +157,8 @@ class Extension:
     """Functions of the Python interface, as ``module:name``."""
     participant_settings: tuple[tuple[str, str], ...] = ()
     """Tables of the settings of the participant level: name and class."""
+    columns: str = ""
+    """Meaning of the columns of its tables, as ``module:mapping``, for the documentation."""
     sections: str = ""
     """Sections of the page of an analysis, as ``module:tuple``."""
     addition: str = ""
@@ -222,6 +226,11 @@ def find_functions() -> dict[str, str]:
 def find_sources() -> tuple[Source, ...]:
     """Find what extensions read beside the sheets, in the order of reading."""
     return tuple(source for extension in find_extensions() for source in extension.sources)
+
+
+def find_settings() -> dict[str, str]:
+    """Find tables of settings by name; two extensions may share one."""
+    return {name: place for one in find_extensions() for name, place in one.group_settings}
 
 
 def find_questions() -> tuple[Question, ...]:

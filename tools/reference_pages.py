@@ -232,7 +232,10 @@ def _named(rows: Iterable[tuple[str, str, str]]) -> Iterator[tuple[str, str, str
 def _group_columns() -> Iterator[tuple[str, str]]:
     """Explain the columns of the group level whose names do not follow a rule of the page."""
     ruled = re.compile(r".+_(low|high|se|cv_sd)|(p|below_)\d+")
-    for name, words in {**JOINT_COLUMNS, **COLUMNS}.items():
+    columns = {**JOINT_COLUMNS, **COLUMNS}
+    for extension in find_extensions():
+        columns |= load(extension.columns) if extension.columns else {}
+    for name, words in columns.items():
         if not ruled.fullmatch(name) and words not in {name, name.removesuffix("_id")}:
             yield f"`{name}`", words
 

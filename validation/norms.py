@@ -7,8 +7,8 @@ import numpy as np
 from scipy import special, stats
 
 from hipsta_bids.extensions.norms.centiles import LEVELS, Norms, People, fit_norms
+from hipsta_bids.extensions.norms.settings import NormSettings
 from hipsta_bids.stats.arrays import Float
-from hipsta_bids.stats.settings import NormSettings
 from validation.report import Cell, Cells, Content, suite, table
 
 #: Target: shares below centiles differ from these by at most this, percentage points.

@@ -9,6 +9,7 @@ import pandas as pd
 from scipy import stats
 from statsmodels.stats.multitest import multipletests
 
+from hipsta_bids.extensions.trials.settings import PowerSettings
 from hipsta_bids.extensions.trials.sizes import (
     SLOWING,
     THINNING,
@@ -117,15 +118,15 @@ def simulate_design(design: TrialDesign, trials: int, seed: int = 0) -> dict[str
     reference = _reference(design, random)
     settings = design.settings
     alpha = (
-        point_level(settings.multiplicity, settings.power)
+        point_level(settings.multiplicity, settings.of(PowerSettings))
         if design.is_map
-        else settings.power.alpha
+        else settings.of(PowerSettings).alpha
     )
-    found = sample_size(design.effect, reference, settings.power, alpha=alpha)
+    found = sample_size(design.effect, reference, settings.of(PowerSettings), alpha=alpha)
     per_arm, enrolled = int(np.median(found["per_arm"])), int(np.median(found["enrolled_per_arm"]))
     if design.is_map:
         shares = [_map_trial(design, per_arm, random) for _ in range(trials)]
-    elif settings.power.dropout:
+    elif settings.of(PowerSettings).dropout:
         shares = [
             share
             for _ in range(trials // _AT_ONCE)
@@ -187,7 +188,7 @@ def _with_dropouts(design: TrialDesign, enrolled: int, random: np.random.Generat
     """Run slowing trials in which the same participants leave, by mixed models of all visits."""
     effect, settings = design.effect, design.settings
     times = np.array(effect.visits)
-    hazard = -np.log1p(-settings.power.dropout) / effect.duration
+    hazard = -np.log1p(-settings.of(PowerSettings).dropout) / effect.duration
     leaves = random.exponential(1 / hazard, 2 * enrolled)
     who, visit = np.nonzero(times - times[0] <= leaves[:, None])
     treated, when = (who >= enrolled).astype(np.float64), times[visit]
@@ -201,7 +202,7 @@ def _with_dropouts(design: TrialDesign, enrolled: int, random: np.random.Generat
     contrast = [Contrast("slowing", np.array([0.0, 0, 0, 1]))]
     how = settings.changed(longitudinal={"random": "slope"}).longitudinal
     fit = fit_mixed(values, matrix, who.astype(np.str_), contrast, how, times=when)
-    return np.asarray(fit.tests[0].p <= settings.power.alpha)
+    return np.asarray(fit.tests[0].p <= settings.of(PowerSettings).alpha)
 
 
 def _trial(design: TrialDesign, enrolled: int, random: np.random.Generator) -> bool:
@@ -225,13 +226,13 @@ def _trial(design: TrialDesign, enrolled: int, random: np.random.Generator) -> b
         values += _WITHIN * random.standard_normal(values.shape)
         centered = times - times.mean()
         arms.append(values @ centered / (centered @ centered))
-    return bool(stats.ttest_ind(*arms).pvalue <= design.settings.power.alpha)
+    return bool(stats.ttest_ind(*arms).pvalue <= design.settings.of(PowerSettings).alpha)
 
 
 def _map_trial(design: TrialDesign, per_arm: int, random: np.random.Generator) -> float:
     """Run one trial of a map, and return the share of the affected points that it finds."""
     affected: Bool = np.zeros(design.nodes, dtype=bool)
-    affected[: round(design.settings.power.affected * design.nodes[0])] = True
+    affected[: round(design.settings.of(PowerSettings).affected * design.nodes[0])] = True
     values = _values(design, 2 * per_arm, random)
     values[per_arm:, affected] -= design.effect.share * _MEAN
     flat = values.reshape(2 * per_arm, -1)

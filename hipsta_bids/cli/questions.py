@@ -91,7 +91,8 @@ def run_question(
     for setting in filter(None, (step.setting for step in find_steps())):
         if attrgetter(setting)(settings):
             raise UsageError(
-                f"{' and '.join(flags)}: {setting} is not possible; remove it from the settings"
+                f"{' and '.join(flags)}: {setting.partition('.')[0]} is not possible; remove"
+                f" {setting} from the settings"
             )
     (question,) = questions
     for further in find_questions():

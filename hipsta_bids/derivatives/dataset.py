@@ -192,7 +192,7 @@ def write_notes(root: Path) -> None:
 
 
 def describe_maker() -> dict[str, Any]:
-    """Say what made the dataset: an entry of ``GeneratedBy``."""
+    """Describe the program that made the dataset, an entry of ``GeneratedBy``."""
     maker: dict[str, Any] = {
         "Name": NAME,
         "Version": __version__,

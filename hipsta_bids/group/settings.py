@@ -1,10 +1,11 @@
 """Every number that changes a result of the group level: default, range, unit, meaning."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING
 
-from pydantic import Field, PositiveInt
+from pydantic import PositiveInt, create_model
 
+from hipsta_bids.joints import find_settings, load
 from hipsta_bids.protocols import toml
 from hipsta_bids.stats import settings as statistics
 from hipsta_bids.types import tables
@@ -25,36 +26,34 @@ class ShapeSettings(tables.SettingsTable):
     """Sheets per hemisphere that are averaged, spread evenly over all; bounds time and memory."""
 
 
-class ExchangeSettings(tables.SettingsTable):
-    """The content of a summary for other sites."""
-
-    min_cell: Annotated[int, Field(ge=5)] = 5
-    """Fewest participants in a cell of all factors of the model, and behind a sum."""
-    min_residual_df: PositiveInt = 10
-    """Fewest participants beyond the columns of the model."""
-    max_leverage: tables.OpenFraction = 0.5
-    """Largest share of a fitted value due to one participant's own value."""
-
-
 class GroupSettings(tables.SettingsTable):
-    """All settings of the group level."""
+    """All settings of the group level; extensions add tables."""
 
     registration: statistics.RegistrationSettings = statistics.RegistrationSettings()
     model: statistics.DefaultModelSettings = statistics.DefaultModelSettings()
     design: statistics.DesignSettings = statistics.DesignSettings()
     glm: statistics.GlmSettings = statistics.GlmSettings()
     longitudinal: statistics.LongitudinalSettings = statistics.LongitudinalSettings()
-    harmonization: statistics.HarmonizationSettings = statistics.HarmonizationSettings()
     asymmetry: AsymmetrySettings = AsymmetrySettings()
     multiplicity: statistics.MultiplicitySettings = statistics.MultiplicitySettings()
     joint: statistics.JointSettings = statistics.JointSettings()
     shapes: ShapeSettings = ShapeSettings()
     classification: statistics.ClassificationSettings = statistics.ClassificationSettings()
-    retest: statistics.RetestSettings = statistics.RetestSettings()
-    power: statistics.PowerSettings = statistics.PowerSettings()
-    norms: statistics.NormSettings = statistics.NormSettings()
-    exchange: ExchangeSettings = ExchangeSettings()
-    meta: statistics.MetaSettings = statistics.MetaSettings()
+
+    def of(self, kind: type[tables.Table]) -> tables.Table:
+        """Return the settings of an extension, by their class."""
+        return next(value for _, value in self if isinstance(value, kind))
+
+
+if not TYPE_CHECKING:
+    _TABLES = {name: load(place) for name, place in find_settings().items()}
+    GroupSettings = create_model(
+        "GroupSettings",
+        __base__=GroupSettings,
+        __doc__=GroupSettings.__doc__,
+        __module__=__name__,
+        **{name: (kind, kind()) for name, kind in _TABLES.items()},
+    )
 
 
 def load_group_settings(path: Path | None) -> GroupSettings:

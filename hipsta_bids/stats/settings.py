@@ -188,20 +188,6 @@ class JointSettings(tables.SettingsTable):
     """Whether the left and the right map of a measure are combined too, point by point."""
 
 
-class HarmonizationSettings(tables.SettingsTable):
-    """ComBat: effects of sites or scanners, taken out of maps and summary measures."""
-
-    column: str = ""
-    """Column whose levels are harmonized, as ``site``; empty is none."""
-    least_participants: Annotated[int, Field(ge=3)] = 10
-    """Sites with fewer participants are refused: the mean of ten is known to a third of an SD."""
-    explained: tables.OpenFraction = 0.8
-    """A note names columns of the model of whose variance sites explain more than this."""
-    pooling: bool = True
-    """Points of a map inform each other about a site (empirical Bayes); summary measures never
-    do."""
-
-
 class ClassificationSettings(tables.SettingsTable):
     """Logistic models and how well they discriminate groups."""
 
@@ -233,72 +219,12 @@ class ClassificationSettings(tables.SettingsTable):
     slope are too uncertain (Snell et al. 2021)."""
 
 
-class RetestSettings(tables.SettingsTable):
-    """Agreement of repeated sessions."""
+class ExchangeSettings(tables.SettingsTable):
+    """The content of a summary for other sites."""
 
-    confidence: tables.OpenFraction = 0.95
-    """Coverage of two-sided confidence limits, fraction."""
-    min_participants: Annotated[int, Field(ge=3)] = 5
-    """Fewer participants with all sessions are too few, also at a point."""
-
-
-class PowerSettings(tables.SettingsTable):
-    """Participants that a trial of two arms needs."""
-
-    power: tables.OpenFraction = 0.8
-    """Chance to find the effect."""
-    dropout: Annotated[float, Field(ge=0, lt=1)] = 0.0
-    """Share of the enrolled participants lost before the last visit, at a constant hazard. Their
-    visits before that are in the mixed model of several visits."""
-    allocation: Annotated[float, Field(ge=1, le=20)] = 1.0
-    """Participants of the larger arm over the smaller arm."""
-    alpha: tables.OpenFraction = 0.05
-    """Two-sided level of the test of a summary measure, one of which is the end point. Maps hold
-    the false discovery rate ``multiplicity.alpha``."""
-    affected: tables.OpenFraction = 0.1
-    """Share of the points of a map that differ, as it decides on the level at each of them."""
-    months_per_time: PositiveFloat = 12.0
-    """Months per unit of a column of time that is not called years, months or days."""
-
-
-class NormSettings(tables.SettingsTable):
-    """Norms of a reference cohort, and scores of new participants."""
-
-    age: str = "age"
-    """Column of age, in years."""
-    sex: str = "sex"
-    """Column of sex."""
-    site: str = "site"
-    """Column of the site or scanner; its values are names."""
-    knots: Annotated[int, Field(ge=3)] = 5
-    """Knots of the natural cubic spline of age, at equal shares of the participants."""
-    shared_knots: Codes = ()
-    """Knots in years on which sites agree, at least three. Norms are then normal at each age, and
-    ``norms.json`` has the sums by which ``meta --norms`` merges sites."""
-    edge: Annotated[int, Field(ge=3)] = 5
-    """Norms reach from the age with this rank from below to the age with this rank from above. They
-    are rounded to years outward, so that they reveal no single participant's age."""
-    least_participants: Annotated[int, Field(ge=50)] = 100
-    """Smaller reference cohorts are refused."""
-    least_site: Annotated[int, Field(ge=10)] = 15
-    """Participants that a site of the reference needs; a point needs half as many with a value."""
-    least_controls: Annotated[int, Field(ge=25)] = 25
-    """Controls that a new site needs; a point needs half as many with a value."""
-    seed: NonNegativeInt = 0
-    """Of the folds."""
-    charts: tables.Texts = ("thickness_mean", "volume", "curvature_mean", "area_mid", "extent_y")
-    """Summary measures that get a chart."""
-
-
-class MetaSettings(tables.SettingsTable):
-    """Summaries of several sites become one result."""
-
-    random: Literal["reml", "reml-adhoc", "dl"] = "reml"
-    """Random effects. ``reml``: variance between sites by restricted maximum likelihood, limits by
-    Knapp and Hartung 2003 (``knha`` in metafor). ``reml-adhoc``: the same, but no standard error
-    below the uncorrected one, which is conservative. ``dl``: DerSimonian and Laird 1986, with
-    normal tests."""
-    min_sites: Annotated[int, Field(ge=2)] = 2
-    """Fewest sites with an estimate at a point."""
-    confidence: tables.OpenFraction = 0.95
-    """Coverage of two-sided confidence and prediction limits, fraction."""
+    min_cell: Annotated[int, Field(ge=5)] = 5
+    """Fewest participants in a cell of all factors of the model, and behind a sum."""
+    min_residual_df: PositiveInt = 10
+    """Fewest participants beyond the columns of the model."""
+    max_leverage: tables.OpenFraction = 0.5
+    """Largest share of a fitted value due to one participant's own value."""

@@ -15,6 +15,10 @@ EXTENSION = Extension(
             meaning="combine summaries of sites (group level)",
         ),
     ),
+    group_settings=(
+        ("exchange", "hipsta_bids.stats.settings:ExchangeSettings"),
+        ("meta", f"{__name__}.settings:MetaSettings"),
+    ),
     parts=(
         Part(
             option="--export-summary",

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
+from hipsta_bids.extensions.consortia.settings import MetaSettings
 from hipsta_bids.stats.arrays import Bool, Float
-from hipsta_bids.stats.settings import MetaSettings
 
 #: Steps of the scoring end when no variance changes by more than this, relative to its scale.
 _TOLERANCE, _MOST_STEPS = 1e-10, 200

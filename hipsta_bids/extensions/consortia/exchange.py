@@ -20,7 +20,6 @@ from hipsta_bids import __version__
 from hipsta_bids.errors import InputError, ModelError
 from hipsta_bids.group.cohort.data import Cohort, grows_with_head, summary_values
 from hipsta_bids.group.output.results import Analysis, templates_of
-from hipsta_bids.group.questions.disclosure import check_cells, check_people, is_traceable
 from hipsta_bids.group.questions.study import Study
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.io import files
@@ -28,9 +27,11 @@ from hipsta_bids.io.files import FileNumbers, Number, Text, read_foreign, rounde
 from hipsta_bids.joints import Writer
 from hipsta_bids.stats.arrays import Float, Int
 from hipsta_bids.stats.design import Design, build_design
+from hipsta_bids.stats.disclosure import check_cells, check_people, is_traceable
 from hipsta_bids.stats.formula import typed
 from hipsta_bids.stats.glm import FittedMaps, PointTest, fit_points, with_mean
 from hipsta_bids.stats.grammar import closed_formula
+from hipsta_bids.stats.settings import ExchangeSettings
 from hipsta_bids.types.tables import TomlTable
 
 #: File of a summary, in the folder of an analysis.
@@ -225,7 +226,7 @@ def summarize(
     notes = []
     if lacking := len(analysis.design.rows) - len(rows):
         notes.append(f"{SUMMARY}: without {lacking} participants who lack a hemisphere")
-    sample = _most_complete(analysis, rows, settings.exchange.min_cell)
+    sample = _most_complete(analysis, rows, settings.of(ExchangeSettings).min_cell)
     try:
         summary, omissions = _summarize(
             cohort, analysis, settings, sample, site=site, inputs=inputs
@@ -299,12 +300,12 @@ def _summarize(
     groups = {}
     if analysis.groups is not None:
         column = table[analysis.groups.column]
-        check_cells({analysis.groups.column: column}, settings.exchange.min_cell)
+        check_cells({analysis.groups.column: column}, settings.of(ExchangeSettings).min_cell)
         groups = _counts(column, analysis.groups.reference)
     names = {name for formula in designs for name in closed_formula(formula).names}
     first = analysis.groups.column if analysis.groups else None
     variables = {name: typed(table[name]) for name in sorted(names, key=lambda n: (n != first, n))}
-    cells = check_people([*designs.values()], variables, settings.exchange)
+    cells = check_people([*designs.values()], variables, settings.of(ExchangeSettings))
     models = list(_models(compared, analysis, rows, designs, settings, cells=cells))
     if not models:
         raise ModelError(
@@ -438,7 +439,7 @@ def _model(
     ]
     complete = np.isfinite(values).all(axis=0)
     fit = fit_points(np.where(complete, values, 0.0), design.matrix, contrasts, settings.glm)
-    traceable = is_traceable(values, cells, settings.exchange.min_cell)
+    traceable = is_traceable(values, cells, settings.of(ExchangeSettings).min_cell)
     usable = complete & np.isfinite(fit.sigma) & ~traceable
 
     def known(numbers: Float) -> list[Any]:

@@ -1,10 +1,8 @@
 """The meta-analysis from files to files: summaries of sites become tables, maps and a page."""
 
-import tomllib
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from functools import partial
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +11,11 @@ import pandas as pd
 
 from hipsta_bids import __version__
 from hipsta_bids.errors import OutputError, UsageError
+from hipsta_bids.extensions.consortia.columns import COLUMNS
 from hipsta_bids.extensions.consortia.effects import FIXED, RANDOM
 from hipsta_bids.extensions.consortia.exchange import SiteSummary, read_summary, shown_counts
 from hipsta_bids.extensions.consortia.page import FOLDER, write_meta_page
+from hipsta_bids.extensions.consortia.settings import MetaSettings
 from hipsta_bids.extensions.consortia.sites import Meta, analyze_sites, check_agreement, meta_tables
 from hipsta_bids.group.cohort.data import Cohort
 from hipsta_bids.group.output import write
@@ -25,7 +25,6 @@ from hipsta_bids.group.output.maps import ContrastMap, contrasts
 from hipsta_bids.group.output.methods import discovery_text
 from hipsta_bids.group.output.panels import Row, draw_pages
 from hipsta_bids.group.output.style import Drawing
-from hipsta_bids.group.output.tables import COLUMNS
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.io import files
 from hipsta_bids.protocols.toml import resolve
@@ -61,7 +60,7 @@ def run_meta(
         )
     with write.whole_folder(folder) as scratch:
         for name, table in meta_tables(meta):
-            write.write_table(scratch, name, table, described=name != "sites", meaning=_columns())
+            write.write_table(scratch, name, table, described=name != "sites", meaning=COLUMNS)
         _write_maps(scratch, meta)
         notes += write.write_figures(scratch, _figures(meta), prints=figures)
         files.write_text(scratch / "methods.md", _methods(meta))
@@ -91,12 +90,6 @@ def _read(paths: Sequence[tuple[str | None, Path]]) -> list[SiteSummary]:
     if len(sites) < 2:  # noqa: PLR2004 -- sites
         raise UsageError("meta: give the summaries of two sites or more")
     return sites
-
-
-def _columns() -> dict[str, str]:
-    """Read the meanings of columns; those of a meta-analysis differ in part from an analysis."""
-    text = (resources.files("hipsta_bids.extensions.consortia") / "columns.toml").read_text("utf-8")
-    return {**COLUMNS, **tomllib.loads(text)}
 
 
 def _write_maps(folder: Path, meta: Meta) -> None:
@@ -213,7 +206,7 @@ def _record(
 
 def _methods(meta: Meta) -> str:
     """Return what was done and what was found."""
-    rules, sites = meta.settings.meta, meta.sites
+    rules, sites = meta.settings.of(MetaSettings), meta.sites
     cite = Citations()
     counts = Counter[str]()
     sizes = [size for site in sites for size in shown_counts(site.groups).items()]

@@ -10,6 +10,7 @@ from hipsta_bids import __version__
 from hipsta_bids.errors import ModelError, UsageError
 from hipsta_bids.extensions.norms import sums as summed_norms
 from hipsta_bids.extensions.norms.file import NormsFile, load_norms, save_norms
+from hipsta_bids.extensions.norms.settings import NormSettings
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.io import files
 from hipsta_bids.stats.formula import listed
@@ -31,7 +32,7 @@ def merge_norms(
     loaded = [load_norms(path)[0] for path in paths]
     _check_agreement(paths, loaded)
     first, sites = loaded[0], {name: n for file in loaded for name, n in file.sites.items()}
-    least, participants = settings.norms.least_participants, sum(sites.values())
+    least, participants = settings.of(NormSettings).least_participants, sum(sites.values())
     if participants < least:
         raise ModelError(
             f"meta --norms: {participants} participants, {least} are needed; add sites"

@@ -12,6 +12,7 @@ import pandas as pd
 from hipsta_bids.errors import ModelError
 from hipsta_bids.extensions.consortia.effects import Combined, MetaResult, meta_analyze
 from hipsta_bids.extensions.consortia.exchange import ModelSummary, SiteSummary, shown_counts
+from hipsta_bids.extensions.consortia.settings import MetaSettings
 from hipsta_bids.group.output import columns, tables
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.io import files
@@ -67,7 +68,7 @@ class Meta:
         """A combined estimate as tests; Cohen's d is over the residual SD within sites."""
         sd, missing = item.result.sd, np.full(len(item.result.sd), np.nan)
         for effects, effects_of_kind in item.result.models.items():
-            limits = effects_of_kind.limits(self.settings.meta.confidence)
+            limits = effects_of_kind.limits(self.settings.of(MetaSettings).confidence)
             test = PointTest(
                 contrast=Contrast(item.label(effects), np.ones(1)),
                 statistic=effects_of_kind.statistic,
@@ -196,7 +197,7 @@ def analyze_sites(sites: list[SiteSummary], settings: GroupSettings) -> Meta:
                 _stack(site.models[number].se[contrast] for site in sites),
                 _stack(site.models[number].sd for site in sites),
                 np.array([site.models[number].df for site in sites]),
-                settings.meta,
+                settings.of(MetaSettings),
             ),
         )
         for number, model in enumerate(sites[0].models)
@@ -233,7 +234,7 @@ def _frame(sites: Sequence[SiteSummary], number: int) -> columns.Frame:
 
 def meta_tables(meta: Meta) -> Iterator[tuple[str, pd.DataFrame]]:
     """Make all tables."""
-    confidence = meta.settings.meta.confidence
+    confidence = meta.settings.of(MetaSettings).confidence
     yield "sites", _sites(meta)
     edges = sheet_edges(
         len(meta.sites[0].x), len(meta.sites[0].y), meta.settings.multiplicity.neighbors
@@ -317,7 +318,7 @@ def _points(peaks: Sequence[pd.DataFrame], frame: columns.Frame) -> list[int]:
 
 def _forest(meta: Meta, item: Item, point: int) -> pd.DataFrame:
     """Everything in a forest plot: a row per site, and one per combined estimate."""
-    result, confidence = item.result, meta.settings.meta.confidence
+    result, confidence = item.result, meta.settings.of(MetaSettings).confidence
     is_map = item.model.kind == "map"
     labels: dict[str, Any] = {
         "measure": item.model.measures[0 if is_map else point],
@@ -366,7 +367,7 @@ def _row(combined: Combined, point: int, confidence: float) -> dict[str, float]:
 
 def _summaries(meta: Meta) -> pd.DataFrame:
     """List summary measures by fixed and random effects."""
-    confidence = meta.settings.meta.confidence
+    confidence = meta.settings.of(MetaSettings).confidence
     parts = []
     for item in meta.of("summary"):
         for key, test, combined in meta.tests(item):

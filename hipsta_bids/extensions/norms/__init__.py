@@ -34,6 +34,11 @@ EXTENSION = Extension(
             },
         ),
     ),
+    group_settings=(
+        ("norms", f"{__name__}.settings:NormSettings"),
+        ("exchange", "hipsta_bids.stats.settings:ExchangeSettings"),
+    ),
+    columns=f"{__name__}.columns:COLUMNS",
     sections=f"{__name__}.page:SECTIONS",
     has_templates=True,
 )

@@ -14,10 +14,10 @@ import numpy as np
 from scipy import special
 
 from hipsta_bids.errors import ModelError
+from hipsta_bids.extensions.norms.settings import NormSettings
 from hipsta_bids.extensions.norms.wscores import tail_probability
 from hipsta_bids.stats.arrays import Bool, Float, Int
 from hipsta_bids.stats.glm import chunks
-from hipsta_bids.stats.settings import NormSettings
 from hipsta_bids.stats.solve import solve_weighted
 
 #: Values at a point are transformed if a likelihood-ratio test rejects the normal distribution

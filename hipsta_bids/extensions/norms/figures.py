@@ -1,4 +1,4 @@
-"""Figures of norms and deviations."""
+"""Figures of norms: charts of centiles, and maps of norms and of deviations."""
 
 import re
 from collections.abc import Iterator, Mapping

@@ -15,10 +15,12 @@ from hipsta_bids.derivatives import dataset
 from hipsta_bids.errors import ModelError
 from hipsta_bids.extensions.norms import centiles as normative
 from hipsta_bids.extensions.norms import sums as summed_norms
+from hipsta_bids.extensions.norms.columns import COLUMNS
 from hipsta_bids.extensions.norms.figures import deviation_rows, draw_norms, norm_rows
 from hipsta_bids.extensions.norms.file import NormsFile, load_norms, save_norms
 from hipsta_bids.extensions.norms.methods import norms_text
 from hipsta_bids.extensions.norms.scoring import ScoredMaps, map_rows, score_rows, write_scores
+from hipsta_bids.extensions.norms.settings import NormSettings
 from hipsta_bids.extensions.norms.sites import with_sums
 from hipsta_bids.extensions.norms.wscores import NormativeScores
 from hipsta_bids.group.cohort.data import SHEET, Cohort, layers
@@ -40,7 +42,6 @@ from hipsta_bids.stats.arrays import Bool, Float, Int, Key
 from hipsta_bids.stats.design import FIRST_AGE
 from hipsta_bids.stats.formula import check_names, level_labels, listed, typed
 from hipsta_bids.stats.glm import most_frequent, points_of
-from hipsta_bids.stats.settings import NormSettings
 from hipsta_bids.stats.warps import Template
 from hipsta_bids.types import PARTICIPANT
 
@@ -99,9 +100,9 @@ def run_norms(
     )
     tell("norms")
     file = file.model_copy(update={"template": template, "labels": dict(study.labels)})
-    if settings.norms.shared_knots:
+    if settings.of(NormSettings).shared_knots:
         file, people, values = with_sums(study, file, people, values)
-    norms, tables["coverage"] = _fit(values, people, file, settings.norms)
+    norms, tables["coverage"] = _fit(values, people, file, settings.of(NormSettings))
     n_sites = len(file.sites)
     scoring = _Made(None, None, file, norms, people, cohorts, values, tables, n_sites)
     return _write(study, scoring, ())
@@ -147,7 +148,7 @@ def _score_people(
         if norms[key].mean.shape[1] != numbers.shape[1]:
             points = f"{norms[key].mean.shape[1]} points, these participants {numbers.shape[1]}"
             raise ModelError(f"{path}: norms of {listed(key)} have {points}")
-        at, least = adapted[rows], settings.norms.least_controls // 2
+        at, least = adapted[rows], settings.of(NormSettings).least_controls // 2
         extended[key] = norms[key].extended(
             numbers[at], people.take(rows[at]), len(file.sites), least
         )
@@ -187,7 +188,7 @@ def _write(study: studies.Study, scoring: _Made, notes: Iterable[str]) -> studie
     charts = [
         file.centiles(norms).assign(hemi=hemi, measure=name, unit=cohort.units.get(name, "1"))
         for (hemi, name), norms in scoring.norms.items()
-        if name in settings.norms.charts and hemi != BOTH
+        if name in settings.of(NormSettings).charts and hemi != BOTH
     ]
     if charts:
         table = pd.concat(charts, ignore_index=True)
@@ -241,7 +242,9 @@ def _write(study: studies.Study, scoring: _Made, notes: Iterable[str]) -> studie
         notes.append(f"{n_later} later sessions are not in the norms, which take first ones")
     if file.site not in cohort.table:
         notes.append(f"no column {file.site!r}: all are taken to be at one, {_NO_SITE!r}")
-    return study.write(name, notes, visits=visits, tables=scoring.tables, record=record, fill=fill)
+    return study.write(
+        name, notes, visits=visits, tables=scoring.tables, meaning=COLUMNS, record=record, fill=fill
+    )
 
 
 def _protocol(study: studies.Study) -> tuple[str, str]:
@@ -256,7 +259,7 @@ def _planned(study: studies.Study) -> tuple[NormsFile, normative.People]:
     Refuses a cohort that is too small, or whose sexes are those of sites.
     """
     cohort, collection, settings = study.cohort, study.collection, study.settings
-    rules, table = settings.norms, cohort.table
+    rules, table = settings.of(NormSettings), cohort.table
     check_names([rules.age], table.columns)
     sites, complete = _site_labels(table, rules.site), np.ones(len(table), dtype=bool)
     sexes = level_labels(table[rules.sex]) if rules.sex in table else None
@@ -395,7 +398,7 @@ def _with_new_sites(
 ) -> NormsFile:
     """Add the names of new sites, if they have controls enough."""
     table, settings = study.cohort.table, study.settings
-    least, sites = settings.norms.least_controls, dict(file.sites)
+    least, sites = settings.of(NormSettings).least_controls, dict(file.sites)
     labels = _site_labels(table, file.site).to_numpy()
     for number in range(len(sites), int(people.site.max(initial=-1)) + 1):
         members = people.site == number

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from hipsta_bids.errors import ModelError
 from hipsta_bids.extensions.norms import STEP
+from hipsta_bids.extensions.norms.columns import COLUMNS
 from hipsta_bids.extensions.norms.wscores import NormativeScores, w_scores
 from hipsta_bids.group.cohort import data
 from hipsta_bids.group.output.results import Analysis
@@ -171,11 +172,11 @@ def tables(
     cohort: data.Cohort,  # noqa: ARG001  (as of all steps)
     analysis: Analysis,
     prefix: str,
-) -> Iterator[tuple[str, pd.DataFrame]]:
-    """Table of scores."""
+) -> Iterator[tuple[str, pd.DataFrame, Mapping[str, str]]]:
+    """Table of scores, with the meaning of its columns."""
     table = analysis.parts[STEP].table
     if len(table):
-        yield f"{prefix}wscores", table
+        yield f"{prefix}wscores", table, COLUMNS
 
 
 def score_files(

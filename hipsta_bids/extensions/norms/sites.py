@@ -12,10 +12,11 @@ from hipsta_bids.extensions.norms import sums as summed_norms
 from hipsta_bids.extensions.norms.centiles import People
 from hipsta_bids.extensions.norms.file import NormsFile
 from hipsta_bids.group.questions import study as studies
-from hipsta_bids.group.questions.disclosure import check_sums, is_traceable
 from hipsta_bids.io import files
 from hipsta_bids.stats.arrays import Float, Int, Key
+from hipsta_bids.stats.disclosure import check_sums, is_traceable
 from hipsta_bids.stats.formula import level_labels, typed
+from hipsta_bids.stats.settings import ExchangeSettings
 from hipsta_bids.types import PARTICIPANT
 
 
@@ -45,7 +46,7 @@ def with_sums(
     if file.sexes:
         variables[file.sex] = level_labels(members[file.sex])
     names = ["constant", *(f"{file.age} {i}" for i in range(1, len(knots))), *file.sexes[1:]]
-    columns, limits = summed_norms.columns_of(summed, knots), study.settings.exchange
+    columns, limits = summed_norms.columns_of(summed, knots), study.settings.of(ExchangeSettings)
     for number, site in enumerate(file.sites):
         positions = np.flatnonzero(summed.site == number)
         if len(positions) < limits.min_cell:

@@ -34,6 +34,8 @@ EXTENSION = Extension(
             },
         ),
     ),
+    group_settings=(("harmonization", f"{__name__}.settings:HarmonizationSettings"),),
+    columns=f"{__name__}.columns:COLUMNS",
     sections=f"{__name__}.page:SECTIONS",
     has_templates=True,
 )

@@ -10,6 +10,7 @@ from hipsta_bids.errors import ModelError
 from hipsta_bids.extensions.sites import NAME, combat
 from hipsta_bids.extensions.sites.planning import SitePlan
 from hipsta_bids.extensions.sites.saved import SavedEffects
+from hipsta_bids.extensions.sites.settings import HarmonizationSettings
 from hipsta_bids.group.cohort.data import Cohort, Measures, compare_sessions, grows_with_head
 from hipsta_bids.group.output.results import Analysis, digests
 from hipsta_bids.group.settings import GroupSettings
@@ -125,7 +126,7 @@ def _effects(
     key: tuple[str, str, str],
 ) -> tuple[combat.SiteEffects, combat.SiteMoments]:
     kind, hemi, measure = key
-    pooled = settings.harmonization.pooling and kind == "map"
+    pooled = settings.of(HarmonizationSettings).pooling and kind == "map"
     if plan.saved is None:
         n, longitudinal = len(plan.sites), settings.longitudinal
         return combat.fit_effects(values, visits, n, longitudinal, pooled=pooled)
@@ -151,7 +152,7 @@ def _notes(plan: SitePlan, settings: GroupSettings, unknown: set[str]) -> Iterat
             "harmonized"
         )
     for name, share in plan.explained.items():
-        if share > settings.harmonization.explained:
+        if share > settings.of(HarmonizationSettings).explained:
             yield f"{plan.column} explains {share:.0%} of {name}: its effect is poorly known"
     if unknown and plan.saved:
         names = formulas.listed(unknown)

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator
 
 from hipsta_bids.extensions.sites.harmonize import part_of
+from hipsta_bids.extensions.sites.settings import HarmonizationSettings
 from hipsta_bids.group.cohort.data import SIZES
 from hipsta_bids.group.output.citations import code, escaped
 from hipsta_bids.group.output.results import Analysis
@@ -24,7 +25,7 @@ def methods(analysis: Analysis, cite: Callable[[str], str]) -> Iterator[str]:
         f" ComBat {sources}. ComBat estimated a shift and a scale of each {column} from the"
         f" residuals of a linear model at each point, and preserved {preserved}."
     )
-    if plan.estimated and settings.harmonization.pooling:
+    if plan.estimated and settings.of(HarmonizationSettings).pooling:
         text += (
             " Shifts and scales were pooled over the points of each map by empirical Bayes;"
             " summary measures were harmonized separately."

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
+from hipsta_bids.extensions.sites.columns import COLUMNS
 from hipsta_bids.extensions.sites.combat import ARRAYS, SiteEffects
 from hipsta_bids.extensions.sites.harmonize import Harmonization, part_of
 from hipsta_bids.extensions.sites.planning import SitePlan
@@ -26,10 +27,12 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-def tables(cohort: Cohort, analysis: Analysis, prefix: str) -> Iterator[tuple[str, pd.DataFrame]]:
-    """Table of shifts and scales."""
+def tables(
+    cohort: Cohort, analysis: Analysis, prefix: str
+) -> Iterator[tuple[str, pd.DataFrame, Mapping[str, str]]]:
+    """Table of shifts and scales, with the meaning of its columns."""
     if rows := list(_site_rows(part_of(analysis), cohort.units)):
-        yield f"{prefix}sites", pd.DataFrame(rows)
+        yield f"{prefix}sites", pd.DataFrame(rows), COLUMNS
 
 
 def _site_rows(harmonization: Harmonization, units: Mapping[str, str]) -> Iterator[dict[str, Any]]:

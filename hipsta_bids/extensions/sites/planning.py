@@ -10,6 +10,7 @@ from formulaic import Formula
 from hipsta_bids.errors import ModelError
 from hipsta_bids.extensions.sites import combat
 from hipsta_bids.extensions.sites.saved import SavedEffects, damaged, load_effects
+from hipsta_bids.extensions.sites.settings import HarmonizationSettings
 from hipsta_bids.group.cohort.data import SIZES
 from hipsta_bids.group.output.results import Analysis
 from hipsta_bids.group.request import Request
@@ -57,7 +58,9 @@ class SitePlan:
 
 def is_asked(request: Request) -> bool:
     """Check whether effects of sites are taken out."""
-    return bool(request.options.get("harmonize_model") or request.settings.harmonization.column)
+    return bool(
+        request.options.get("harmonize_model") or request.settings.of(HarmonizationSettings).column
+    )
 
 
 def plan_sites(request: Request) -> SitePlan:
@@ -70,7 +73,7 @@ def plan_sites(request: Request) -> SitePlan:
     cohort, model, settings = request.cohort, request.model, request.settings
     path = request.options.get("harmonize_model")
     saved = load_effects(path) if path else None
-    column = saved.column if saved else settings.harmonization.column
+    column = saved.column if saved else settings.of(HarmonizationSettings).column
     formulas.check_names([column], cohort.table.columns)
     _check_terms(model, column)
     if request.comparison.pair:
@@ -196,7 +199,7 @@ def _check_sizes(
     *,
     is_single: bool,
 ) -> None:
-    least = settings.harmonization.least_participants
+    least = settings.of(HarmonizationSettings).least_participants
     if is_single and len(new) < 2:  # noqa: PLR2004 -- one is like all
         raise ModelError(
             f"--harmonize {column}: all participants with the variables of the model have "

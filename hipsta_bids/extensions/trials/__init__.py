@@ -17,6 +17,11 @@ EXTENSION = Extension(
             settings=f"{__name__}.options:given_settings",
         ),
     ),
+    group_settings=(
+        ("retest", f"{__name__}.settings:RetestSettings"),
+        ("power", f"{__name__}.settings:PowerSettings"),
+    ),
+    columns=f"{__name__}.columns:COLUMNS",
     sections=f"{__name__}.page:SECTIONS",
     has_templates=True,
 )

@@ -2,10 +2,10 @@
 
 from collections.abc import Callable
 
+from hipsta_bids.extensions.trials.settings import PowerSettings, RetestSettings
 from hipsta_bids.extensions.trials.sizes import THINNING, TrialEffect, point_level
 from hipsta_bids.group.output.methods import PROCEDURES
 from hipsta_bids.group.settings import GroupSettings
-from hipsta_bids.stats.settings import RetestSettings
 
 Cite = Callable[[str], str]
 """Numbers a work by its key."""
@@ -18,7 +18,7 @@ def power_text(
     cite: Cite,
 ) -> str:
     """Return the design of the trial; ``source`` names what variances were estimated from."""
-    plan, rules = settings.power, settings.multiplicity
+    plan, rules = settings.of(PowerSettings), settings.multiplicity
     months = ", ".join(f"{month:g}" for month in effect.visits)
     question = f"treatment prevents {100 * effect.share:g} % of the change over time"
     if effect.kind == THINNING:

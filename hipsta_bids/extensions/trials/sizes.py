@@ -8,8 +8,9 @@ from numpy.typing import NDArray
 from scipy import special, stats
 
 from hipsta_bids.errors import ModelError, UsageError
+from hipsta_bids.extensions.trials.settings import PowerSettings
 from hipsta_bids.stats.arrays import Bool, Float
-from hipsta_bids.stats.settings import MultiplicitySettings, PowerSettings
+from hipsta_bids.stats.settings import MultiplicitySettings
 
 #: More participants per arm are not looked for.
 MOST_PARTICIPANTS = 10_000

@@ -14,9 +14,11 @@ from hipsta_bids import __version__
 from hipsta_bids.derivatives import dataset
 from hipsta_bids.errors import ModelError
 from hipsta_bids.extensions.trials import sizes as trials
+from hipsta_bids.extensions.trials.columns import COLUMNS
 from hipsta_bids.extensions.trials.figures import agreement_rows, size_rows
 from hipsta_bids.extensions.trials.methods import power_text, retest_text
 from hipsta_bids.extensions.trials.page import TABLES
+from hipsta_bids.extensions.trials.settings import PowerSettings, RetestSettings
 from hipsta_bids.group import model as modeling
 from hipsta_bids.group.cohort.covariates import order_sessions
 from hipsta_bids.group.cohort.data import SHEET, SUMMARY, Cohort, Layer, layers, participants_with
@@ -39,7 +41,7 @@ from hipsta_bids.stats.design import build_design
 from hipsta_bids.stats.formula import listed, model_from_shortcut, parse_model
 from hipsta_bids.stats.glm import FittedMaps, PointwiseFit, RowModel, fit_maps, points_of
 from hipsta_bids.stats.mixed import longitudinal_model
-from hipsta_bids.stats.settings import GlmSettings, RetestSettings
+from hipsta_bids.stats.settings import GlmSettings
 from hipsta_bids.types import PARTICIPANT, SESSION
 
 #: Maps, by the value of ``stat-``: the tables that have them, the column, and the unit; none
@@ -85,7 +87,7 @@ class Retested:
         self, cohort: Cohort, settings: GroupSettings, *, has_visits: bool = False
     ) -> None:
         """Take variances of one visit of a trial, or of several."""
-        self._has_visits, self._settings = has_visits, settings.retest
+        self._has_visits, self._settings = has_visits, settings.of(RetestSettings)
         table = cohort.table
         counts = table[SESSION].fillna("").value_counts()
         self.sessions = tuple(order_sessions(table, settings))
@@ -188,7 +190,9 @@ class Modeled:
     @property
     def months(self) -> float:
         """Months per unit of time."""
-        return _MONTHS.get(str(self.time).casefold(), self._settings.power.months_per_time)
+        return _MONTHS.get(
+            str(self.time).casefold(), self._settings.of(PowerSettings).months_per_time
+        )
 
     @property
     def follow_up(self) -> float:
@@ -309,7 +313,9 @@ def run_trial(
     """
     dataset.check_own_dataset(options.out_dir)
     if effect is not None:
-        trials.point_level(settings.multiplicity, settings.power)  # refuses before anything is read
+        trials.point_level(
+            settings.multiplicity, settings.of(PowerSettings)
+        )  # refuses before anything is read
     visits = bool(effect and effect.visits)
     options = replace(options, comparison=modeling.Comparison(longitudinal=retest or visits))
     study = studies.read_study(options, settings, among)
@@ -356,7 +362,7 @@ def run_trial(
         "power": effect
         and asdict(effect)
         | {
-            "alpha_point": trials.point_level(settings.multiplicity, settings.power),
+            "alpha_point": trials.point_level(settings.multiplicity, settings.of(PowerSettings)),
             "most": trials.MOST_PARTICIPANTS,
         },
         "among": among,
@@ -369,6 +375,7 @@ def run_trial(
         _notes(source, results, study, effect),
         visits=modeled,
         tables=tables,
+        meaning=COLUMNS,
         record=record,
         fill=fill,
     )
@@ -385,7 +392,7 @@ def _sample_sizes(effect: trials.TrialEffect, result: Described, settings: Group
         if not single:
             return {}
         moments = replace(moments, mean=np.full_like(moments.mean, np.nan))
-    plan = settings.power
+    plan = settings.of(PowerSettings)
     alpha = plan.alpha if single else trials.point_level(settings.multiplicity, plan)
     confidence = settings.glm.confidence if single else None
     size = trials.sample_size(effect, moments, plan, alpha=alpha, confidence=confidence)
@@ -457,7 +464,9 @@ def _methods(
     paragraphs = [first]
     if isinstance(source, Retested):
         paragraphs.append(
-            retest_text(len(source.sessions), len(source.participants), settings.retest, cite)
+            retest_text(
+                len(source.sessions), len(source.participants), settings.of(RetestSettings), cite
+            )
         )
     if effect is not None:
         paragraphs.append(power_text(effect, settings, source.words, cite))
@@ -491,7 +500,7 @@ def _write_tables(
                     table = table.sort_values(
                         ["per_arm", "cohen_d"], ascending=[True, False], ignore_index=True
                     )
-            write.write_table(folder, title, table)
+            write.write_table(folder, title, table, meaning=COLUMNS)
 
 
 def _write_maps(folder: Path, cohorts: Mapping[str, Cohort], results: Sequence[Described]) -> None:

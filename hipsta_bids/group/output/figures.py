@@ -3,7 +3,6 @@
 Figures of maps are in ``maps`` and ``panels``. Colors are those of the pages (``reports.display``).
 """
 
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -12,7 +11,6 @@ from textwrap import wrap
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 
 from hipsta_bids.derivatives.analyses import GroupResults, records
 from hipsta_bids.group.cohort.data import SHEET, Cohort
@@ -21,10 +19,9 @@ from hipsta_bids.group.output.maps import draw_alignment, draw_measure
 from hipsta_bids.group.output.results import Analysis
 from hipsta_bids.group.output.shapes import AverageShape
 from hipsta_bids.group.output.steps import blocks
-from hipsta_bids.io.files import MISSING
 from hipsta_bids.joints import load_all
 from hipsta_bids.reports.cells import display_name, with_brackets
-from hipsta_bids.reports.display import COLORS, HEMISPHERE_COLORS, X_ENDS
+from hipsta_bids.reports.display import COLORS, X_ENDS
 from hipsta_bids.reports.group_maps import MOST_FIGURES, measures_of
 from hipsta_bids.stats.arrays import Float, describe_known
 from hipsta_bids.stats.glm import FittedMaps
@@ -342,52 +339,6 @@ def _mark_subfields(axis: "Axes", layers: Float, fitted: FittedMaps, node: int) 
             x, y = middle[nodes[len(nodes) // 2]]
             box = {"facecolor": "white", "alpha": 0.8, "edgecolor": "none", "pad": 0.3}
             axis.text(x, y, name, fontsize=style.SMALL, ha="center", va="center", bbox=box)
-
-
-def draw_norms(lines: pd.DataFrame, dots: pd.DataFrame) -> "list[Figure]":
-    """Draw centiles over age, a row for each sex, a column for each side, and participants.
-
-    Controls that a site was adapted to are open circles.
-    """
-    sexes, sides = lines["sex"].unique(), lines["hemi"].unique()
-    width = style.TWO_COLUMNS if len(sides) > 1 else style.ONE_COLUMN
-    figure, axes = style.new_panels(len(sexes), len(sides), (width, 60.0 * len(sexes)))
-    measure, unit = lines[["measure", "unit"]].iloc[0]
-    names = [name for name in lines.columns if re.fullmatch(r"p\d+", name)]
-    limits = np.concatenate([lines[names].to_numpy().ravel(), dots["value"]])
-    low, high = np.nanmin(limits), np.nanmax(limits)
-    margin = 0.03 * (high - low)
-    for row, sex in zip(axes, sexes, strict=True):
-        for axis, hemi in zip(row, sides, strict=True):
-            lines_here = lines[(lines["hemi"] == hemi) & (lines["sex"] == sex)]
-            age, color = lines_here["age"], HEMISPHERE_COLORS[hemi]
-            for first, last in ((0, -1), (1, -2)):
-                edges = lines_here[names[first]], lines_here[names[last]]
-                axis.fill_between(age, *edges, color=color, alpha=0.15, linewidth=0)
-            for name in names:
-                middle = name == names[len(names) // 2]
-                axis.plot(age, lines_here[name], color=color, linewidth=1.4 if middle else 0.6)
-                end = (1.01, lines_here[name].iloc[-1])
-                axis.annotate(name[1:], end, xycoords=("axes fraction", "data"), va="center")
-            dots_here = dots[(dots["hemi"] == hemi) & (dots["sex"] == sex)]
-            for control, face in ((False, "black"), (True, "none")):
-                dots_of_control = dots_here[dots_here["adapted"] == control]
-                axis.plot(
-                    dots_of_control["age"],
-                    dots_of_control["value"],
-                    "o",
-                    color="black",
-                    mfc=face,
-                    ms=2.5,
-                    mew=0.5,
-                )
-            axis.set_title(SIDES[hemi] if sex == MISSING else f"{SIDES[hemi]}, {sex}")
-            axis.set_xlabel("age [years]")
-            axis.set_xlim(age.min(), age.max())
-            axis.set_ylim(low - margin, high + margin)
-        row[0].set_ylabel(with_brackets(display_name(measure), unit))
-    style.letter_panels(axes.flat)
-    return [figure]
 
 
 def draw_figures(

@@ -12,7 +12,6 @@ import pandas as pd
 from hipsta_bids.group.cohort.data import Cohort, hemispheres, participants_with, summary_values
 from hipsta_bids.group.output import columns, results
 from hipsta_bids.group.output.columns import find_clusters, frame_of
-from hipsta_bids.group.output.steps import blocks
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.reports import cells
 from hipsta_bids.reports.group_tables import opposite_changes
@@ -41,6 +40,11 @@ JOINT_COLUMNS: Mapping[str, str] = COLUMNS | _MEANINGS["joint"]
 DEMOGRAPHIC_COLUMNS: Mapping[str, str] = COLUMNS | _MEANINGS["demographics"]
 
 
+def read_columns(package: str) -> dict[str, str]:
+    """Read the meaning of the columns of an extension, beside the columns of all analyses."""
+    return {**COLUMNS, **tomllib.loads((files(package) / "columns.toml").read_text("utf-8"))}
+
+
 def result_tables(
     surface: str,
     cohort: Cohort,
@@ -59,7 +63,6 @@ def result_tables(
         yield "measures", summary_tests(cohort, analysis, settings)
         if analysis.groups is not None:
             yield "descriptives", _stacked(_descriptives(analysis))
-    yield from blocks("tables", analysis.request, cohort, analysis, prefix)
     if analysis.pairs:
         yield "classification", _classification(analysis, settings)
         yield "roc", _stacked(_curves(analysis, _roc))

@@ -95,6 +95,10 @@ def write_results(
             surface, surface_cohort, analyses[surface], settings, averages
         ):
             write_table(folder, name, tables.with_references(table, analysis))
+        prefix = f"{surface}_" if surface else ""
+        further = blocks("tables", analysis.request, surface_cohort, analyses[surface], prefix)
+        for name, table, meaning in further:
+            write_table(folder, name, table, meaning=meaning)
     if analysis.found:
         overview = tables.overview_table(analysis.found)
         write_table(folder, "maps", tables.with_references(overview, analysis))

@@ -213,19 +213,21 @@ class Study:
         *,
         visits: pd.DataFrame,
         tables: Mapping[str, pd.DataFrame],
+        meaning: Mapping[str, str],
         record: Mapping[str, Any],
         fill: Callable[[Path], list[str]],
     ) -> GroupResult:
         """Write results of questions other than comparisons, and a page.
 
-        ``fill`` writes the files of this question only, and returns notes.
+        ``meaning`` is of the columns of the tables. ``fill`` writes the files of this question
+        only, and returns notes.
         """
         excluded = [*self.exclusions, *collect.exclude_visits(self.visits, self.left_out)]
         all_notes, people = [*self.notes, *notes], int(visits[PARTICIPANT].nunique())
 
         def everything(folder: Path) -> dict[str, Any]:
             for title, table in tables.items():
-                write.write_table(folder, title, table)
+                write.write_table(folder, title, table, meaning=meaning)
             write.write_exclusions(folder, excluded)
             write.write_table(folder, "covariates", visits, described=False)
             formulas = [record.get("formula") or "1"]

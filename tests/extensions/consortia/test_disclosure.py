@@ -9,12 +9,11 @@ from check_disclosure import attack_designs, share_of_ordinary
 
 from hipsta_bids.errors import ModelError
 from hipsta_bids.extensions.consortia import exchange
-from hipsta_bids.group.questions.disclosure import check_cells, check_people, is_traceable
-from hipsta_bids.group.settings import ExchangeSettings
 from hipsta_bids.stats.design import build_design
+from hipsta_bids.stats.disclosure import check_cells, check_people, is_traceable
 from hipsta_bids.stats.formula import ModelSpec, typed
 from hipsta_bids.stats.grammar import closed_formula
-from hipsta_bids.stats.settings import DesignSettings
+from hipsta_bids.stats.settings import DesignSettings, ExchangeSettings
 
 
 def people(n_cell, seed=0, cells=(("CN", "F"), ("CN", "M"), ("AD", "F"), ("AD", "M"))):

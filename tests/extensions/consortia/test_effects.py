@@ -5,7 +5,7 @@ import pytest
 from statsmodels.stats.meta_analysis import combine_effects
 
 from hipsta_bids.extensions.consortia.effects import combine, meta_analyze
-from hipsta_bids.stats.settings import MetaSettings
+from hipsta_bids.extensions.consortia.settings import MetaSettings
 
 #: Trials of the BCG vaccine (Colditz et al. 1994): cases and others among the vaccinated, and among
 #: controls, as in Viechtbauer (2010), J Stat Softw 36(3), table 1.

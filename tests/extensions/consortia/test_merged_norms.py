@@ -15,8 +15,8 @@ from hipsta_bids.extensions.norms import norming
 from hipsta_bids.extensions.norms.centiles import NORM_ARRAYS, People
 from hipsta_bids.extensions.norms.file import _digest, load_norms
 from hipsta_bids.extensions.norms.sums import columns_of
-from hipsta_bids.group.questions.disclosure import check_sums
-from hipsta_bids.group.settings import ExchangeSettings
+from hipsta_bids.stats.disclosure import check_sums
+from hipsta_bids.stats.settings import ExchangeSettings
 
 MEASURES = ("--measures", "thickness", "thickness_mean", "volume")
 SHARED = "[norms]\nshared_knots = [20.0, 50.0, 85.0]\n"

@@ -16,9 +16,9 @@ from small_cohorts import NODES, place_of, read_participants, table, write_parti
 
 from hipsta_bids.cli.main import main
 from hipsta_bids.extensions.norms import norming
+from hipsta_bids.extensions.norms.columns import COLUMNS
 from hipsta_bids.extensions.norms.file import NormArrays, NormsFile, _digest, load_norms
 from hipsta_bids.group.output.saved import templates_from_json
-from hipsta_bids.group.output.tables import COLUMNS
 from hipsta_bids.io import files
 from hipsta_bids.reports.group import group_page
 from hipsta_bids.stats.registration import mean_profiles, register_to

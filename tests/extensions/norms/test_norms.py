@@ -14,7 +14,7 @@ from hipsta_bids.extensions.norms.centiles import (
     from_normal,
     to_normal,
 )
-from hipsta_bids.stats.settings import NormSettings
+from hipsta_bids.extensions.norms.settings import NormSettings
 
 SETTINGS = NormSettings()
 KNOTS = np.array([20.0, 35, 50, 70, 90])

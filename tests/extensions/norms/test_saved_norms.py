@@ -8,7 +8,7 @@ import pytest
 from hipsta_bids.errors import ModelError
 from hipsta_bids.extensions.norms.centiles import fit_norms
 from hipsta_bids.extensions.norms.file import NormsFile, load_norms, save_norms
-from hipsta_bids.stats.settings import NormSettings
+from hipsta_bids.extensions.norms.settings import NormSettings
 
 KNOTS = np.array([20.0, 35, 50, 70, 90])
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 from hipsta_bids.extensions.norms import centiles as norms_module
-from hipsta_bids.stats.settings import NormSettings
+from hipsta_bids.extensions.norms.settings import NormSettings
 from validation import norms as suite
 
 

@@ -14,8 +14,8 @@ from hipsta_bids.extensions.norms.centiles import (
     age_columns,
     fit_norms,
 )
+from hipsta_bids.extensions.norms.settings import NormSettings
 from hipsta_bids.extensions.norms.sums import fit_sums, fit_values, sum_columns, sum_values
-from hipsta_bids.stats.settings import NormSettings
 
 KNOTS = np.array([20.0, 40, 60, 85])
 #: Shift in mm, and scale of the SD; the last site is new.

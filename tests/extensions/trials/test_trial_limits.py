@@ -5,6 +5,7 @@ import pandas as pd
 import pytest
 from statsmodels.stats.power import TTestIndPower
 
+from hipsta_bids.extensions.trials.settings import PowerSettings
 from hipsta_bids.extensions.trials.sizes import (
     Reference,
     TrialEffect,
@@ -17,7 +18,6 @@ from hipsta_bids.extensions.trials.trial import Modeled, Retested
 from hipsta_bids.group.cohort.data import SHEET, Cohort, layers
 from hipsta_bids.group.model import ModelRequest, VisitTime
 from hipsta_bids.group.settings import GroupSettings
-from hipsta_bids.stats.settings import PowerSettings
 from hipsta_bids.types import PARTICIPANT, SESSION
 from validation.group import thickness_side
 

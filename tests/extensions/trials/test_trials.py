@@ -6,6 +6,7 @@ from scipy import stats
 from statsmodels.stats.power import TTestIndPower
 
 from hipsta_bids.errors import ModelError, UsageError
+from hipsta_bids.extensions.trials.settings import PowerSettings
 from hipsta_bids.extensions.trials.sizes import (
     Reference,
     TrialEffect,
@@ -14,7 +15,7 @@ from hipsta_bids.extensions.trials.sizes import (
     power_of,
     sample_size,
 )
-from hipsta_bids.stats.settings import MultiplicitySettings, PowerSettings
+from hipsta_bids.stats.settings import MultiplicitySettings
 
 SETTINGS = PowerSettings()
 REFERENCE = Reference(

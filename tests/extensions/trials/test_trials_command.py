@@ -14,8 +14,8 @@ from statsmodels.stats.power import TTestIndPower
 
 from hipsta_bids.cli.main import main
 from hipsta_bids.extensions.trials import trial as trials
+from hipsta_bids.extensions.trials.columns import COLUMNS
 from hipsta_bids.extensions.trials.sizes import repeatability
-from hipsta_bids.group.output.tables import COLUMNS
 from hipsta_bids.reports.group import group_page
 from hipsta_bids.stats.registration import mean_profiles, register
 from hipsta_bids.stats.settings import RegistrationSettings

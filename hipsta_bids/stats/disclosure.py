@@ -14,10 +14,10 @@ import numpy as np
 import pandas as pd
 
 from hipsta_bids.errors import ModelError
-from hipsta_bids.group.settings import ExchangeSettings
 from hipsta_bids.stats.arrays import Bool, Float, Int
 from hipsta_bids.stats.design import DEPENDENCE, Design
 from hipsta_bids.stats.formula import FEW_VALUES, level_labels
+from hipsta_bids.stats.settings import ExchangeSettings
 
 #: Share of a sum of squares that belongs to a few participants, if the sum is theirs alone.
 _WHOLE_SHARE = 1 - 1e-6
