@@ -12,7 +12,7 @@ _MODULES = {
     "measure": "hipsta_bids.api.maps",
     "load": "hipsta_bids.api.datasets",
     "example": "hipsta_bids.api.datasets",
-    "register": "hipsta_bids.group.questions.models",
+    "register": "hipsta_bids.api.models",
     "figure": "hipsta_bids.api.figures",
     "plot_sheet": "hipsta_bids.api.plots",
     "plot_surface": "hipsta_bids.api.plots",
@@ -24,9 +24,9 @@ if TYPE_CHECKING:
     from hipsta_bids.api.datasets import example, load
     from hipsta_bids.api.figures import figure
     from hipsta_bids.api.maps import measure
+    from hipsta_bids.api.models import group, register
     from hipsta_bids.api.plots import plot_group, plot_sheet, plot_surface
     from hipsta_bids.extensions.agreement.correlate import correlate
-    from hipsta_bids.group.questions.models import group, register
 else:
 
     def __getattr__(name: str) -> object:

@@ -9,9 +9,9 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from hipsta_bids.api.maps import Measurement, attributes, check_choice
+from hipsta_bids.api.models import GroupFit
 from hipsta_bids.derivatives.results import STATE
 from hipsta_bids.geometry.catalog import MAPS
-from hipsta_bids.group.questions.models import GroupFit
 from hipsta_bids.io.gifti import sheet_triangles
 from hipsta_bids.reports import display
 from hipsta_bids.reports.cells import display_name, unit_of

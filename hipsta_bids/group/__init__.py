@@ -1,7 +1,7 @@
 """Group level: registration of profiles, point-wise models, classification.
 
 Called as a function, ``hipsta_bids.group(maps, table, formula)``, it fits a model to arrays: see
-:func:`hipsta_bids.group.questions.models.group`.
+:func:`hipsta_bids.api.models.group`.
 """
 
 import inspect
@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from hipsta_bids.group.questions.models import GroupFit
+    from hipsta_bids.api.models import GroupFit
 
 
 def _function() -> "Callable[..., GroupFit]":
-    from hipsta_bids.group.questions.models import group  # noqa: PLC0415  (most imports need no model)
+    from hipsta_bids.api.models import group  # noqa: PLC0415  (most imports need no model)
 
     return group
 
@@ -25,7 +25,7 @@ class _Package(ModuleType):
     """A package with the call, signature and text of the function that it hides by its name."""
 
     def __call__(self, *arguments: Any, **named: Any) -> "GroupFit":  # noqa: ANN401  (of the function)
-        """Fit a model to arrays, see :func:`hipsta_bids.group.questions.models.group`."""
+        """Fit a model to arrays, see :func:`hipsta_bids.api.models.group`."""
         return _function()(*arguments, **named)
 
     @property

@@ -13,7 +13,7 @@ import hipsta_bids as hb
 
 MODULES = (
     *(f"hipsta_bids.api.{name}" for name in ("maps", "datasets", "plots")),
-    "hipsta_bids.group.questions.models",
+    "hipsta_bids.api.models",
 )
 LIBRARIES = ("xarray", "matplotlib.pyplot")
 
@@ -57,7 +57,7 @@ def test_the_interface_opens_no_window_system():
 
 
 def test_group_has_the_signature_and_text_of_its_function():
-    function = import_module("hipsta_bids.group.questions.models").group
+    function = import_module("hipsta_bids.api.models").group
     assert inspect.signature(hb.group) == inspect.signature(function)
     assert list(inspect.signature(hb.group).parameters)[:3] == ["maps", "table", "formula"]
     assert inspect.getdoc(hb.group) == inspect.getdoc(function)

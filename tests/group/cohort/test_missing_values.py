@@ -7,10 +7,10 @@ import pandas as pd
 import pytest
 from small_cohorts import place_of
 
+from hipsta_bids.api.models import group
 from hipsta_bids.errors import InputError, ModelError
 from hipsta_bids.group.cohort.covariates import read_covariates, spelled_note
 from hipsta_bids.group.cohort.exclusions import Choices
-from hipsta_bids.group.questions.models import group
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.inputs.edits import read_ends
 from hipsta_bids.inputs.maps import read_regions
