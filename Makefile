@@ -2,6 +2,7 @@
 #   make demo    make the environment, make a synthetic dataset, measure it, compare with the truth
 #   make quick   tests of geometry, statistics, formats, protocols and designs
 #   make test    lint, types, layer contracts and tests, exactly as in CI
+#   make separable    tests and demonstration without each extension
 #   make release    what takes long: validation, tutorials, faults, containers, clusters, browser
 #   make validation    measure accuracy: all suites, and their tables in docs/validation
 #   make docs    the documentation as a site in build/site, without network
@@ -23,7 +24,7 @@ BIN := $(VENV)/bin
 # Changes to either file mean that the environment is out of date.
 STAMP := $(VENV)/.made-from-lock
 
-.PHONY: help env demo quick test release lint types layers unit validation docs format lock clean
+.PHONY: help env demo quick test brief separable release lint types layers unit validation docs format lock clean
 help:
 	@sed -n '2,/^$$/s/^# \{0,1\}//p' Makefile
 
@@ -45,7 +46,11 @@ $(STAMP): requirements-dev.lock pyproject.toml
 demo: $(STAMP)
 	"$(BIN)/hipsta-bids" demo "$(DEMO)"
 
-test: lint types layers unit
+test: lint types layers unit brief
+
+# Two extensions are deleted, others each day.
+brief: $(STAMP)
+	PYTHON="$(BIN)/python" tools/test-separable --brief
 
 lint: $(STAMP)
 	"$(BIN)/python" -m ruff check .
@@ -76,7 +81,10 @@ unit: $(STAMP)
 quick: $(STAMP)
 	$(PYTEST) $(QUICK:%=tests/%)
 
-release: $(STAMP) validation
+separable: $(STAMP)
+	PYTHON="$(BIN)/python" tools/test-separable
+
+release: $(STAMP) validation separable
 	$(PYTEST) tests/validation
 	set -e; for script in tutorials faults fuzz container cluster reports long install; do \
 		PYTHON="$(BIN)/python" "tools/test-$$script"; done
