@@ -134,9 +134,8 @@ class Collection:
 
 def collect_sheets(request: GroupRequest, *, may_lack: bool = False) -> Collection:
     """Find all complete hemispheres of one protocol, made with the same settings."""
-    for folder in request.segmentations:
-        if not folder.is_dir():
-            raise MissingFileError(f"{folder}: folder not found; check --segmentations")
+    if lacking := [folder for folder in request.segmentations if not folder.is_dir()]:
+        raise MissingFileError(f"{lacking[0]}: folder not found; check --segmentations")
     roots = [root for root in request.roots if root.is_dir() or not may_lack]
     results = [result for root in roots for result in _wanted_results(root, request)]
     places = [result for result in results if result.name.region == request.region]
@@ -150,51 +149,74 @@ def collect_sheets(request: GroupRequest, *, may_lack: bool = False) -> Collecti
     _refuse_twice(places)
     visits = [(result.name.subject, result.name.session) for result in results]
     choices = Choices(request.exclude_table, request.ratings, visits)
-    compared = {root: read_compared(root) for root in roots}
-    records: list[SheetRecord] = []
-    left_out = [exclusion for root in roots for exclusion in _excluded_labels(root, request)]
-    quality, digests = [], []
-    for result in sorted(places, key=_key):
-        record = read_record(result)
-        row = compared[result.root].get(result.name.title)
-        outlier = None if row is None else row[TEXT].replace(files.MISSING, "")
-        entry = _judge(result, record, request, choices, outlier)
-        quality.append(_quality(result.name, record, choices, outlier))
-        digests.append((result.name, _digest(record)))
-        if isinstance(entry, Exclusion):
-            left_out.append(entry)
-        else:
-            records.append(entry)
+    judged = _judge_all(places, roots, request, choices)
+    records = judged.records
     _refuse_unfinished(request, seg, choices)
     if not records:
-        reasons = ", ".join(f"{n} {why}" for why, n in Counter(e.reason for e in left_out).items())
+        counts = Counter(exclusion.reason for exclusion in judged.excluded)
+        reasons = ", ".join(f"{n} {reason}" for reason, n in counts.items())
         raise NothingToDoError(
             f"{request.roots[0]}: no hemisphere is left for the group level ({reasons})"
         )
-    count = sum(q["outlier status"] is None and q["decision"] != Decision.FAILED for q in quality)
-    unknown = (
-        f"--exclude-outliers: {count} hemispheres were not compared with {FEWEST} or more others;"
-        " run the participant level without --shard to compare"
-    )
     digest, grid = _one_settings(records), grid_of(records[0].result.root)
     _refuse_several_sheets(records)
     return Collection(
         records=tuple(records),
-        exclusions=tuple(left_out),
+        exclusions=tuple(judged.excluded),
         grid=grid,
         settings_hash=digest,
-        quality=pd.DataFrame(quality),
+        quality=pd.DataFrame(judged.quality),
         versions=tuple(sorted({record.version for record in records})),
-        ratings=choices.counts(digests),
+        ratings=choices.counts(judged.digests),
         notes=(
             *notes,
             *_shared_sheets(grid),
-            *[unknown] * bool(count and request.exclude_outliers),
+            *(_not_compared(judged.quality) if request.exclude_outliers else ()),
             *choices.excluded.notes(_with_digests(results)),
             *choices.rated.notes(_with_digests(results)),
         ),
         warnings=_several_versions(records),
     )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Judged:
+    """Hemispheres in their order."""
+
+    records: list[SheetRecord] = field(default_factory=list)
+    excluded: list[Exclusion] = field(default_factory=list)
+    quality: list[dict[str, str | None]] = field(default_factory=list)
+    digests: list[tuple[HemisphereName, str | None]] = field(default_factory=list)
+
+
+def _judge_all(
+    places: Iterable[ResultPlace], roots: Sequence[Path], request: GroupRequest, choices: Choices
+) -> _Judged:
+    """Take or exclude each hemisphere, with its decision, its rating and its hash."""
+    compared = {root: read_compared(root) for root in roots}
+    judged = _Judged(excluded=[e for root in roots for e in _excluded_labels(root, request)])
+    for result in sorted(places, key=_key):
+        record = read_record(result)
+        row = compared[result.root].get(result.name.title)
+        outlier = None if row is None else row[TEXT].replace(files.MISSING, "")
+        entry = _judge(result, record, request, choices, outlier)
+        if isinstance(entry, Exclusion):
+            judged.excluded.append(entry)
+        else:
+            judged.records.append(entry)
+        judged.quality.append(_quality(result.name, record, choices, outlier))
+        judged.digests.append((result.name, _digest(record)))
+    return judged
+
+
+def _not_compared(quality: Iterable[Mapping[str, str | None]]) -> Iterator[str]:
+    """Note hemispheres that were not compared with enough others to be outliers."""
+    count = sum(q["outlier status"] is None and q["decision"] != Decision.FAILED for q in quality)
+    if count:
+        yield (
+            f"--exclude-outliers: {count} hemispheres were not compared with {FEWEST} or more"
+            " others; run the participant level without --shard to compare"
+        )
 
 
 def _quality(
