@@ -291,17 +291,17 @@ def add_external(
     if not with_sheets:
         measured, flat = _without_sheets(measured, flat)
     sides = {hemi: _with_maps(side, hemi, flat) for hemi, side in measured.sides.items()}
-    cohorts = {}
-    for name, sides_of_map in maps.items():
-        if name not in flat:
-            on_mesh = any(side.mesh is not None for side in sides_of_map.values())
-            axes = measured if on_mesh else _on_grid(measured, _nodes(sides_of_map))
-            cohorts[name] = Cohort(
-                table=measured.table, sides=sides_of_map, x=axes.x, y=axes.y, units=units
-            )
+    cohorts = {name: _cohort(one, measured) for name, one in maps.items() if name not in flat}
     if cohorts:
         notes.append(f"maps {', '.join(cohorts)}: not registered, their points are to correspond")
     return replace(measured, sides=sides), cohorts, notes
+
+
+def _cohort(sides: Mapping[str, SideMaps], measured: Measured) -> Cohort:
+    """Return a map with points of its own as a cohort."""
+    on_mesh = any(side.mesh is not None for side in sides.values())
+    axes = measured if on_mesh else _on_grid(measured, _nodes(sides))
+    return Cohort(table=measured.table, sides=sides, x=axes.x, y=axes.y, units=measured.units)
 
 
 def _without_sheets(measured: Measured, flat: _Flat) -> tuple[Measured, _Flat]:

@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from pathlib import Path
 from sys import intern
 from typing import Any
@@ -134,10 +135,9 @@ class Collection:
 
 def collect_sheets(request: GroupRequest, *, may_lack: bool = False) -> Collection:
     """Find all complete hemispheres of one protocol, made with the same settings."""
-    if lacking := [folder for folder in request.segmentations if not folder.is_dir()]:
-        raise MissingFileError(f"{lacking[0]}: folder not found; check --segmentations")
+    _check_folders(request.segmentations)
     roots = [root for root in request.roots if root.is_dir() or not may_lack]
-    results = [result for root in roots for result in _wanted_results(root, request)]
+    results = list(chain.from_iterable(_wanted_results(root, request) for root in roots))
     places = [result for result in results if result.name.region == request.region]
     notes = _other_regions(results, request)
     if may_lack and not places:
@@ -150,18 +150,13 @@ def collect_sheets(request: GroupRequest, *, may_lack: bool = False) -> Collecti
     visits = [(result.name.subject, result.name.session) for result in results]
     choices = Choices(request.exclude_table, request.ratings, visits)
     judged = _judge_all(places, roots, request, choices)
-    records = judged.records
     _refuse_unfinished(request, seg, choices)
-    if not records:
-        counts = Counter(exclusion.reason for exclusion in judged.excluded)
-        reasons = ", ".join(f"{n} {reason}" for reason, n in counts.items())
-        raise NothingToDoError(
-            f"{request.roots[0]}: no hemisphere is left for the group level ({reasons})"
-        )
+    _refuse_none(judged, request)
+    records = tuple(judged.records)
     digest, grid = _one_settings(records), grid_of(records[0].result.root)
     _refuse_several_sheets(records)
     return Collection(
-        records=tuple(records),
+        records=records,
         exclusions=tuple(judged.excluded),
         grid=grid,
         settings_hash=digest,
@@ -177,6 +172,12 @@ def collect_sheets(request: GroupRequest, *, may_lack: bool = False) -> Collecti
         ),
         warnings=_several_versions(records),
     )
+
+
+def _check_folders(folders: Iterable[Path]) -> None:
+    for folder in folders:
+        if not folder.is_dir():
+            raise MissingFileError(f"{folder}: folder not found; check --segmentations")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -207,6 +208,15 @@ def _judge_all(
         judged.quality.append(_quality(result.name, record, choices, outlier))
         judged.digests.append((result.name, _digest(record)))
     return judged
+
+
+def _refuse_none(judged: _Judged, request: GroupRequest) -> None:
+    if not judged.records:
+        counts = Counter(exclusion.reason for exclusion in judged.excluded)
+        reasons = ", ".join(f"{n} {reason}" for reason, n in counts.items())
+        raise NothingToDoError(
+            f"{request.roots[0]}: no hemisphere is left for the group level ({reasons})"
+        )
 
 
 def _not_compared(quality: Iterable[Mapping[str, str | None]]) -> Iterator[str]:
@@ -373,17 +383,24 @@ def _judge(
     elif request.exclude_qc and (condition := fulfilled(request.exclude_qc, _metrics(record))):
         reason, message = "quality", condition
     else:
-        inputs = record.get("inputs") or [{}]
-        return SheetRecord(
-            result=result,
-            settings_hash=intern(str(record.get("settings_hash"))),
-            version=intern(str(record.get("version"))),
-            source=relocate(str(inputs[0].get("file", "")), request.segmentations),
-            provenance=tuple(intern(text) for text in provenance_of(record).values()),
-            sheet=tuple(dict.fromkeys(str(v.get("session")) for v in record.get("visits") or ())),
-            doubtful=decision == Decision.LOOK and not choices.approves(*rated),
-        )
+        doubtful = decision == Decision.LOOK and not choices.approves(*rated)
+        return _taken(result, record, request, doubtful=doubtful)
     return Exclusion.of_sheet(result.name, reason, message)
+
+
+def _taken(
+    result: ResultPlace, record: Mapping[str, Any], request: GroupRequest, *, doubtful: bool
+) -> SheetRecord:
+    inputs = record.get("inputs") or [{}]
+    return SheetRecord(
+        result=result,
+        settings_hash=intern(str(record.get("settings_hash"))),
+        version=intern(str(record.get("version"))),
+        source=relocate(str(inputs[0].get("file", "")), request.segmentations),
+        provenance=tuple(intern(text) for text in provenance_of(record).values()),
+        sheet=tuple(dict.fromkeys(str(v.get("session")) for v in record.get("visits") or ())),
+        doubtful=doubtful,
+    )
 
 
 def _metrics(record: Mapping[str, Any]) -> dict[str, Any]:

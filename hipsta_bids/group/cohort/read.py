@@ -45,7 +45,6 @@ def choose_measures(
     if not requested:
         return Measures(maps=(*(DEFAULT if records else ()), *further))
     summaries = tuple(read_summary(records[0].result)) if records else ()
-    available = [*(SHEET_MAPS if records else ()), *further, *_sampled(records), *summaries]
     maps, numbers = [], []
     for name in requested:
         if (
@@ -57,12 +56,18 @@ def choose_measures(
         elif name in summaries or name.startswith(VOLUME):
             numbers.append(name)
         else:
-            names = list(dict.fromkeys(available))  # maps and summary measures share some
-            hint = f"there are {listed(names, _MOST_NAMES)}"
-            if records and len(names) > _MOST_NAMES:
-                hint += f"; {records[0].result.path('summary')} has all summary measures"
-            raise _unknown(name, names, hint)
+            raise _no_measure(name, records, (*further, *_sampled(records), *summaries))
     return Measures(maps=tuple(maps), summaries=tuple(numbers) or None)
+
+
+def _no_measure(name: str, records: Sequence[SheetRecord], further: Sequence[str]) -> InputError:
+    """Return the error of a name that is neither a map nor a summary measure."""
+    # Maps and summary measures share some names.
+    names = list(dict.fromkeys([*(SHEET_MAPS if records else ()), *further]))
+    hint = f"there are {listed(names, _MOST_NAMES)}"
+    if records and len(names) > _MOST_NAMES:
+        hint += f"; {records[0].result.path('summary')} has all summary measures"
+    return _unknown(name, names, hint)
 
 
 def check_summaries(measures: Measures, sides: Mapping[str, SideMaps]) -> None:
