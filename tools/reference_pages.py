@@ -103,8 +103,7 @@ REST_TEXT = """\
 Limits, sizes and iterations, beside the [settings that users change](settings.md). The defaults are
 the values of the [validation](validation.md)."""
 
-#: Settings that users change, of the participant and of the group level, and of extensions.
-_CHANGED: Mapping[str, str] = {
+_CHANGED = {
     "body": "region layer_rule join_every_layer end_rule end_margin mending",
     "boundaries": "operator edges",
     "sheet": "x_nodes y_nodes z_nodes x_coordinate depths",
@@ -124,12 +123,9 @@ _CHANGED: Mapping[str, str] = {
     "norms": "shared_knots",
     "meta": "random",
 }
-#: The same of those that are there.
-CHANGED = {
-    stage: names
-    for stage, names in _CHANGED.items()
-    if stage in Settings.model_fields or stage in GroupSettings.model_fields
-}
+_TABLES = {*Settings.model_fields, *GroupSettings.model_fields}
+#: Settings that users change, of the participant and of the group level, as far as these exist.
+CHANGED: Mapping[str, str] = {n: names for n, names in _CHANGED.items() if n in _TABLES}
 
 REASONS_TEXT = """\
 A reason is a short name for programs. It is in the column `reason` of `status.tsv` and

@@ -79,13 +79,8 @@ def correlate(
         for one in (first, second)
     ]
     columns = correlate_maps(maps[0], maps[1], mesh, permutations, seed)
-    content = {
-        **dict(zip(("first", "second"), names, strict=True)),
-        **columns,
-        "permutations": permutations,
-        "seed": seed,
-    }
-    row = pd.Series(content, dtype=object)
+    content = dict(zip(("first", "second"), names, strict=True)) | columns
+    row = pd.Series({**content, "permutations": permutations, "seed": seed}, dtype=object)
     if out is not None:
         _write(Path(out), row, partial(_drawn, row, maps, mesh))
     return row

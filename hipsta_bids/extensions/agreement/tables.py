@@ -56,6 +56,11 @@ class Entry:
         return maps
 
     @property
+    def measures(self) -> set[str]:
+        """Return the names of the maps."""
+        return {key.measure for key in self.maps}
+
+    @property
     def people(self) -> set[str]:
         """Return the labels of the participants in the model."""
         return set(self.results.table("covariates")[PARTICIPANT])
@@ -177,43 +182,56 @@ def effect_rows(
     entries: Sequence[Entry], measure: str
 ) -> tuple[dict[str, Ground], list[list[Row]]]:
     """Show the effect maps of a measure in one scale: a row per analysis, a block per contrast."""
-    drawn = [entry for entry in entries if measure in {key.measure for key in entry.maps}]
+    drawn = [entry for entry in entries if measure in entry.measures]
     grounds = [read_grounds(entry.results, entry.measure or measure) for entry in drawn]
-    flat = [{hemi: replace(one, surface=None) for hemi, one in own.items()} for own in grounds]
-    names = [dict.fromkeys(n for one in own.values() for n in one.names) for own in flat]
-    uniform = all(list(own) == list(names[0]) for own in names)
-    first, number, blocks = drawn[0].maps, count(), list[list[Row]]()
-    for contrast in dict.fromkeys(key.contrast for key in first if key.measure == measure):
-        keys = [key for key in first if (key.measure, key.contrast) == (measure, contrast)]
-        tests = [
-            {k.hemi: e.maps[k][0] for k in keys if k in e.maps and _comparable(first[k], e.maps[k])}
-            for e in drawn
-        ]
-        every_test = [test for own in tests for test in own.values()]
-        reach = display.effect_reach(
-            [display.Effects(t.kind, t.effect, t.statistic, t.df) for t in every_test]
+    flat = [_changed(sides, surface=None) for sides in grounds]
+    names = [list(dict.fromkeys(n for one in sides.values() for n in one.names)) for sides in flat]
+    uniform = names.count(names[0]) == len(names)
+    # One line of names below all rows would be wrong.
+    ends = ["" if uniform else f"; {', '.join(of_analysis)}" for of_analysis in names]
+    lines, number = list(zip(drawn, flat, ends, strict=True)), count()
+    contrasts = dict.fromkeys(key.contrast for key in drawn[0].maps if key.measure == measure)
+    blocks = [_contrast_rows(lines, measure, contrast, number) for contrast in contrasts]
+    return flat[0] if uniform else _changed(flat[0], names=()), blocks
+
+
+def _changed(grounds: Mapping[str, Ground], **values: Any) -> dict[str, Ground]:  # noqa: ANN401  (of any field)
+    return {hemi: replace(ground, **values) for hemi, ground in grounds.items()}
+
+
+def _contrast_rows(
+    lines: Sequence[tuple[Entry, Mapping[str, Ground], str]],
+    measure: str,
+    contrast: str,
+    number: Iterator[int],
+) -> list[Row]:
+    """Show the maps of a contrast in one scale; analyses have grounds, and ends of titles."""
+    first = lines[0][0].maps
+    keys = [key for key in first if (key.measure, key.contrast) == (measure, contrast)]
+    tests = [
+        {k.hemi: e.maps[k][0] for k in keys if k in e.maps and _comparable(first[k], e.maps[k])}
+        for e, *_ in lines
+    ]
+    every_test = [test for own in tests for test in own.values()]
+    kind = every_test[0].kind
+    reach = display.effect_reach(
+        [display.Effects(t.kind, t.effect, t.statistic, t.df) for t in every_test]
+    )
+    low, colors, _ = display.effect_colors(kind)
+    return [
+        Row(
+            kind="effect",
+            index=next(number),
+            title=f"{contrast}: {entry.name} (n = {entry.results.record['participants']}){end}",
+            label=EFFECT_NAMES[kind],
+            scale={"cmap": colors, "vmin": low * reach, "vmax": reach},
+            values={hemi: test.effect for hemi, test in own.items()},
+            survive={hemi: test.rejected for hemi, test in own.items()},
+            grounds=sides,
         )
-        low, colors, _ = display.effect_colors(every_test[0].kind)
-        blocks.append(
-            [
-                Row(
-                    kind="effect",
-                    index=next(number),
-                    title=f"{contrast}: {entry.name} (n = {entry.results.record['participants']})"
-                    # One line of names below all rows would be wrong.
-                    + ("" if uniform else f"; {', '.join(own_names)}"),
-                    label=EFFECT_NAMES[every_test[0].kind],
-                    scale={"cmap": colors, "vmin": low * reach, "vmax": reach},
-                    values={hemi: test.effect for hemi, test in own.items()},
-                    survive={hemi: test.rejected for hemi, test in own.items()},
-                    grounds=sides,
-                )
-                for entry, own, sides, own_names in zip(drawn, tests, flat, names, strict=True)
-                if own
-            ]
-        )
-    shared = flat[0] if uniform else {h: replace(one, names=()) for h, one in flat[0].items()}
-    return shared, blocks
+        for (entry, sides, end), own in zip(lines, tests, strict=True)
+        if own
+    ]
 
 
 def differences(entries: Sequence[Entry]) -> Iterator[str]:

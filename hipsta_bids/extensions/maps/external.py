@@ -56,21 +56,8 @@ def map_patterns(
     """Combine and check the options about maps; a surface without a name is for all other maps."""
     names = [name for name, _ in patterns]
     for name, pattern in patterns:
-        if not (name.isalnum() and name.isascii() and name[0].isalpha()):
-            raise UsageError(f"--maps: {name!r} is not a name of letters and digits")
-        if name in reserved or names.count(name) > 1:
-            problem = "belongs to the sheets" if name in reserved else "occurs twice"
-            raise UsageError(
-                f"--maps: the name {name} {problem}; choose another one, such as other{name}"
-            )
-        check_pattern("--maps", name, pattern)
-        fields = fields_of(pattern)
-        one_side = fields & {"hemi", "side"} or pattern.endswith(DENSE_SCALARS)
-        if "subject" not in fields or not one_side:
-            raise UsageError(
-                f"--maps {name}: the pattern needs {{subject}}, and {{hemi}} or {{side}} unless it"
-                f" ends with {DENSE_SCALARS}"
-            )
+        _check_name(name, names, reserved)
+        _check_map(name, pattern)
     if unmatched := [name for name, _ in surfaces if name is not None and name not in names]:
         raise UsageError(f"--maps-surface: there is no --maps {unmatched[0]}=...")
     for surface, pattern in surfaces:
@@ -80,6 +67,27 @@ def map_patterns(
         MapPattern(name=name, pattern=pattern, surface=pattern_of.get(name, pattern_of.get(None)))
         for name, pattern in patterns
     )
+
+
+def _check_name(name: str, names: Sequence[str], reserved: Sequence[str]) -> None:
+    if not (name.isalnum() and name.isascii() and name[0].isalpha()):
+        raise UsageError(f"--maps: {name!r} is not a name of letters and digits")
+    if name in reserved or names.count(name) > 1:
+        problem = "belongs to the sheets" if name in reserved else "occurs twice"
+        raise UsageError(
+            f"--maps: the name {name} {problem}; choose another one, such as other{name}"
+        )
+
+
+def _check_map(name: str, pattern: str) -> None:
+    check_pattern("--maps", name, pattern)
+    fields = fields_of(pattern)
+    one_side = fields & {"hemi", "side"} or pattern.endswith(DENSE_SCALARS)
+    if "subject" not in fields or not one_side:
+        raise UsageError(
+            f"--maps {name}: the pattern needs {{subject}}, and {{hemi}} or {{side}} unless it"
+            f" ends with {DENSE_SCALARS}"
+        )
 
 
 def find_maps(
@@ -134,27 +142,17 @@ def read_maps(
     """
     row_of = {visit: row for row, visit in enumerate(visits)}
     name, sides, units, notes = source.request.name, {}, [], list[str]()
-    for hemi, path_of in source.files.items():
-        keys = sorted(path_of, key=row_of.__getitem__)
-        paths = [path_of[visit] for visit in keys]
-        maps = [read_map(path, name, hemi) for path in paths]
-        notes += sign_notes(name, hemi, paths)
-        _refuse_mixed(name, hemi, paths, maps)
-        # The curvature of other programs may be huge at single vertices of good maps.
-        problems = [why_impossible(name, m.values) if name == THICKNESS else None for m in maps]
-        impossible = [(path, text) for path, text in zip(paths, problems, strict=True) if text]
-        notes += [f"{path}: {text}; excluded" for path, text in impossible]
-        if len(impossible) == len(maps):
-            raise InputError(f"--maps {name}: {notes[-1]}, as are all")
-        keys = [visit for visit, text in zip(keys, problems, strict=True) if not text]
-        maps = [one for one, text in zip(maps, problems, strict=True) if not text]
+    for hemi in source.files:
+        keys, maps, notes_of_side = _possible_maps(source, hemi, row_of)
+        notes += notes_of_side
         first, points = maps[0], len(maps[0].values)
         nodes = first.nodes if first.nodes is not None and not with_sheets else grid
         mesh = None if first.nodes == nodes else _mesh(source, hemi, points)
         if mesh is None and points != nodes[0] * nodes[1]:
+            place = min(source.files[hemi], key=row_of.__getitem__)
             raise InputError(
                 f"--maps {name}, hemisphere {hemi}: {points} values fit neither sheets "
-                f"({nodes[0]} x {nodes[1]}) nor a surface beside {paths[0]}; use "
+                f"({nodes[0]} x {nodes[1]}) nor a surface beside {source.files[hemi][place]}; use "
                 "--maps-surface"
             )
         shape = nodes if mesh is None else (points, 1)
@@ -169,6 +167,26 @@ def read_maps(
         )
         units.append(first.unit)
     return sides, units[0], notes
+
+
+def _possible_maps(
+    source: ExternalFiles, hemi: str, row_of: Mapping[VisitKey, int]
+) -> tuple[list[VisitKey], list[PointMap], list[str]]:
+    """Read the maps of a hemisphere, without impossible ones, of which notes are."""
+    name, path_of = source.request.name, source.files[hemi]
+    keys = sorted(path_of, key=row_of.__getitem__)
+    paths = [path_of[visit] for visit in keys]
+    maps = [read_map(path, name, hemi) for path in paths]
+    notes = sign_notes(name, hemi, paths)
+    _refuse_mixed(name, hemi, paths, maps)
+    # The curvature of other programs may be huge at single vertices of good maps.
+    problems = [why_impossible(name, m.values) if name == THICKNESS else None for m in maps]
+    impossible = [(path, text) for path, text in zip(paths, problems, strict=True) if text]
+    notes += [f"{path}: {text}; excluded" for path, text in impossible]
+    if len(impossible) == len(maps):
+        raise InputError(f"--maps {name}: {notes[-1]}, as are all")
+    possible = [i for i, text in enumerate(problems) if not text]
+    return [keys[i] for i in possible], [maps[i] for i in possible], notes
 
 
 def sign_notes(name: str, hemi: str, paths: Iterable[Path]) -> list[str]:
@@ -233,6 +251,8 @@ def find_all(
     ]
 
 
+_Flat = Mapping[str, Mapping[str, SideMaps]]
+"""Maps on a grid by name and hemisphere."""
 Reader = Callable[[ExternalFiles, Sequence[VisitKey]], tuple[dict[str, SideMaps], str, list[str]]]
 """Reads one map, as ``read_maps``."""
 
@@ -263,29 +283,34 @@ def add_external(
         points = ", ".join(str(np.prod(side.shape)) for side in maps[name].values())
         notes.append(f"maps {name}: {counts} of {len(visits)} visits, {points} points")
     measured = replace(measured, units=units)
-    flat = {
+    flat: _Flat = {
         name: sides
         for name, sides in maps.items()
         if all(side.mesh is None for side in sides.values())
     }
     if not with_sheets:
-        curvature = flat.get(CURVATURE, {})
-        nodes = _nodes(curvature) if curvature else None
-        flat = {name: sides for name, sides in flat.items() if _nodes(sides) == nodes}
-        sheets = {hemi: replace(side, maps={}) for hemi, side in curvature.items()}
-        measured = replace(_on_grid(measured, nodes) if nodes else measured, sides=sheets)
+        measured, flat = _without_sheets(measured, flat)
     sides = {hemi: _with_maps(side, hemi, flat) for hemi, side in measured.sides.items()}
-    cohorts = {}
-    for name, sides_of_map in maps.items():
-        if name not in flat:
-            on_mesh = any(side.mesh is not None for side in sides_of_map.values())
-            axes = measured if on_mesh else _on_grid(measured, _nodes(sides_of_map))
-            cohorts[name] = Cohort(
-                table=measured.table, sides=sides_of_map, x=axes.x, y=axes.y, units=units
-            )
+    cohorts = {name: _cohort(one, measured) for name, one in maps.items() if name not in flat}
     if cohorts:
         notes.append(f"maps {', '.join(cohorts)}: not registered, their points are to correspond")
     return replace(measured, sides=sides), cohorts, notes
+
+
+def _cohort(sides: Mapping[str, SideMaps], measured: Measured) -> Cohort:
+    """Return a map with points of its own as a cohort."""
+    on_mesh = any(side.mesh is not None for side in sides.values())
+    axes = measured if on_mesh else _on_grid(measured, _nodes(sides))
+    return Cohort(table=measured.table, sides=sides, x=axes.x, y=axes.y, units=measured.units)
+
+
+def _without_sheets(measured: Measured, flat: _Flat) -> tuple[Measured, _Flat]:
+    """Take the grid of the curvature for that of the sheets; keep maps on this grid."""
+    curvature = flat.get(CURVATURE, {})
+    nodes = _nodes(curvature) if curvature else None
+    sheets = {hemi: replace(side, maps={}) for hemi, side in curvature.items()}
+    measured = replace(_on_grid(measured, nodes) if nodes else measured, sides=sheets)
+    return measured, {name: sides for name, sides in flat.items() if _nodes(sides) == nodes}
 
 
 def _nodes(sides: Mapping[str, SideMaps]) -> tuple[int, int]:

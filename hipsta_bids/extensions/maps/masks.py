@@ -13,6 +13,7 @@ from hipsta_bids.group.cohort.collect import SheetRecord
 from hipsta_bids.group.cohort.exclusions import UserTable
 from hipsta_bids.group.cohort.read import Measured, visit_name
 from hipsta_bids.io import files
+from hipsta_bids.stats.arrays import Bool
 from hipsta_bids.types import PARTICIPANT, VisitKey
 
 #: Mask of the columns that a repair of the labels touched.
@@ -41,12 +42,7 @@ def mask_sheets(
         is_masked = np.zeros((len(side.rows), *side.shape), dtype=bool)
         visits = measured.table.index[side.rows]
         for sheet, record in enumerate(by_place[visit, hemi] for visit in visits):
-            if REPAIRED in masks:
-                columns = read_sheet(record.result.path("sheet"), [], [REPAIRED], side.shape)
-                is_masked[sheet] |= columns[REPAIRED] == "true"
-            for table in tables:
-                for row in table.about(record.result.name):
-                    is_masked[(sheet, *_node(row, side.shape, table.path))] = True
+            _mask(is_masked[sheet], record, tables, repaired=REPAIRED in masks)
         maps = {name: np.where(is_masked, np.nan, values) for name, values in side.maps.items()}
         sides[hemi] = replace(side, maps=maps, unmasked=side.maps["curvature"])
         shares += [
@@ -56,6 +52,19 @@ def mask_sheets(
     names = [(record.result.name, None) for record in records]
     notes = [note for table in tables for note in table.notes(names)]
     return replace(measured, sides=sides), pd.DataFrame(shares), notes
+
+
+def _mask(
+    is_masked: Bool, record: SheetRecord, tables: Sequence[UserTable], *, repaired: bool
+) -> None:
+    """Mark masked points of a sheet (x, y)."""
+    shape = is_masked.shape[0], is_masked.shape[1]
+    if repaired:
+        columns = read_sheet(record.result.path("sheet"), [], [REPAIRED], shape)
+        is_masked |= columns[REPAIRED] == "true"
+    for table in tables:
+        for row in table.about(record.result.name):
+            is_masked[_node(row, shape, table.path)] = True
 
 
 def mask_note(shares: pd.DataFrame, groups: pd.Series | None) -> str:

@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from pathlib import Path
 from sys import intern
 from typing import Any
@@ -134,11 +135,9 @@ class Collection:
 
 def collect_sheets(request: GroupRequest, *, may_lack: bool = False) -> Collection:
     """Find all complete hemispheres of one protocol, made with the same settings."""
-    for folder in request.segmentations:
-        if not folder.is_dir():
-            raise MissingFileError(f"{folder}: folder not found; check --segmentations")
+    _check_folders(request.segmentations)
     roots = [root for root in request.roots if root.is_dir() or not may_lack]
-    results = [result for root in roots for result in _wanted_results(root, request)]
+    results = list(chain.from_iterable(_wanted_results(root, request) for root in roots))
     places = [result for result in results if result.name.region == request.region]
     notes = _other_regions(results, request)
     if may_lack and not places:
@@ -150,51 +149,84 @@ def collect_sheets(request: GroupRequest, *, may_lack: bool = False) -> Collecti
     _refuse_twice(places)
     visits = [(result.name.subject, result.name.session) for result in results]
     choices = Choices(request.exclude_table, request.ratings, visits)
-    compared = {root: read_compared(root) for root in roots}
-    records: list[SheetRecord] = []
-    left_out = [exclusion for root in roots for exclusion in _excluded_labels(root, request)]
-    quality, digests = [], []
-    for result in sorted(places, key=_key):
-        record = read_record(result)
-        row = compared[result.root].get(result.name.title)
-        outlier = None if row is None else row[TEXT].replace(files.MISSING, "")
-        entry = _judge(result, record, request, choices, outlier)
-        quality.append(_quality(result.name, record, choices, outlier))
-        digests.append((result.name, _digest(record)))
-        if isinstance(entry, Exclusion):
-            left_out.append(entry)
-        else:
-            records.append(entry)
+    judged = _judge_all(places, roots, request, choices)
     _refuse_unfinished(request, seg, choices)
-    if not records:
-        reasons = ", ".join(f"{n} {why}" for why, n in Counter(e.reason for e in left_out).items())
-        raise NothingToDoError(
-            f"{request.roots[0]}: no hemisphere is left for the group level ({reasons})"
-        )
-    count = sum(q["outlier status"] is None and q["decision"] != Decision.FAILED for q in quality)
-    unknown = (
-        f"--exclude-outliers: {count} hemispheres were not compared with {FEWEST} or more others;"
-        " run the participant level without --shard to compare"
-    )
+    _refuse_none(judged, request)
+    records = tuple(judged.records)
     digest, grid = _one_settings(records), grid_of(records[0].result.root)
     _refuse_several_sheets(records)
     return Collection(
-        records=tuple(records),
-        exclusions=tuple(left_out),
+        records=records,
+        exclusions=tuple(judged.excluded),
         grid=grid,
         settings_hash=digest,
-        quality=pd.DataFrame(quality),
+        quality=pd.DataFrame(judged.quality),
         versions=tuple(sorted({record.version for record in records})),
-        ratings=choices.counts(digests),
+        ratings=choices.counts(judged.digests),
         notes=(
             *notes,
             *_shared_sheets(grid),
-            *[unknown] * bool(count and request.exclude_outliers),
+            *(_not_compared(judged.quality) if request.exclude_outliers else ()),
             *choices.excluded.notes(_with_digests(results)),
             *choices.rated.notes(_with_digests(results)),
         ),
         warnings=_several_versions(records),
     )
+
+
+def _check_folders(folders: Iterable[Path]) -> None:
+    for folder in folders:
+        if not folder.is_dir():
+            raise MissingFileError(f"{folder}: folder not found; check --segmentations")
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Judged:
+    """Hemispheres in their order."""
+
+    records: list[SheetRecord] = field(default_factory=list)
+    excluded: list[Exclusion] = field(default_factory=list)
+    quality: list[dict[str, str | None]] = field(default_factory=list)
+    digests: list[tuple[HemisphereName, str | None]] = field(default_factory=list)
+
+
+def _judge_all(
+    places: Iterable[ResultPlace], roots: Sequence[Path], request: GroupRequest, choices: Choices
+) -> _Judged:
+    """Take or exclude each hemisphere, with its decision, its rating and its hash."""
+    compared = {root: read_compared(root) for root in roots}
+    judged = _Judged(excluded=[e for root in roots for e in _excluded_labels(root, request)])
+    for result in sorted(places, key=_key):
+        record = read_record(result)
+        row = compared[result.root].get(result.name.title)
+        outlier = None if row is None else row[TEXT].replace(files.MISSING, "")
+        entry = _judge(result, record, request, choices, outlier)
+        if isinstance(entry, Exclusion):
+            judged.excluded.append(entry)
+        else:
+            judged.records.append(entry)
+        judged.quality.append(_quality(result.name, record, choices, outlier))
+        judged.digests.append((result.name, _digest(record)))
+    return judged
+
+
+def _refuse_none(judged: _Judged, request: GroupRequest) -> None:
+    if not judged.records:
+        counts = Counter(exclusion.reason for exclusion in judged.excluded)
+        reasons = ", ".join(f"{n} {reason}" for reason, n in counts.items())
+        raise NothingToDoError(
+            f"{request.roots[0]}: no hemisphere is left for the group level ({reasons})"
+        )
+
+
+def _not_compared(quality: Iterable[Mapping[str, str | None]]) -> Iterator[str]:
+    """Note hemispheres that were not compared with enough others to be outliers."""
+    count = sum(q["outlier status"] is None and q["decision"] != Decision.FAILED for q in quality)
+    if count:
+        yield (
+            f"--exclude-outliers: {count} hemispheres were not compared with {FEWEST} or more"
+            " others; run the participant level without --shard to compare"
+        )
 
 
 def _quality(
@@ -351,17 +383,24 @@ def _judge(
     elif request.exclude_qc and (condition := fulfilled(request.exclude_qc, _metrics(record))):
         reason, message = "quality", condition
     else:
-        inputs = record.get("inputs") or [{}]
-        return SheetRecord(
-            result=result,
-            settings_hash=intern(str(record.get("settings_hash"))),
-            version=intern(str(record.get("version"))),
-            source=relocate(str(inputs[0].get("file", "")), request.segmentations),
-            provenance=tuple(intern(text) for text in provenance_of(record).values()),
-            sheet=tuple(dict.fromkeys(str(v.get("session")) for v in record.get("visits") or ())),
-            doubtful=decision == Decision.LOOK and not choices.approves(*rated),
-        )
+        doubtful = decision == Decision.LOOK and not choices.approves(*rated)
+        return _taken(result, record, request, doubtful=doubtful)
     return Exclusion.of_sheet(result.name, reason, message)
+
+
+def _taken(
+    result: ResultPlace, record: Mapping[str, Any], request: GroupRequest, *, doubtful: bool
+) -> SheetRecord:
+    inputs = record.get("inputs") or [{}]
+    return SheetRecord(
+        result=result,
+        settings_hash=intern(str(record.get("settings_hash"))),
+        version=intern(str(record.get("version"))),
+        source=relocate(str(inputs[0].get("file", "")), request.segmentations),
+        provenance=tuple(intern(text) for text in provenance_of(record).values()),
+        sheet=tuple(dict.fromkeys(str(v.get("session")) for v in record.get("visits") or ())),
+        doubtful=doubtful,
+    )
 
 
 def _metrics(record: Mapping[str, Any]) -> dict[str, Any]:

@@ -45,7 +45,6 @@ def choose_measures(
     if not requested:
         return Measures(maps=(*(DEFAULT if records else ()), *further))
     summaries = tuple(read_summary(records[0].result)) if records else ()
-    available = [*(SHEET_MAPS if records else ()), *further, *_sampled(records), *summaries]
     maps, numbers = [], []
     for name in requested:
         if (
@@ -57,12 +56,18 @@ def choose_measures(
         elif name in summaries or name.startswith(VOLUME):
             numbers.append(name)
         else:
-            names = list(dict.fromkeys(available))  # maps and summary measures share some
-            hint = f"there are {listed(names, _MOST_NAMES)}"
-            if records and len(names) > _MOST_NAMES:
-                hint += f"; {records[0].result.path('summary')} has all summary measures"
-            raise _unknown(name, names, hint)
+            raise _no_measure(name, records, (*further, *_sampled(records), *summaries))
     return Measures(maps=tuple(maps), summaries=tuple(numbers) or None)
+
+
+def _no_measure(name: str, records: Sequence[SheetRecord], further: Sequence[str]) -> InputError:
+    """Return the error of a name that is neither a map nor a summary measure."""
+    # Maps and summary measures share some names.
+    names = list(dict.fromkeys([*(SHEET_MAPS if records else ()), *further]))
+    hint = f"there are {listed(names, _MOST_NAMES)}"
+    if records and len(names) > _MOST_NAMES:
+        hint += f"; {records[0].result.path('summary')} has all summary measures"
+    return _unknown(name, names, hint)
 
 
 def check_summaries(measures: Measures, sides: Mapping[str, SideMaps]) -> None:
@@ -117,31 +122,14 @@ def read_sheets(
     visits = visits_of(records) if visits is None else visits
     row_of = {visit: row for row, visit in enumerate(visits)}
     names = tuple(dict.fromkeys((*maps, CURVATURE)))
-    sides = {}
-    damaged: list[Exclusion] = []
+    sides, damaged = {}, list[Exclusion]()
     for hemi in "LR":
         records_of_side = [record for record in records if record.result.name.hemi == hemi]
         rows = [row_of[r.result.name.subject, r.result.name.session] for r in records_of_side]
         if records_of_side:
             side = _read_side(records_of_side, np.array(rows, dtype=np.int64), shape, names)
-            columns = {str(name): one.to_numpy() for name, one in side.summary.items()}
-            doubtful = {name: one for name, one in columns.items() if why_impossible(name, one)}
-            problems = [_damage(side, i, doubtful, max_gap) for i in range(len(records_of_side))]
-            impossible = [
-                Exclusion.of_sheet(record.result.name, "damaged-map", text)
-                for record, text in zip(records_of_side, problems, strict=True)
-                if text
-            ]
-            if len(impossible) == len(records_of_side):
-                raise InputError(
-                    f"hemisphere {hemi}: no sheet can be used; {impossible[0].participant}:"
-                    f" {impossible[0].message}"
-                )
-            damaged += impossible
-            sides[hemi] = side.sheets(np.array([not text for text in problems]))
-            records_of_side = [
-                r for r, text in zip(records_of_side, problems, strict=True) if not text
-            ]
+            sides[hemi], excluded = _usable(side, records_of_side, max_gap)
+            damaged += excluded
             if region in EXPERIMENTAL:
                 for values in sides[hemi].maps.values():
                     leave_rare(values)
@@ -159,6 +147,26 @@ def read_sheets(
         },
         damaged=tuple(damaged),
     )
+
+
+def _usable(
+    side: SideMaps, records: Sequence[SheetRecord], max_gap: float
+) -> tuple[SideMaps, list[Exclusion]]:
+    """Return the sheets of a side that can be used, and the exclusions of the others."""
+    columns = {str(name): one.to_numpy() for name, one in side.summary.items()}
+    doubtful = {name: one for name, one in columns.items() if why_impossible(name, one)}
+    problems = [_damage(side, i, doubtful, max_gap) for i in range(len(records))]
+    impossible = [
+        Exclusion.of_sheet(record.result.name, "damaged-map", text)
+        for record, text in zip(records, problems, strict=True)
+        if text
+    ]
+    if len(impossible) == len(records):
+        raise InputError(
+            f"hemisphere {records[0].result.name.hemi}: no sheet can be used;"
+            f" {impossible[0].participant}: {impossible[0].message}"
+        )
+    return side.sheets(np.array([not text for text in problems])), impossible
 
 
 def leave_rare(values: Float) -> None:
