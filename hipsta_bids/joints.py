@@ -79,6 +79,17 @@ class Question:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Region:
+    """An experimental region, which the participant level measures instead of the body."""
+
+    name: str
+    measure: str
+    """Function as ``measure_hemisphere``: of labels, hemisphere, settings and clock."""
+    meaning: str = ""
+    """For the help."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Extension:
     """What a folder adds to the program."""
 
@@ -88,6 +99,7 @@ class Extension:
     commands: tuple[Command, ...] = ()
     parts: tuple[Part, ...] = ()
     questions: tuple[Question, ...] = ()
+    regions: tuple[Region, ...] = ()
     settings: tuple[tuple[str, str], ...] = ()
     """Tables of the settings of the participant level: name and class."""
     sections: str = ""
@@ -126,18 +138,24 @@ def read_texts(package: str) -> dict[str, Any]:
     return tomllib.loads((files(package) / "texts.toml").read_text(encoding="utf-8"))
 
 
-def find_texts(kind: str) -> dict[str, Any]:
-    """Collect the texts of extensions of a kind, by their keys."""
-    texts: dict[str, Any] = {}
+def find_texts(kind: str) -> dict[str, dict[str, Any]]:
+    """Collect the tables of texts of extensions of a kind, joined where they have one key."""
+    texts: dict[str, dict[str, Any]] = {}
     for extension in find_extensions():
         if extension.has_texts:
-            texts |= read_texts(extension.package).get(kind, {})
+            for key, table in read_texts(extension.package).get(kind, {}).items():
+                texts[key] = texts.get(key, {}) | table
     return texts
 
 
 def is_present(name: str) -> bool:
     """Check whether the folder of an extension exists."""
     return any(extension.package.endswith(f".{name}") for extension in find_extensions())
+
+
+def find_regions() -> dict[str, Region]:
+    """Find the regions of extensions, by name."""
+    return {region.name: region for extension in find_extensions() for region in extension.regions}
 
 
 def find_parts() -> tuple[Part, ...]:

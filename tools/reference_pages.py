@@ -12,7 +12,6 @@ from hipsta_bids.cli.commands import (
     figure_parser,
     phantom_parser,
     replicate_parser,
-    resample_parser,
 )
 from hipsta_bids.cli.group import group_parser
 from hipsta_bids.cli.participant import build_parser
@@ -317,7 +316,6 @@ def options_page() -> str:
         ("hipsta-bids replicate", replicate_parser()),
         ("hipsta-bids figure", figure_parser()),
         ("hipsta-bids correlate", correlate_parser()),
-        ("hipsta-bids resample", resample_parser()),
         *(
             (f"hipsta-bids {command.name}", load(command.parser)())
             for extension in find_extensions()

@@ -35,7 +35,6 @@ _CORE = (
     ("compare", "run_compare", "FOLDER... OUT", "compare finished analyses (group level)"),
     ("replicate", "run_replicate", "FOLDER OUT", "compare an analysis with Diers et al. (2023)"),
     ("figure", "draw_figure", "WHAT OUT", "draw a figure for a paper from results"),
-    ("resample", "run_resample", "MAP... OUT", "move maps to HippUnfold's surfaces, or from there"),
     ("correlate", "run_correlate", "MAP MAP OUT", "correlate two maps of the group level"),
     ("validate", "run_validation", "", None),
 )

@@ -4,4 +4,4 @@
 """
 
 #: Folders, in the order of the help.
-NAMES = ("consortia", "trials", "norms", "surrogate", "export")
+NAMES = ("consortia", "trials", "norms", "regions", "surrogate", "export")
