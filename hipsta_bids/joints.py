@@ -137,6 +137,17 @@ class Page:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Region:
+    """An experimental region, which the participant level measures instead of the body."""
+
+    name: str
+    measure: str
+    """Function as ``measure_hemisphere``: of labels, hemisphere, settings and clock."""
+    meaning: str = ""
+    """For the help."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Extension:
     """What a folder adds to the program."""
 
@@ -155,6 +166,7 @@ class Extension:
     """Function of the options and settings of the group level, and of protocols: runs each."""
     functions: tuple[str, ...] = ()
     """Functions of the Python interface, as ``module:name``."""
+    regions: tuple[Region, ...] = ()
     participant_settings: tuple[tuple[str, str], ...] = ()
     """Tables of the settings of the participant level: name and class."""
     columns: str = ""
@@ -193,18 +205,24 @@ def read_texts(package: str) -> dict[str, Any]:
     return tomllib.loads((files(package) / "texts.toml").read_text(encoding="utf-8"))
 
 
-def find_texts(kind: str) -> dict[str, Any]:
-    """Collect the texts of extensions of a kind, by their keys."""
-    texts: dict[str, Any] = {}
+def find_texts(kind: str) -> dict[str, dict[str, Any]]:
+    """Collect the tables of texts of extensions of a kind, joined where they have one key."""
+    texts: dict[str, dict[str, Any]] = {}
     for extension in find_extensions():
         if extension.has_texts:
-            texts |= read_texts(extension.package).get(kind, {})
+            for key, table in read_texts(extension.package).get(kind, {}).items():
+                texts[key] = texts.get(key, {}) | table
     return texts
 
 
 def is_present(name: str) -> bool:
     """Check whether the folder of an extension exists."""
     return any(extension.package.endswith(f".{name}") for extension in find_extensions())
+
+
+def find_regions() -> dict[str, Region]:
+    """Find the regions of extensions, by name."""
+    return {region.name: region for extension in find_extensions() for region in extension.regions}
 
 
 def find_parts() -> tuple[Part, ...]:

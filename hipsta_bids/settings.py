@@ -14,19 +14,22 @@ from pydantic import Field, create_model, model_validator
 from pydantic.types import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
 from hipsta_bids.joints import find_extensions, load
-from hipsta_bids.protocols import toml
+from hipsta_bids.protocols import EXPERIMENTAL, toml
 from hipsta_bids.types import tables
 
+if TYPE_CHECKING:  # type checkers know no extensions
+    _Region = str
+else:
+    _Region = Literal["body", "extended", "entorhinal", *EXPERIMENTAL]
 _Table = TypeVar("_Table", bound=tables.SettingsTable)
 
 
 class BodySettings(tables.SettingsTable):
     """From labels to the body's mask and end planes."""
 
-    region: Literal["body", "extended", "entorhinal", "headbody", "whole"] = "body"
+    region: _Region = "body"
     """Region: ``body`` (subfields between the end planes), ``extended`` (with neighboring
-    cortex), ``entorhinal`` (that cortex alone). Experimental: ``headbody``, and ``whole`` (with
-    the tail)."""
+    cortex), ``entorhinal`` (that cortex alone). Experimental ones: see ``--region``."""
     min_cortex_reach: tables.PositiveFraction = 0.9
     """Refuse cortex with labels along less than this share of the body."""
     layer_rule: Literal["nearest-sheet", "nearest-label"] = "nearest-sheet"

@@ -9,7 +9,6 @@ from pathlib import Path
 from hipsta_bids.cli.commands import (
     figure_parser,
     phantom_parser,
-    resample_parser,
 )
 from hipsta_bids.cli.group import group_parser
 from hipsta_bids.cli.participant import build_parser
@@ -309,7 +308,6 @@ def options_page() -> str:
         ("Group level", group_parser()),
         ("hipsta-bids phantom", phantom_parser()),
         ("hipsta-bids figure", figure_parser()),
-        ("hipsta-bids resample", resample_parser()),
         *(
             (f"hipsta-bids {command.name}", load(command.parser)())
             for extension in find_extensions()

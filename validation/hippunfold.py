@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from hipsta_bids.errors import InputError
+from hipsta_bids.extensions.regions.unfolded import Correspondence
+from hipsta_bids.extensions.regions.whole import MAX_VOXEL
 from hipsta_bids.geometry.digital import to_ras
 from hipsta_bids.geometry.wall import vertex_normals
 from hipsta_bids.inputs.labels import read_label_volume
 from hipsta_bids.inputs.search import HemisphereInput, InputRequest, find_hemispheres
 from hipsta_bids.io.gifti import read_mesh
 from hipsta_bids.io.hippunfold import unfolded_shares
-from hipsta_bids.participant.unfolded import Correspondence
-from hipsta_bids.participant.whole import MAX_VOXEL
 from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.protocols.protocol import translate
 from hipsta_bids.settings import Settings

@@ -33,19 +33,6 @@ def phantom_parser() -> Parser:
 
     return parser
 
-
-def resample_parser() -> Parser:
-    """Describe ``hipsta-bids resample``."""
-    parser, add = parser_of("resample")
-    add("maps", "MAP", nargs="+", type=Path)
-    add("out", "OUT", type=Path)
-    add("--surface", "FILE", nargs="+", required=True)
-    add("--sheet", "FILE", nargs="+", default=[])
-    add("--to-surface", "FILE", nargs="+", default=[])
-    add("--column", "NAME", default="thickness")
-    add("--settings", "FILE.toml")
-    return parser
-
     return parser
 
 
@@ -193,19 +180,6 @@ def draw_figure(arguments: Sequence[str]) -> ExitCode:
         option = _FIGURE_OPTIONS.get(error.argument, error.argument)
         raise UsageError(f"--{option} {error.problem}") from error
     echo(f"figure: {options.output}")
-    return ExitCode.OK
-
-
-def run_resample(arguments: Sequence[str]) -> ExitCode:
-    """Move maps between the whole sheet and HippUnfold's surfaces."""
-    options = resample_parser().parse_intermixed_args(arguments)
-    from hipsta_bids.participant.unfolded import resample  # noqa: PLC0415  (heavy)
-    from hipsta_bids.settings import load_settings  # noqa: PLC0415  (start-up time)
-
-    sheet = load_settings(options.settings).sheet
-    files = options.maps, options.out, options.surface
-    between = {"sheets": options.sheet, "targets": options.to_surface}
-    echo(resample(*files, sheet, column=options.column, **between))
     return ExitCode.OK
 
     return ExitCode.OK

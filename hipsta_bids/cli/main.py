@@ -33,7 +33,6 @@ _CORE = (
     ("demo", "run_demo", "DIR", "write it, run on it, and compare with the truth"),
     ("phantom", "write_phantoms", "DIR", "write a synthetic cohort with a known effect"),
     ("figure", "draw_figure", "WHAT OUT", "draw a figure for a paper from results"),
-    ("resample", "run_resample", "MAP... OUT", "move maps to HippUnfold's surfaces, or from there"),
     ("validate", "run_validation", "", None),
 )
 COMMANDS = {

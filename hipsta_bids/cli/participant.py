@@ -25,6 +25,7 @@ from hipsta_bids.cli.parser import (
     subject_label,
 )
 from hipsta_bids.errors import ExitCode, NothingToDoError, OutputError, UsageError, did_you_mean
+from hipsta_bids.joints import find_regions
 from hipsta_bids.participant.cluster import Cluster, Shard, check_cluster, parse_shard
 from hipsta_bids.participant.pool import pin_threads, processors
 from hipsta_bids.protocols import EXPERIMENTAL
@@ -121,7 +122,7 @@ def _add_processing(parser: Parser) -> None:
     group = parser.add_argument_group("how to process")
     add = adder(group, _HELP)
     add("--settings --config-file", "FILE.toml")
-    add("--region", "NAME", choices=REGIONS)
+    add("--region", "NAME", _regions_text(), choices=REGIONS)
     add("--method", "NAME", choices=("default", "published"))
     add("--x-coordinate", "NAME", choices=("midsurface", "volume"))
     add("--ends", "FILE.tsv")
@@ -142,6 +143,14 @@ def _add_processing(parser: Parser) -> None:
     add("--stop-on-first-crash")
     add("-v --verbose", action="count", default=0)
     add("-q --quiet")
+
+
+def _regions_text() -> str:
+    """List the regions, for the help."""
+    regions = find_regions().items()
+    further = [f"{name} ({one.meaning})" if one.meaning else name for name, one in regions]
+    text = help_texts()["participant"]["--region"]
+    return f"{text}; experimental: {', '.join(further)}" if further else text
 
 
 def _level(text: str) -> str:

@@ -356,7 +356,9 @@ def citation_text(
         pybids=about["pybids"] if pybids else "",
         probabilities=about["probabilities"] if probabilities else "",
         layer=_layer_rule(body, protocols),
-        region=about["region"][body.region].format(faces=about["faces"]),
+        region=(about["region"] | find_texts("methods").get("region", {}))[body.region].format(
+            faces=about["faces"]
+        ),
         end_rule=about["end_rule"][body.end_rule],
         mending=about["mending"][body.mending],
         spacing=settings.grid.spacing,

@@ -178,10 +178,6 @@ OUTPUTS: tuple[Output, ...] = (
 )
 
 _SPREAD = _output("thickness_sd", "morph", ".shape.gii", unit="mm", desc="thicknessSd")
-_HEADS = tuple(
-    _output(key, "morph", ".shape.gii", unit="1", desc=key)
-    for key in ("distortion", "proximodistal")
-)
 _CHANGE = _output("change", "morph", ".shape.gii", unit="mm", desc="thicknessChange")
 #: Of the sheet that all visits of a participant share, in the folder of the participant.
 _TEMPLATE = (
@@ -225,8 +221,6 @@ EXTRA_OUTPUTS: tuple[Output, ...] = (
     *_table("summaryuncertainty", called="that table"),
     _SPREAD,
     *_sidecars([_SPREAD]),
-    *_HEADS,
-    *_sidecars(_HEADS),
     _CHANGE,
     *_sidecars([_CHANGE]),
     *_TEMPLATE,
@@ -269,6 +263,9 @@ _RECORD = re.compile(
     r"sub-(?P<subject>[^_]+)(?:_ses-(?P<session>[^_]+))?_hemi-(?P<hemi>[LR])_seg-(?P<seg>[^_]+)"
     r"(?:_label-(?P<region>[^_]+))?_desc-qc_metrics\.json"
 )
+
+#: Images of maps that extensions may measure, by key.
+ADDED_MAPS = {row.key: row for row in _of_extensions() if row.extension == ".shape.gii"}
 
 _BY_KEY = {output.key: output for output in (*OUTPUTS, *EXTRA_OUTPUTS)}
 

@@ -18,6 +18,7 @@ import psutil
 from hipsta_bids import __version__
 from hipsta_bids.derivatives import hemisphere
 from hipsta_bids.derivatives.dataset import source_address
+from hipsta_bids.derivatives.names import ADDED_MAPS
 from hipsta_bids.derivatives.results import ResultPlace, read_record
 from hipsta_bids.errors import GeometryError, HipstaError, InputError, OutputError, ProtocolError
 from hipsta_bids.geometry.sampling import Regions
@@ -418,11 +419,11 @@ def _write_more(
 ) -> None:
     """Write what options asked for."""
     write_signals(result, maps, mapped, regions)
-    for name in maps.maps.keys() & {"distortion", "proximodistal"}:
+    for name in maps.maps.keys() & ADDED_MAPS.keys():
         from hipsta_bids.io import gifti  # noqa: PLC0415  (workers only)
 
-        values = maps.maps[name].ravel()
-        content = gifti.shape_bytes(values, hemi=result.name.hemi, name=name, unit="1")
+        values, unit = maps.maps[name].ravel(), ADDED_MAPS[name].unit or ""
+        content = gifti.shape_bytes(values, hemi=result.name.hemi, name=name, unit=unit)
         files.write_bytes(result.path(name), content)
     if spread is not None and spread.known:
         measured = spread.copies - spread.failed

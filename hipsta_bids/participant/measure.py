@@ -60,7 +60,7 @@ from hipsta_bids.geometry.sheet import (
     whole_body,
 )
 from hipsta_bids.geometry.topology import Repair, SolidField, repair_topology, repaired_columns
-from hipsta_bids.participant.whole import Own, check_fine, measure_whole
+from hipsta_bids.joints import find_regions, load
 from hipsta_bids.protocols import EXPERIMENTAL
 from hipsta_bids.protocols.load import for_region
 from hipsta_bids.protocols.protocol import LATERAL_END, MEDIAL_END, Tissue
@@ -455,18 +455,15 @@ def measure_hemisphere(
             reason="edited-mask-region",
         )
     if region in EXPERIMENTAL:
-        check_fine(volume)
-        body_settings = settings.changed(body={"region": "body"})
-        body = unfold(volume, hemi, body_settings, clock)
-        body_alone = Own(
-            body.body, body.mesh, body.coordinates, _flags(body, _find(volume, hemi, body))
+        measured: HemisphereMaps = load(find_regions()[region].measure)(
+            volume, hemi, settings, clock
         )
-        return measure_whole(volume, hemi, settings, clock, body_alone)
+        return measured
     evidence = unfold(volume, hemi, settings, clock)
     sheet = evidence.sheet
     with clock("measures"):
         layers, folded_layers = space_layers(sheet, settings)
-        findings = [*_find(volume, hemi, evidence), *folded_layers]
+        findings = [*find_in_body(volume, hemi, evidence), *folded_layers]
         maps = measure_maps(evidence)
         doubtful = repairs.doubtful_columns(sheet, evidence.solid, findings)
         return HemisphereMaps(
@@ -489,13 +486,13 @@ def measure_hemisphere(
                 *map(str, evidence.solid.repairs),
                 *describe_uncus(evidence.body, settings.checks),
             ),
-            flags=_flags(evidence, findings),
+            flags=flags_of(evidence, findings),
             mesh=evidence.mesh,
             coordinates=evidence.coordinates,
         )
 
 
-def _find(volume: LabelVolume, hemi: str, evidence: Evidence) -> list[Finding]:
+def find_in_body(volume: LabelVolume, hemi: str, evidence: Evidence) -> list[Finding]:
     """List what the checks of a body found, within its limit or not."""
     body, settings, checks = evidence.body, evidence.settings, evidence.settings.checks
     return [
@@ -516,7 +513,8 @@ def check_edits(volume: LabelVolume, body: Body, settings: Settings) -> list[Fin
     return check_mask(mask, change, in_plane_voxel(body.affine), settings.body)
 
 
-def _flags(evidence: Evidence, findings: list[Finding]) -> tuple[Flag, ...]:
+def flags_of(evidence: Evidence, findings: list[Finding]) -> tuple[Flag, ...]:
+    """Return the findings beyond their limits as flags, with their places."""
     place = partial(name_place, body=evidence.body)
     return tuple(raise_flags(findings, evidence.sheet, place))
 

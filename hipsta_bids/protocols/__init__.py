@@ -1,8 +1,10 @@
 """Segmentation protocols: one TOML file each."""
 
-#: Regions with the head on the sheet: with the tail or without it. Here, where the command line and
-#: names of files find them without loading protocols.
-EXPERIMENTAL = ("headbody", "whole")
+from hipsta_bids.joints import find_regions
+
+#: Regions with the head on the sheet, of extensions. Here, where the command line and names of
+#: files find them without loading protocols.
+EXPERIMENTAL = tuple(find_regions())
 
 
 def rows_beyond(region: str, rows: int) -> tuple[int, int]:

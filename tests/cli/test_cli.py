@@ -8,14 +8,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from extension_marks import needs
+from extension_marks import PRESENT, needs
 from stand_ins import make_input, stand_in_job
 
 from hipsta_bids import __version__
 from hipsta_bids.cli import main
 from hipsta_bids.cli.commands import (
     phantom_parser,
-    resample_parser,
 )
 from hipsta_bids.cli.main import EPILOG
 from hipsta_bids.cli.parser import help_texts
@@ -24,6 +23,7 @@ from hipsta_bids.errors import ExitCode, NothingToDoError
 from hipsta_bids.inputs import search
 from hipsta_bids.inputs.scan import InputRequest
 from hipsta_bids.inputs.search import Findings
+from hipsta_bids.joints import find_extensions, load
 from hipsta_bids.participant import run as runner
 from hipsta_bids.participant.run import RunOptions
 from hipsta_bids.settings import Settings, load_settings
@@ -237,21 +237,33 @@ def test_spellings_of_other_bids_apps(alias, field, value):
     assert getattr(options, field) == value
 
 
+_ABOUT = {"description", "epilog"}
+
+
 @pytest.mark.parametrize(
     ("command", "make"),
     [
         ("participant", build_parser),
         ("phantom", phantom_parser),
-        ("resample", resample_parser),
     ],
 )
 def test_the_texts_of_the_help_have_no_leftovers(command, make):
     actions = make()._actions
     names = {(action.option_strings or [action.dest])[0]: action.help for action in actions}
-    texts = help_texts()[command]
-    assert {name: names.get(name) for name in texts if name not in {"description", "epilog"}} == {
-        name: text for name, text in texts.items() if name not in {"description", "epilog"}
-    }
+    texts = {k: text for k, text in help_texts()[command].items() if k not in _ABOUT}
+    assert names.keys() >= texts.keys()
+    # The help of the regions goes on with regions of extensions.
+    assert all(names[name].startswith(text) for name, text in texts.items())
+
+
+@pytest.mark.parametrize("name", sorted(PRESENT))
+def test_the_texts_of_the_help_of_extensions_have_no_leftovers(name):
+    extension = next(one for one in find_extensions() if one.package.endswith(f".{name}"))
+    for command in extension.commands:
+        actions = load(command.parser)()._actions
+        names = {(action.option_strings or [action.dest])[0] for action in actions}
+        absent = set() if "norms" in PRESENT else {"--norms"}
+        assert help_texts(extension.package)[command.name].keys() - _ABOUT - absent <= names
 
 
 def test_options_without_meaning_are_remembered_with_the_reason():

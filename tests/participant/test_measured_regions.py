@@ -21,7 +21,7 @@ from hipsta_bids.protocols.protocol import Tissue
 from hipsta_bids.settings import BodySettings, Settings
 from hipsta_bids.types import EditedMask
 
-#: Those between the end planes; test_whole.py is about the others.
+#: Those between the end planes.
 REGIONS = [region for region in ALL_REGIONS if region not in EXPERIMENTAL]
 
 #: The cortex bends round its white matter, as in life: the other way than the hippocampus.
@@ -283,7 +283,7 @@ def test_cortex_has_to_reach_from_end_to_end():
 def test_edited_masks_are_about_the_body():
     volume = draw(S_SHAPE)
     mask = EditedMask(inside=np.isin(volume.tissue, volume.protocol.sheet), voxel=0.4)
-    for region in ("extended", "whole"):
+    for region in ("extended", *EXPERIMENTAL):
         with pytest.raises(GeometryError, match="edit the labels instead") as caught:
             measure(replace(volume, edited_mask=mask), "L", in_region(region))
         assert caught.value.reason == "edited-mask-region"

@@ -3,6 +3,7 @@
 import numpy as np
 import pandas as pd
 import pytest
+from extension_marks import needs
 
 from hipsta_bids.cli.main import main
 from hipsta_bids.errors import ExitCode
@@ -39,6 +40,7 @@ def test_labels_have_the_volume_of_the_truth(digitations):
     assert wall == pytest.approx(phantom.region_summary("headbody")["volume"], rel=0.01)
 
 
+@needs("regions")
 def test_head_is_measured_and_has_the_planted_difference(dataset, patient, tmp_path):
     where = ["--participant-label", "Oslo02", "--hemi", "L", "--n-procs", "1", "--no-reports"]
     where += ["--region", "headbody", "--ends", str(dataset / "phantom_ends.tsv")]

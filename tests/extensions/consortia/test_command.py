@@ -4,7 +4,7 @@ import os
 
 import pandas as pd
 import pytest
-from extension_marks import PRESENT
+from extension_marks import PRESENT, needs
 from small_cohorts import FAST
 from whole_cohorts import QUICK, REGION, N, write_whole
 
@@ -49,6 +49,7 @@ def test_summaries_that_are_no_regular_files_end_at_once(tmp_path, capsys, make)
     assert error.count("\n") == 1
 
 
+@needs("regions")
 def test_sites_are_combined_and_plots_name_the_part(tmp_path, monkeypatch):
     monkeypatch.setattr(write, "draw_figures", lambda *_: iter(()))
     data, out = write_whole(tmp_path)

@@ -9,10 +9,8 @@ import pandas as pd
 import pytest
 
 from hipsta_bids.cli import main
-from hipsta_bids.cli.parser import help_texts
 from hipsta_bids.derivatives.names import HemisphereName, output_path
 from hipsta_bids.errors import ExitCode, SettingsError
-from hipsta_bids.extensions.surrogate.commands import surrogate_parser
 from hipsta_bids.phantom import Hemisphere, PhantomSpec, write_dataset
 from hipsta_bids.settings import Settings
 from hipsta_bids.types.tables import settings_from
@@ -39,12 +37,6 @@ def run(bids_dir, out, *options):
 def path_of(out, key, hemi="L"):
     name = HemisphereName(subject="01", session=None, hemi=hemi, seg="freesurfer")
     return out / output_path(name, key)
-
-
-def test_the_texts_of_the_help_have_no_leftovers():
-    names = {(action.option_strings or [action.dest])[0] for action in surrogate_parser()._actions}
-    texts = help_texts("hipsta_bids.extensions.surrogate")["surrogate"]
-    assert texts.keys() - {"description", "epilog"} <= names
 
 
 @pytest.mark.parametrize(

@@ -17,6 +17,8 @@ from hipsta_bids.reports.group import group_page
 from hipsta_bids.settings import SheetSettings
 from hipsta_bids.types import parts_of
 
+pytestmark = needs("regions")
+
 
 @pytest.fixture(scope="module", autouse=True)
 def without_pages():

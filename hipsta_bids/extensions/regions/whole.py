@@ -9,18 +9,15 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import replace
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from hipsta_bids import types
 from hipsta_bids.errors import GeometryError
-from hipsta_bids.geometry import catalog
-from hipsta_bids.geometry.body import Body, check_side
-from hipsta_bids.geometry.checks import columns_near, flag_margins, name_place, raise_flags
-from hipsta_bids.geometry.digital import voxel_points
-from hipsta_bids.geometry.disk import (
+from hipsta_bids.extensions.regions.disk import (
     Disk,
     Edges,
     Lines,
@@ -33,7 +30,7 @@ from hipsta_bids.geometry.disk import (
     map_to_rectangle,
     proximodistal,
 )
-from hipsta_bids.geometry.faces import (
+from hipsta_bids.extensions.regions.faces import (
     Faces,
     find_faces,
     find_ridges,
@@ -41,10 +38,16 @@ from hipsta_bids.geometry.faces import (
     whole_surface,
     whole_tissue,
 )
+from hipsta_bids.geometry import catalog
+from hipsta_bids.geometry.body import Body, check_side
+from hipsta_bids.geometry.checks import columns_near, flag_margins, name_place, raise_flags
+from hipsta_bids.geometry.digital import voxel_points
+from hipsta_bids.geometry.ends import EndPlanes
 from hipsta_bids.geometry.fem import volume_laplace
 from hipsta_bids.geometry.measures import column_area, labels_at, measure_thickness
 from hipsta_bids.geometry.mesh import fill_surface, tetra_quality, triangle_areas, unique_edges
 from hipsta_bids.geometry.sheet import coordinates_at, fill_points, label_sheet, sheet_levels
+from hipsta_bids.participant.measure import find_in_body, flags_of, unfold
 from hipsta_bids.protocols.protocol import CORE, LATERAL_END, MEDIAL_END, Tissue
 from hipsta_bids.settings import Settings
 from hipsta_bids.types import Bool, Finding, Float, Int, Sheet
@@ -96,14 +99,51 @@ class Own(NamedTuple):
     flags: tuple[types.Flag, ...]
 
 
-def measure_whole(
-    volume: types.LabelVolume, hemi: str, settings: Settings, clock: Clock, body_alone: Own
+class Laid(NamedTuple):
+    """The sheet of head and body laid out, and the evidence of the stages before it."""
+
+    body: Body
+    """All of the hippocampus, between end planes that are far away."""
+    side: float
+    """How far the medial subfields lie medially of CA1, mm."""
+    surface: types.Surface
+    mesh: types.TetMesh
+    smoothed: int
+    """How often the surface was smoothed more because TetGen could not fill it."""
+    u: Float
+    """(N,) coordinate from the interior to the exterior wall."""
+    disk: Disk
+    edges: Edges
+    plane: Float
+    """(V, 2) place of each vertex of the disk in the rectangle."""
+    axes: tuple[Float, Float, Float]
+    sheet: Sheet
+    whole: Sheet
+    """The same from edge to edge, without margins."""
+    subfield: NDArray[np.uint8]
+    folds: list[Finding]
+
+
+def measure_region(
+    volume: types.LabelVolume, hemi: str, settings: Settings, clock: Clock
 ) -> types.HemisphereMaps:
     """Measure head, body and, unless the region is ``headbody``, tail on one sheet.
 
-    ``body_alone`` is the body measured alone. The other arguments, result and errors are as in
-    `measure_hemisphere`.
+    Arguments, result and errors are as in `measure_hemisphere`. The body is measured alone first.
     """
+    check_fine(volume)
+    body = unfold(volume, hemi, settings.changed(body={"region": "body"}), clock)
+    flags = flags_of(body, find_in_body(volume, hemi, body))
+    body_alone = Own(body.body, body.mesh, body.coordinates, flags)
+    laid = lay_out(volume, hemi, settings, clock, body_alone)
+    with clock("measures"):
+        return _measure(volume, settings, body_alone, laid)
+
+
+def lay_out(
+    volume: types.LabelVolume, hemi: str, settings: Settings, clock: Clock, body_alone: Own
+) -> Laid:
+    """Lay out the sheet of a region around ``body_alone``, the body measured alone."""
     region = settings.body.region
     with clock("body"):
         side = check_side(body_alone.body, hemi)
@@ -137,64 +177,107 @@ def measure_whole(
         edge_to_edge = (np.linspace(-_RIM, _RIM, len(axes[0])), axes[1], axes[2][::2])
         whole = _sample(disk, plane, lines_of, edge_to_edge, 0.0)
         subfield = label_sheet(sheet, body)
-    with clock("measures"):
-        measured = catalog.Measured(
-            body=body,
-            mesh=mesh,
-            sheet=sheet,
-            subfield=subfield,
-            whole=whole,
-            settings=settings,
-        )
-        all_maps = catalog.measure_maps(measured)
-        maps = {k: np.where(sheet.valid, v, np.nan) for k, v in all_maps.items()}
-        maps["distortion"] = _distortion(sheet)
-        maps["proximodistal"] = at_nodes(disk, plane, proximodistal(disk, edges), *axes[:2])
-        folded = flipped_area(disk, plane)
-        measured_area = float(column_area(sheet)[sheet.valid].sum())
-        area = float(triangle_areas(disk.vertices, disk.triangles).sum())
-        masked = max(0.0, 1 - measured_area / area)
-        findings = [*_findings(disk, edges, folded, masked, region), *folds]
-        return types.HemisphereMaps(
-            sheet=sheet,
-            layers=sheet,
-            maps=maps,
-            profiles=catalog.average_profiles(all_maps, sheet),
-            sections=catalog.measure_sections(measured),
-            subfield=subfield,
-            repaired=np.zeros(subfield.shape, dtype=bool),
-            doubtful=np.zeros(subfield.shape, dtype=bool),
-            body_mask=volume.in_file(tissue > 0),
-            summary=catalog.summarize(measured, volume.protocol.sheet),
-            qc={
-                "region": region,
-                "experimental": True,
-                "voxel_size_mm": np.linalg.norm(body.affine[:3, :3], axis=0).round(4).tolist(),
-                "body_voxels": int(np.count_nonzero(body.inside)),
-                "surface_vertices": len(surface.vertices),
-                "extra_smoothing": smoothed,
-                "tetrahedra": len(mesh.tetrahedra),
-                "tetra_quality_median": float(np.median(tetra_quality(mesh))),
-                "holes_mm": [round(hole, 2) for hole in disk.holes],
-                "edge_lengths_mm": _lengths(disk, edges),
-                "folded_fraction": folded,
-                "masked_fraction": masked,
-                "medial_offset_mm": side,
-                "posterior_end_rule": ends.posterior.rule,
-                "anterior_end_rule": ends.anterior.rule,
-                "posterior_plane": ends.posterior.entry(body.inside_points()[1]),
-                "anterior_plane": ends.anterior.entry(body.inside_points()[1]),
-                "flag_margins": flag_margins(findings),
-            },
-            flags=(
-                *raise_flags(findings, sheet, lambda at: name_place(at, body)),
-                *(replace(f, message=f"the body alone: {f.message}") for f in body_alone.flags),
-            ),
-            mesh=mesh,
-            coordinates=types.Coordinates(
-                values=np.column_stack([np.full((len(u), 2), np.nan), u])
-            ),
-        )
+    return Laid(
+        body=body,
+        side=side,
+        surface=surface,
+        mesh=mesh,
+        smoothed=smoothed,
+        u=u,
+        disk=disk,
+        edges=edges,
+        plane=plane,
+        axes=axes,
+        sheet=sheet,
+        whole=whole,
+        subfield=subfield,
+        folds=folds,
+    )
+
+
+def _measure(
+    volume: types.LabelVolume, settings: Settings, body_alone: Own, laid: Laid
+) -> types.HemisphereMaps:
+    """Measure the maps of a sheet that is laid out, and check them."""
+    body, sheet = laid.body, laid.sheet
+    measured = catalog.Measured(
+        body=body,
+        mesh=laid.mesh,
+        sheet=sheet,
+        subfield=laid.subfield,
+        whole=laid.whole,
+        settings=settings,
+    )
+    all_maps = catalog.measure_maps(measured)
+    maps = {k: np.where(sheet.valid, v, np.nan) for k, v in all_maps.items()}
+    maps["distortion"] = _distortion(sheet)
+    medial_to_lateral = proximodistal(laid.disk, laid.edges)
+    maps["proximodistal"] = at_nodes(laid.disk, laid.plane, medial_to_lateral, *laid.axes[:2])
+    folded, masked = flipped_area(laid.disk, laid.plane), _masked(laid)
+    findings = [*_findings(laid.disk, laid.edges, folded, masked, body.region), *laid.folds]
+    return types.HemisphereMaps(
+        sheet=sheet,
+        layers=sheet,
+        maps=maps,
+        profiles=catalog.average_profiles(all_maps, sheet),
+        sections=catalog.measure_sections(measured),
+        subfield=laid.subfield,
+        repaired=np.zeros(laid.subfield.shape, dtype=bool),
+        doubtful=np.zeros(laid.subfield.shape, dtype=bool),
+        body_mask=volume.in_file(body.inside),
+        summary=catalog.summarize(measured, volume.protocol.sheet),
+        qc={
+            **_metrics(laid),
+            "folded_fraction": folded,
+            "masked_fraction": masked,
+            **_metrics_of_ends(laid, body_alone.body.ends),
+            "flag_margins": flag_margins(findings),
+        },
+        flags=(
+            *raise_flags(findings, sheet, lambda at: name_place(at, body)),
+            *(replace(f, message=f"the body alone: {f.message}") for f in body_alone.flags),
+        ),
+        mesh=laid.mesh,
+        coordinates=types.Coordinates(
+            values=np.column_stack([np.full((len(laid.u), 2), np.nan), laid.u])
+        ),
+    )
+
+
+def _masked(laid: Laid) -> float:
+    """Compute the share of the sheet's area that has no values."""
+    measured_area = float(column_area(laid.sheet)[laid.sheet.valid].sum())
+    area = float(triangle_areas(laid.disk.vertices, laid.disk.triangles).sum())
+    return max(0.0, 1 - measured_area / area)
+
+
+def _metrics(laid: Laid) -> dict[str, Any]:
+    """Return numbers about the solid and its sheet."""
+    body = laid.body
+    return {
+        "region": body.region,
+        "experimental": True,
+        "voxel_size_mm": np.linalg.norm(body.affine[:3, :3], axis=0).round(4).tolist(),
+        "body_voxels": int(np.count_nonzero(body.inside)),
+        "surface_vertices": len(laid.surface.vertices),
+        "extra_smoothing": laid.smoothed,
+        "tetrahedra": len(laid.mesh.tetrahedra),
+        "tetra_quality_median": float(np.median(tetra_quality(laid.mesh))),
+        "holes_mm": [round(hole, 2) for hole in laid.disk.holes],
+        "edge_lengths_mm": _lengths(laid.disk, laid.edges),
+    }
+
+
+def _metrics_of_ends(laid: Laid, ends: EndPlanes) -> dict[str, Any]:
+    """Return the side, and the end planes of the body."""
+    inside = laid.body.inside_points()[1]
+    return {
+        "medial_offset_mm": laid.side,
+        "posterior_end_rule": ends.posterior.rule,
+        "anterior_end_rule": ends.anterior.rule,
+        "posterior_plane": ends.posterior.entry(inside),
+        "anterior_plane": ends.anterior.entry(inside),
+    }
 
 
 def check_fine(volume: types.LabelVolume) -> None:

@@ -19,8 +19,8 @@ from hipsta_bids.api.maps import Measurement
 from hipsta_bids.cli.main import main
 from hipsta_bids.derivatives.names import name_of_record
 from hipsta_bids.errors import GeometryError, NothingToDoError, ProtocolError
-from hipsta_bids.geometry.disk import find_edges, level_surface, make_disk
-from hipsta_bids.geometry.faces import find_ridges
+from hipsta_bids.extensions.regions.disk import find_edges, level_surface, make_disk
+from hipsta_bids.extensions.regions.faces import find_ridges
 from hipsta_bids.participant.measure import measure_hemisphere
 from hipsta_bids.phantom.head import RADIUS, HeadSpec, draw_head
 from hipsta_bids.protocols.load import for_region, load_protocol

@@ -24,7 +24,7 @@ from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.settings import Settings
 from validation import hippunfold
 
-DATA = (Path(__file__).parents[2] / ".." / "shared" / "data" / "hippunfold").resolve()
+DATA = (Path(__file__).parents[3] / ".." / "shared" / "data" / "hippunfold").resolve()
 pytestmark = pytest.mark.skipif(not DATA.is_dir(), reason="shared test data not found")
 
 TEMPLATES = DATA / "templates"

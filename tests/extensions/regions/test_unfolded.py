@@ -9,8 +9,8 @@ from scipy.ndimage import binary_dilation
 from scipy.spatial import Delaunay, cKDTree
 
 from hipsta_bids.cli.main import main
+from hipsta_bids.extensions.regions.unfolded import Correspondence
 from hipsta_bids.geometry.sheet import sheet_levels
-from hipsta_bids.participant.unfolded import Correspondence
 from hipsta_bids.settings import Settings
 
 X, Y, _ = sheet_levels(Settings().sheet, "whole")
