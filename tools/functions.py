@@ -18,49 +18,18 @@ EXCEPTIONS: tuple[tuple[str, str], ...] = ()
 #: Functions that still have to be split. An entry that is no longer needed is an error.
 TO_SPLIT = frozenset(
     """
-    api/figures.py:figure api/maps.py:_with_probabilities cli/group.py:_add_methods
-    cli/group.py:_add_sheets cli/group.py:_run cli/participant.py:_run
-    derivatives/copies.py:same_labels derivatives/dataset.py:settle_settings
-    derivatives/outliers.py:_compare extensions/consortia/exchange.py:_summarize
-    extensions/consortia/meta.py:_methods extensions/consortia/norms.py:merge_norms
-    extensions/consortia/page.py:_drawing extensions/consortia/sites.py:check_agreement
-    extensions/norms/methods.py:norms_text extensions/norms/norming.py:_write
-    extensions/trials/trial.py:run_trial geometry/checks.py:check_cross_sections
-    geometry/slices.py:_stacked geometry/topology.py:repair_topology group/cohort/collect.py:_judge
-    group/cohort/collect.py:collect_sheets group/cohort/covariates.py:add_time
+    cli/participant.py:_run group/cohort/collect.py:_judge group/cohort/collect.py:collect_sheets
     group/cohort/external.py:add_external group/cohort/external.py:map_patterns
-    group/cohort/external.py:read_maps group/cohort/masks.py:mask_sheets
-    group/cohort/read.py:choose_measures group/cohort/read.py:read_sheets
-    group/model.py:model_document group/output/agreement.py:effect_rows
-    group/output/demographics.py:demographics_table group/output/figures.py:_draw_pairs
-    group/output/figures.py:draw_figures group/output/figures.py:draw_registration
-    group/output/maps.py:contrasts group/output/methods.py:_harmonization
-    group/output/methods.py:_models group/output/methods.py:_visits
-    group/output/methods.py:methods_text group/output/panels.py:_draw_rows
-    group/output/panels.py:_write_feet group/output/slices.py:draw_surrogate
-    group/output/write.py:write_results group/questions/analysis.py:analyze_cohort
+    group/cohort/external.py:read_maps group/cohort/read.py:choose_measures
+    group/cohort/read.py:read_sheets group/questions/analysis.py:analyze_cohort
     group/questions/analysis.py:combine_maps group/questions/compare.py:_analyze
     group/questions/compare.py:_notes group/questions/harmonize.py:plan_sites
-    group/questions/mixing.py:with_mixes group/questions/models.py:register
-    group/questions/replicate.py:replicate group/questions/scores.py:score_cohort
-    group/questions/study.py:read_study inputs/account.py:unused_of_visit
-    inputs/edits.py:attach_ends inputs/freesurfer.py:choose_run inputs/maps.py:map_requests
-    inputs/maps.py:read_regions inputs/probabilities.py:_attached inputs/probabilities.py:_kinds
-    inputs/scan.py:_candidates inputs/scan.py:_datasets inputs/search.py:_nothing
-    inputs/search.py:dataset_notes inputs/search.py:entries inputs/search.py:find_inputs
-    inputs/tree.py:_inner_folders inputs/tree.py:_renamed inputs/tree.py:read_names
-    inputs/tree.py:sort_folders io/files.py:read_tsv io/volumes.py:_checked_affine
+    group/questions/models.py:register group/questions/replicate.py:replicate
+    group/questions/scores.py:score_cohort group/questions/study.py:read_study
     participant/job.py:hash_inputs participant/job.py:measure_job participant/measure.py:find_all
     participant/measure.py:unfold participant/pool.py:run_jobs participant/run.py:_measured
     participant/run.py:_prepare participant/run.py:_run participant/unfolded.py:resample
     participant/visits.py:_measure_visits participant/whole.py:measure_whole
-    phantom/cohort.py:__post_init__ phantom/dataset.py:write_dataset
-    protocols/load.py:_check_agreement reports/cohort.py:open_commands
-    reports/group_tables.py:findings reports/participant.py:_quality_numbers
-    reports/results.py:read_views stats/contrasts.py:contrast_json stats/contrasts.py:parse_contrast
-    stats/design.py:build_design stats/formula.py:parse_model stats/grammar.py:closed_formula
-    stats/grammar.py:columns stats/inference.py:_permuted stats/marginal.py:_rows
-    stats/references.py:choose_reference
     """.split()  # noqa: SIM905  (a list would take a line per name)
 )
 

@@ -2,6 +2,7 @@
 
 from base64 import b64encode
 from collections.abc import Mapping
+from collections.abc import Set as AbstractSet
 from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import cached_property
@@ -396,6 +397,14 @@ def measure(
     )
 
 
+def _check_complete(volume: LabelVolume, tissues: AbstractSet[Tissue]) -> None:
+    sheet = (*volume.protocol.sheet, *volume.protocol.layer)
+    present = {tissue for tissue in sheet if (volume.tissue == tissue).any()}
+    if lacking := present - tissues:
+        names = ", ".join(sorted(tissue.name for tissue in lacking))
+        raise InputError(f"no probabilities of {names}; add them", reason="bad-probabilities")
+
+
 def _with_probabilities(volume: LabelVolume, source: Any) -> LabelVolume:  # noqa: ANN401  (as above)
     """Add probabilities of the sheet, or of codes, to labels."""
     sheet = (*volume.protocol.sheet, *volume.protocol.layer)
@@ -403,10 +412,7 @@ def _with_probabilities(volume: LabelVolume, source: Any) -> LabelVolume:  # noq
     if isinstance(source, Mapping):
         for code in source:
             check_choice("probabilities: code", code, tissues)
-        lacking = {tissue for tissue in sheet if (volume.tissue == tissue).any()}
-        if lacking := lacking.difference(tissues[code] for code in source):
-            names = ", ".join(sorted(tissue.name for tissue in lacking))
-            raise InputError(f"no probabilities of {names}; add them", reason="bad-probabilities")
+        _check_complete(volume, {tissues[code] for code in source})
         by_tissue = [(tissues[code], f" of code {code}", values) for code, values in source.items()]
     else:
         # All of the sheet, whichever of its tissues has the name.

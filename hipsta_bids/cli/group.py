@@ -3,7 +3,7 @@
 import argparse
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -124,6 +124,11 @@ def _add_sheets(parser: Parser) -> None:
         choices=REGIONS,
         default=REGIONS[0],
     )
+    _add_selection(add)
+
+
+def _add_selection(add: Callable[..., None]) -> None:
+    """Add the options that select and exclude participants, visits, hemispheres and points."""
     for label, prefix in (("participant", "sub-"), ("session", "ses-")):
         add(
             f"--{label}-label",
@@ -273,6 +278,20 @@ def _add_methods(parser: Parser) -> None:
         "harmonize by the harmonization.json of another analysis, its sites or new ones; "
         "with its --template",
     )
+    _add_tests(add)
+    add(
+        "--base",
+        "MEASURE...",
+        "measures and covariates of the base model of classification (default: volume)",
+    )
+    add("--no-classification", "", "omit the classification of groups by logistic models")
+    add(
+        "--settings", "FILE.toml", "settings that change results (see `hipsta-bids settings group`)"
+    )
+
+
+def _add_tests(add: Callable[..., None]) -> None:
+    """Add the options of corrections, permutations and joint tests."""
     add(
         "--correction",
         "",
@@ -302,15 +321,6 @@ def _add_methods(parser: Parser) -> None:
         " (non-parametric combination, family-wise error)",
     )
     add("--joint-sides", "", "with --joint: left and right together, too")
-    add(
-        "--base",
-        "MEASURE...",
-        "measures and covariates of the base model of classification (default: volume)",
-    )
-    add("--no-classification", "", "omit the classification of groups by logistic models")
-    add(
-        "--settings", "FILE.toml", "settings that change results (see `hipsta-bids settings group`)"
-    )
 
 
 def _add_reports(parser: Parser) -> None:
@@ -378,7 +388,7 @@ def run_group_level(arguments: Sequence[str]) -> ExitCode:
         return _run(parsed, arguments)
 
 
-def _run(parsed: argparse.Namespace, arguments: Sequence[str]) -> ExitCode:
+def _check_model(parsed: argparse.Namespace) -> None:
     if parsed.model is not None and (parsed.formula or parsed.contrast):
         raise UsageError("give --model, or --formula and --contrast")
     if parsed.age_model is not None and (parsed.model or parsed.formula):
@@ -386,6 +396,10 @@ def _run(parsed: argparse.Namespace, arguments: Sequence[str]) -> ExitCode:
             "--age-model is of the default model; write poly(age, 2) in the formula, and --contrast"
             ' "nonlinear(age)"'
         )
+
+
+def _run(parsed: argparse.Namespace, arguments: Sequence[str]) -> ExitCode:
+    _check_model(parsed)
     if parsed.reports_only:
         return _rebuild_reports(parsed.output_dir, parsed.name)
     # Thousands of tiny fits: threads of the linear algebra would only get in each other's way.

@@ -96,7 +96,7 @@ def settle_settings(root: Path, settings: Settings) -> str:
     if path.exists():
         earlier = files.read_json(path)
         is_same_version = earlier.get("version") == __version__
-        if earlier.get("hash") == digest and is_same_version:
+        if (earlier.get("hash"), is_same_version) == (digest, True):
             return digest
         before = earlier.get("settings")
         recorded = flatten(before if isinstance(before, dict) else {})

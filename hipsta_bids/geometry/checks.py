@@ -349,6 +349,17 @@ def check_labels(body: Body, settings: CheckSettings) -> list[Finding]:
     ]
 
 
+#: What is wrong with a cross-section, and the remedy, by reason.
+_SECTIONS = {
+    "section-notch": ("lacks a part that its neighbors have", "complete the labels there"),
+    "section-bump": ("has a part that its neighbors lack", "look for leaks and bridges there"),
+    "section-intrusion": (
+        "has the sheet between interior labels of its neighbors",
+        "look for bridges there",
+    ),
+}
+
+
 def check_cross_sections(
     field: Field, slice_step: float, settings: CheckSettings, cuts: Bool | None = None
 ) -> list[Finding]:
@@ -391,36 +402,16 @@ def check_cross_sections(
             share = part.sum(axis=(0, 1)) / area
             usual = contrast * (float(np.median(share)) + least)
             outlier.update(part, share, usual, k + field.beyond)
-    rows = (
-        (
-            "section-notch",
-            notch,
-            "lacks a part that its neighbors have",
-            "complete the labels there",
-        ),
-        (
-            "section-bump",
-            bump,
-            "has a part that its neighbors lack",
-            "look for leaks and bridges there",
-        ),
-        (
-            "section-intrusion",
-            intrusion,
-            "has the sheet between interior labels of its neighbors",
-            "look for bridges there",
-        ),
-    )
     return [
         Finding(
             reason=reason,
             value=outlier.share,
             limit=outlier.limit,
-            text=f"a cross-section {what}, {outlier.share:.0%} of its area",
-            remedy=remedy,
+            text=f"a cross-section {_SECTIONS[reason][0]}, {outlier.share:.0%} of its area",
+            remedy=_SECTIONS[reason][1],
             points=field.grid.to_ras(outlier.nodes),
         )
-        for reason, outlier, what, remedy in rows
+        for reason, outlier in zip(_SECTIONS, (notch, bump, intrusion), strict=True)
     ]
 
 

@@ -259,6 +259,21 @@ def _in_own_order(body: Body) -> Body:
     return replace(body, **volumes, affine=affine)
 
 
+def _part_ribbons(
+    images: Stack, tissue: NDArray[np.uint8], fine: float, settings: SliceSettings
+) -> list[Float | None]:
+    """Part doubled outlines and turns of ribbons in place, and return the nodes of ribbons."""
+    ribbons = []
+    for outline, labels in zip(images, tissue, strict=True):
+        rank = outlines.ranks_of(labels, settings.upsampling)
+        outlines.drop_doubles(outline, rank)
+        ribbons.append(nodes := ribbon.ribbon_nodes(outline, rank, fine))
+        if nodes is not None:
+            ribbon.keep_whole(outline, nodes, fine)
+            ribbon.part_turns(outline, nodes, fine)
+    return ribbons
+
+
 def _stacked(
     tissue: NDArray[np.uint8], pixel: float, settings: SliceSettings, share: Stack | None = None
 ) -> _SliceStack:
@@ -292,17 +307,7 @@ def _stacked(
     plain = images
     images = np.minimum(images, outlines.keep_apart(ends[0], ends[1]))
     images = outlines.cut_rings(images, fine)
-    ranks = [outlines.ranks_of(image, settings.upsampling) for image in tissue]
-    for outline, rank in zip(images, ranks, strict=True):
-        outlines.drop_doubles(outline, rank)
-    ribbons = [
-        ribbon.ribbon_nodes(outline, rank, fine)
-        for outline, rank in zip(images, ranks, strict=True)
-    ]
-    for outline, nodes in zip(images, ribbons, strict=True):
-        if nodes is not None:
-            ribbon.keep_whole(outline, nodes, fine)
-            ribbon.part_turns(outline, nodes, fine)
+    ribbons = _part_ribbons(images, tissue, fine, settings)
     if any(nodes is None for nodes in ribbons):
         flows = register_slices(images, pixel, settings)
     else:

@@ -147,18 +147,14 @@ def repair_topology(
     after = state[membranes.INNER]
     size = int(np.count_nonzero(before))
     changed, touched = _changes(field, after, edits)
+    consistent = _consistent_values(lifted[membranes.INNER], after)
     repairs = tuple(
         _describe(edit, field, size, settings, locate)
         for edit in edits
         if _between_planes(edit, field).mean() > 0.5  # noqa: PLR2004 -- most of it
     )
     return SolidField(
-        field=replace(
-            field,
-            values=_consistent_values(lifted[membranes.INNER], after),
-            separated=None,
-            slits=None,
-        ),
+        field=replace(field, values=consistent, separated=None, slits=None),
         before=field,
         repairs=repairs,
         touched=touched,

@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import filterfalse
 from pathlib import Path
 
 from hipsta_bids.inputs import tree
@@ -146,8 +147,9 @@ def unused_of_visit(
     visit, root = context.visit, context.source.path
     top = root / visit.folders[0].path.relative_to(root).parts[0]
     entry_of = partial(tree.Ignored, subject=visit.subject, session=visit.session, inside=top)
-    used_paths = {path for item in items for path in item.files}
-    used_paths |= {item.path_of(name) for item in items for name, _ in item.passed_over}
+    used_paths = {
+        path for item in items for path in (*item.files, *map(item.path_of, dict(item.passed_over)))
+    }
     n_other = sum(len(folder.names) for folder in visit.folders) - len(used_paths)
     has_labels = bool(items)
     for folder in visit.folders:
@@ -160,11 +162,10 @@ def unused_of_visit(
         for name in folder.inner:
             if text := _inner_reason(folder.path, name):
                 yield entry_of(path=folder.path / name, reason=text)
-    sides = {item.hemi for item in items}
-    for hemi in context.selection.wanted_hemis() if sides else ():
-        if hemi not in sides:
-            reason = "no labels of this hemisphere, but of the other"
-            yield entry_of(path=items[0].files[0].parent, hemi=hemi, reason=reason)
+    present = [item.hemi for item in items] or context.selection.wanted_hemis()
+    for hemi in filterfalse(present.__contains__, context.selection.wanted_hemis()):
+        reason = "no labels of this hemisphere, but of the other"
+        yield entry_of(path=items[0].files[0].parent, hemi=hemi, reason=reason)
     if not has_labels and explain | bool(visit.session):
         yield _without_labels(context, entry_of)
     elif n_other:

@@ -301,6 +301,21 @@ def _vector(cells: dict[str, str], names: Sequence[str]) -> tuple[float, float, 
     return numbers[0], numbers[1], numbers[2]
 
 
+def _with_labels_of(
+    items: Sequence[scan.HemisphereInput], path: Path
+) -> tuple[list[EndRow], list[str]]:
+    """Read a table of ends, and spell subjects and sessions as the hemispheres do."""
+    rows, notes = read_ends(path), list[str]()
+    for name in ("subject", "session"):
+        labels = [getattr(row, name) or "" for row in rows]
+        data = [label for item in items if (label := getattr(item, name))]
+        matches, lines = match_labels(filter(None, labels), data, str(path))
+        changes: list[dict[str, Any]] = [{name: matches.get(x, x) or None} for x in labels]
+        rows = [replace(row, **change) for row, change in zip(rows, changes, strict=True)]
+        notes += lines
+    return rows, notes
+
+
 def attach_ends(
     items: Sequence[scan.HemisphereInput], path: Path | None
 ) -> tuple[tuple[scan.HemisphereInput, ...], tuple[str, ...]]:
@@ -310,14 +325,7 @@ def attach_ends(
     """
     if path is None:
         return tuple(items), ()
-    rows, notes = read_ends(path), list[str]()
-    for name in ("subject", "session"):
-        labels = [getattr(row, name) or "" for row in rows]
-        data = [label for item in items if (label := getattr(item, name))]
-        matches, lines = match_labels(filter(None, labels), data, str(path))
-        changes: list[dict[str, Any]] = [{name: matches.get(x, x) or None} for x in labels]
-        rows = [replace(row, **change) for row, change in zip(rows, changes, strict=True)]
-        notes += lines
+    rows, notes = _with_labels_of(items, path)
     attached = tuple(_attached(item, [r for r in rows if r.is_of(item)], items) for item in items)
     unused_rows = [row for row in rows if not any(row.is_of(item) for item in items)]
     if not unused_rows:

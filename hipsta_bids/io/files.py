@@ -281,21 +281,7 @@ def write_tsv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[str]])
 
 def read_tsv(path: Path) -> list[dict[str, str]]:
     """Read a BIDS table as text cells."""
-    try:
-        text = opening.read_text(path, encoding="utf-8-sig")
-    except FileNotFoundError as error:
-        raise MissingFileError(f"{path}: file not found; check its name") from error
-    except UnicodeDecodeError as error:
-        raise InputError(
-            f"{path}: not readable as a table: no UTF-8 text; save it as that (not as Excel's"
-            " Unicode text)",
-            reason="unreadable-table",
-        ) from error
-    except (OSError, ValueError) as error:
-        raise InputError(
-            f"{path}: not readable as a table ({error}); save it as UTF-8 text with tabs",
-            reason="unreadable-table",
-        ) from error
+    text = _read_table_text(path)
     lines = [
         [(match[1] if (match := _QUOTED.fullmatch(cell)) else cell) for cell in line.split("\t")]
         for line in re.split(r"\r\n?|\n", text)
@@ -316,6 +302,24 @@ def read_tsv(path: Path) -> list[dict[str, str]]:
             f"{path}: column {repeated[0]!r} occurs more than once; keep one", reason="bad-table"
         )
     return [dict(zip(header, cells, strict=True)) for _, cells in table]
+
+
+def _read_table_text(path: Path) -> str:
+    try:
+        return opening.read_text(path, encoding="utf-8-sig")
+    except FileNotFoundError as error:
+        raise MissingFileError(f"{path}: file not found; check its name") from error
+    except UnicodeDecodeError as error:
+        raise InputError(
+            f"{path}: not readable as a table: no UTF-8 text; save it as that (not as Excel's"
+            " Unicode text)",
+            reason="unreadable-table",
+        ) from error
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"{path}: not readable as a table ({error}); save it as UTF-8 text with tabs",
+            reason="unreadable-table",
+        ) from error
 
 
 def _shortened(cells: Sequence[str], size: int) -> list[str]:

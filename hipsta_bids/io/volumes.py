@@ -408,10 +408,9 @@ def _checked_affine(image: Any, path: Path, limits: tuple[float, float]) -> Floa
     """Return the affine, voxel index to RAS mm; refuse one that cannot be right."""
     affine: Float = np.asarray(image.affine, dtype=np.float64)
     linear = affine[:3, :3]
-    no_orientation = isinstance(image, nib.Nifti1Pair) and not (
+    if isinstance(image, nib.Nifti1Pair) and not (
         int(image.header["sform_code"]) or int(image.header["qform_code"])
-    )
-    if no_orientation:
+    ):
         raise InputError(
             f"{path}: no sform and no qform, left and right are unknown; copy the "
             "orientation of the segmented image",
@@ -442,23 +441,29 @@ def _checked_affine(image: Any, path: Path, limits: tuple[float, float]) -> Floa
             reason="bad-voxel-size",
         )
     if isinstance(image, nib.Nifti1Pair):
-        qform = _qform(image)
-        if qform is not None and np.linalg.det(qform[:3, :3]) * np.linalg.det(linear) < 0:
-            raise InputError(
-                f"{path}: sform and qform are mirror images of each other, left and right are "
-                "unknown; correct the wrong one",
-                reason="bad-affine",
-            )
-        spacing = np.asarray(image.header.get_zooms()[:_SPACE], dtype=np.float64)
-        # Some programs without a qform leave it as it was.
-        stated = spacing.min() > 0 and (qform is not None or np.any(spacing != 1))
-        if stated and np.abs(sizes / spacing - 1).max() > _SAME_SIZE:
-            raise InputError(
-                f"{path}: voxels are {_times(sizes)} mm by the sform, but {_times(spacing)} "
-                "mm by pixdim; correct the wrong one",
-                reason="bad-affine",
-            )
+        _check_header(image, path, linear)
     return affine
+
+
+def _check_header(image: Any, path: Path, linear: Float) -> None:  # noqa: ANN401  (as above)
+    """Refuse a NIfTI header that contradicts the linear part of the affine."""
+    sizes = np.linalg.norm(linear, axis=0)
+    qform = _qform(image)
+    if qform is not None and np.linalg.det(qform[:3, :3]) * np.linalg.det(linear) < 0:
+        raise InputError(
+            f"{path}: sform and qform are mirror images of each other, left and right are "
+            "unknown; correct the wrong one",
+            reason="bad-affine",
+        )
+    spacing = np.asarray(image.header.get_zooms()[:_SPACE], dtype=np.float64)
+    # Some programs without a qform leave it as it was.
+    stated = spacing.min() > 0 and (qform is not None or np.any(spacing != 1))
+    if stated and np.abs(sizes / spacing - 1).max() > _SAME_SIZE:
+        raise InputError(
+            f"{path}: voxels are {_times(sizes)} mm by the sform, but {_times(spacing)} "
+            "mm by pixdim; correct the wrong one",
+            reason="bad-affine",
+        )
 
 
 def _qform(image: Any) -> Float | None:  # noqa: ANN401 (untyped)

@@ -1,5 +1,6 @@
 """Synthetic cohorts: groups with a planted effect, covariates and known truth."""
 
+import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -115,23 +116,27 @@ class CohortPlan:
                     f"phantom: {name} {value!r} is unknown; choose from {', '.join(choices)}"
                     f"{did_you_mean([value], choices)}"
                 )
-        problem = None
+        if problem := self._problem():
+            raise UsageError(f"phantom: {problem}")
+
+    def _problem(self) -> str:
+        """Return what cannot be made, or nothing."""
+        problem = ""
         if self.cortex and KINDS[self.kind].power != 1:
             problem = f"the shape {self.kind} cannot extend into cortex; choose another kind"
-        bodies = self.shift or self.cortex or self.probabilities or self.kind != CohortPlan.kind
-        if self.head is not None and bodies:
-            problem = "a head has a shape of its own; remove shift, cortex, kind, probabilities"
-        if self.head is not None and not 0 <= self.head <= _MOST_DIGITATIONS:
-            problem = f"a head has 0 to {_MOST_DIGITATIONS} digitations, not {self.head}"
+        if self.head is not None:
+            if self.shift or self.cortex or self.probabilities or self.kind != CohortPlan.kind:
+                problem = "a head has a shape of its own; remove shift, cortex, kind, probabilities"
+            if not 0 <= self.head <= _MOST_DIGITATIONS:
+                problem = f"a head has 0 to {_MOST_DIGITATIONS} digitations, not {self.head}"
         if not (1 <= self.n_subjects <= _MOST_SUBJECTS and self.seed >= 0):
             problem = f"{self.n_subjects} subjects; give 1 to {_MOST_SUBJECTS:,}"
             problem += f", and a seed of 0 or more, not {self.seed}"
         if not self.groups or len(set(self.groups)) < len(self.groups):
             problem = "give at least one group, and groups with different names"
-        if self.site and not (self.site.isascii() and self.site.isalnum()):
+        if not re.fullmatch("[A-Za-z0-9]*", self.site):
             problem = f"site {self.site!r}: labels have letters and digits only"
-        if problem is not None:
-            raise UsageError(f"phantom: {problem}")
+        return problem
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -3,6 +3,7 @@
 import gzip
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from itertools import filterfalse
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -117,8 +118,7 @@ def write_dataset(
     does; ``rows`` has their values in this order, by subject label without ``sub-``. The same input
     gives the same bytes. Existing files of the same name are replaced.
     """
-    unknown = [name for name in layouts if name not in LAYOUTS]
-    if unknown:
+    if unknown := list(filterfalse(LAYOUTS.__contains__, layouts)):
         raise bad(
             f"layout {unknown[0]!r} is unknown; choose from {', '.join(LAYOUTS)}"
             f"{did_you_mean(unknown, LAYOUTS)}"

@@ -4,7 +4,7 @@ import os
 import re
 import shlex
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -344,6 +344,16 @@ def open_commands(hemisphere: Hemisphere, anatomy: Path | None = None) -> list[t
         volumes.append((_from(result.root, mask), ":colormap=heat:opacity=0.3"))
     if not volumes:
         return []
+    return [
+        ("FreeView", _freeview_command(hemisphere, volumes, behind)),
+        ("ITK-SNAP", _itksnap_command([path for path, _ in volumes], behind)),
+    ]
+
+
+def _freeview_command(
+    hemisphere: Hemisphere, volumes: Iterable[tuple[str, str]], behind: Iterable[str]
+) -> str:
+    result = hemisphere.result
     freeview = ["freeview", "-v", *behind, *(path + look for path, look in volumes)]
     surfaces = {name: result.path(f"{name}_surface") for name in SURFACES}
     if all(path.exists() for path in surfaces.values()):
@@ -355,14 +365,18 @@ def open_commands(hemisphere: Hemisphere, anatomy: Path | None = None) -> list[t
     point = next((f.point for f in hemisphere.findings if f.point is not None), None)
     if point is not None:
         freeview += ["-ras", *(f"{value:g}" for value in point)]
-    first, before = volumes[0][0], ""
+    return shlex.join(freeview)
+
+
+def _itksnap_command(volumes: Sequence[str], behind: Iterable[str]) -> str:
+    first, before = volumes[0], ""
     if not first.endswith(_NIFTI):
         before, first = f"mri_convert {shlex.quote(first)} labels.nii.gz && ", "labels.nii.gz"
     snap = ["itksnap", "-g", first]
     if len(volumes) > 1:
-        snap += ["-s", volumes[1][0]]
+        snap += ["-s", volumes[1]]
     snap += [word for path in behind if path.endswith(_NIFTI) for word in ("-o", path)]
-    return [("FreeView", shlex.join(freeview)), ("ITK-SNAP", before + shlex.join(snap))]
+    return before + shlex.join(snap)
 
 
 def _from(root: Path, path: Path) -> str:

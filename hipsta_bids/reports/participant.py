@@ -279,12 +279,14 @@ def _quality_numbers(series: Series) -> Mapping[str, Any] | None:
             values = (lengths - opposite).tolist()
         if not np.isnan(values).all():
             rows.append((usual, values))
-    facts = [
-        (title, [", ".join(str(h.metrics.get(key, "n/a")) for key in keys) for h in measured])
-        for title, *keys in _FACTS
-        if not series.whole or any(key in h.metrics for key in keys for h in measured)
-    ]
-    return {"sides": [h.side for h in measured], "rows": rows, "facts": facts}
+    return {"sides": [h.side for h in measured], "rows": rows, "facts": list(_facts(series))}
+
+
+def _facts(series: Series) -> Iterator[tuple[str, list[str]]]:
+    for title, *keys in _FACTS:
+        if not series.whole or any(key in h.metrics for key in keys for h in series.measured):
+            values = ([str(h.metrics.get(key, "n/a")) for key in keys] for h in series.measured)
+            yield title, [", ".join(texts) for texts in values]
 
 
 def participant_page(

@@ -342,6 +342,13 @@ class Views:
         return index
 
 
+def _box(interest: Bool, affine: Float) -> tuple[slice, ...]:
+    if not interest.any():
+        return tuple(slice(0, n) for n in interest.shape)
+    hits = [np.asarray(interest.any(axis=axes)) for axes in ((1, 2), (0, 2), (0, 1))]
+    return volumes.box_with_margin(hits, _MARGIN, affine)
+
+
 def read_views(hemisphere: Hemisphere, bids_dir: Path | None = None) -> Views | None:
     """Read what slices are drawn from; without ``bids_dir`` no anatomical images."""
     mask = _read_mask(hemisphere)
@@ -356,10 +363,7 @@ def read_views(hemisphere: Hemisphere, bids_dir: Path | None = None) -> Views | 
     inside = None if mask is None else _reoriented(mask.data, mask.own_affine)[0] != 0
     names = _names(hemisphere, data)
     interest = inside if inside is not None else np.isin(data, list(names))  # type: ignore[arg-type]  # one is there
-    box: tuple[slice, ...] = tuple(slice(0, n) for n in interest.shape)
-    if interest.any():
-        hits = [np.asarray(interest.any(axis=axes)) for axes in ((1, 2), (0, 2), (0, 1))]
-        box = volumes.box_with_margin(hits, _MARGIN, affine)
+    box = _box(interest, affine)
     anatomy, unused = None, None
     if bids_dir is not None and interest.any():
         points = apply_affine(affine, np.argwhere(interest)[::7])

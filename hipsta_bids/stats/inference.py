@@ -449,14 +449,15 @@ def _permuted(
             combine=combine,
         )
         corrected = [result.p_enhanced if enhanced else result.p_max for result in results]
+        points = [result.p_uncorrected for result in results]
         if raw is not None:  # a test that ordinary p-values do not have is no test
             pairs = zip(keys, corrected, strict=True)
             corrected = [np.where(np.isfinite(raw[key]), p, np.nan) for key, p in pairs]
+            points = [raw[key] for key in keys]
         rejected = [p <= rules.alpha for p in corrected]
         n_tests = sum(int(np.isfinite(p).sum()) for p in corrected)
         cutoff = np.nan
         if n_tests and not enhanced:
-            points = [r.p_uncorrected for r in results] if raw is None else [raw[k] for k in keys]
             p, survive = np.concatenate(points), np.concatenate(rejected)
             cutoff = p[survive].max() if survive.any() else np.nanmin(p) * BELOW_ALL
         for key, result, p, flags in zip(keys, results, corrected, rejected, strict=True):

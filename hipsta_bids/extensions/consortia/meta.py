@@ -211,6 +211,24 @@ def _record(
     }
 
 
+def _random_effects(method: str, cite: Citations) -> str:
+    """Return how the variance between sites was estimated."""
+    if method == "dl":
+        return (
+            f"estimated by the moments of DerSimonian and Laird {cite('dl')}. Tests used the normal"
+            " distribution"
+        )
+    text = (
+        f"estimated by restricted maximum likelihood {cite('reml')}. Tests and limits followed"
+        f" Knapp and Hartung {cite('knapp-hartung')}"
+    )
+    if method == "reml-adhoc":
+        text += (
+            f", with standard errors not smaller than without their correction {cite('modified')}"
+        )
+    return text
+
+
 def _methods(meta: Meta) -> str:
     """Return what was done and what was found."""
     rules, sites = meta.settings.meta, meta.sites
@@ -229,21 +247,7 @@ def _methods(meta: Meta) -> str:
     method_text = cite("method")
     if sites[0].template is not None:
         aligned += f" Registration used monotone B-spline warps {cite('registr')}."
-    if rules.random == "dl":
-        random = (
-            f"estimated by the moments of DerSimonian and Laird {cite('dl')}. Tests used the normal"
-            " distribution"
-        )
-    else:
-        random = (
-            f"estimated by restricted maximum likelihood {cite('reml')}. Tests and limits followed"
-            f" Knapp and Hartung {cite('knapp-hartung')}"
-        )
-        if rules.random == "reml-adhoc":
-            random += (
-                f", with standard errors not smaller than without their correction"
-                f" {cite('modified')}"
-            )
+    random = _random_effects(rules.random, cite)
     measure_text = (
         f"Measures of the hippocampal body {method_text} of {meta.people} participants{groups} at"
         f" {len(sites)} sites were combined with hipsta_bids {__version__}. No value of a"

@@ -130,15 +130,18 @@ def check_agreement(sites: Sequence[SiteSummary]) -> list[str]:
                 words = [", ".join(f"{weight:.6g}" for weight in row) for row in rows]
                 item = f"{title}: weights of {name} on {', '.join(model.columns)}"
                 _agree(sites, item, words, _BY_COLUMNS)
-    notes = []
+    return list(_differences(sites))
+
+
+def _differences(sites: Sequence[SiteSummary]) -> Iterator[str]:
+    """Note in which versions and labels the sites differ."""
     if len({site.version for site in sites}) > 1:
-        notes.append("sites used several versions of hipsta_bids, see sites.tsv")
+        yield "sites used several versions of hipsta_bids, see sites.tsv"
     for name in dict.fromkeys(name for site in sites for name in site.labels):
         kinds = {site.site: ", ".join(site.labels.get(name, ["unknown"])) for site in sites}
         if len(set(kinds.values())) > 1:
             texts = "; ".join(f"{kind} at {site}" for site, kind in kinds.items())
-            notes.append(f"labels of sites differ in {name}: {texts}")
-    return notes
+            yield f"labels of sites differ in {name}: {texts}"
 
 
 def _agree(

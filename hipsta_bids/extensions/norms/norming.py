@@ -184,11 +184,10 @@ def _registered(
 def _write(study: studies.Study, scoring: _Made, notes: Iterable[str]) -> studies.GroupResult:
     """Write all results; charts are of the measures that the settings name."""
     file, people, cohort = scoring.file, scoring.people, study.cohort
-    settings = study.settings
     charts = [
         file.centiles(norms).assign(hemi=hemi, measure=name, unit=cohort.units.get(name, "1"))
         for (hemi, name), norms in scoring.norms.items()
-        if name in settings.norms.charts and hemi != BOTH
+        if name in study.settings.norms.charts and hemi != BOTH
     ]
     if charts:
         table = pd.concat(charts, ignore_index=True)

@@ -337,7 +337,6 @@ def run_trial(
     if effect is not None:
         for result in results:
             result.tables.update(_sample_sizes(effect, result, settings))
-    people = int(modeled[PARTICIPANT].nunique())
 
     def fill(folder: Path) -> list[str]:
         _write_tables(folder, cohorts, results)
@@ -347,20 +346,6 @@ def run_trial(
         files.write_text(folder / "methods.md", _methods(study, source, modeled, results, effect))
         return write.write_figures(folder, _figures(cohorts, results), prints=options.figures)
 
-    record = {
-        "formula": source.spec.formula if isinstance(source, Modeled) else None,
-        "hemispheres": {hemi: len(side.rows) for hemi, side in cohort.sides.items()},
-        "retest": {"participants": people, "sessions": source.sessions}
-        if isinstance(source, Retested)
-        else None,
-        "power": effect
-        and asdict(effect)
-        | {
-            "alpha_point": trials.point_level(settings.multiplicity, settings.power),
-            "most": trials.MOST_PARTICIPANTS,
-        },
-        "among": among,
-    }
     name = ["retest"] if retest else []
     if effect is not None:
         name.append(f"power-{effect.kind}-{100 * effect.share:g}".replace(".", "p"))
@@ -369,7 +354,7 @@ def run_trial(
         _notes(source, results, study, effect),
         visits=modeled,
         tables=tables,
-        record=record,
+        record=_record(study, source, modeled, effect) | {"among": among},
         fill=fill,
     )
 
@@ -390,6 +375,25 @@ def _sample_sizes(effect: trials.TrialEffect, result: Described, settings: Group
     confidence = settings.glm.confidence if single else None
     size = trials.sample_size(effect, moments, plan, alpha=alpha, confidence=confidence)
     return {"power": size}
+
+
+def _record(
+    study: studies.Study, source: Source, visits: pd.DataFrame, effect: trials.TrialEffect | None
+) -> dict[str, Any]:
+    """Return the record of the model or the sessions, and of the trial."""
+    settings, people = study.settings, int(visits[PARTICIPANT].nunique())
+    power = {
+        "alpha_point": trials.point_level(settings.multiplicity, settings.power),
+        "most": trials.MOST_PARTICIPANTS,
+    }
+    return {
+        "formula": source.spec.formula if isinstance(source, Modeled) else None,
+        "hemispheres": {hemi: len(side.rows) for hemi, side in study.cohort.sides.items()},
+        "retest": {"participants": people, "sessions": source.sessions}
+        if isinstance(source, Retested)
+        else None,
+        "power": effect and asdict(effect) | power,
+    }
 
 
 def _notes(

@@ -2,7 +2,7 @@
 
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import cache
@@ -392,6 +392,16 @@ def order_sessions(table: pd.DataFrame, settings: GroupSettings) -> list[str]:
     return sorted(sessions, key=lambda name: float(medians[name]))
 
 
+def _named_time(
+    table: pd.DataFrame, time_columns: Iterable[str], by_name: Mapping[str, str]
+) -> tuple[str | None, Any]:
+    """Return the first column of time that varies between the sessions of a participant."""
+    columns = [by_name[name] for name in map(str.casefold, time_columns) if name in by_name]
+    candidates = ((column, typed(table[column])) for column in columns)
+    varying = ((n, values) for n, values in candidates if _varies(values, table[PARTICIPANT]))
+    return next(varying, (None, None))
+
+
 def add_time(
     table: pd.DataFrame, settings: GroupSettings, comparison: Comparison | None = None
 ) -> VisitTime:
@@ -415,18 +425,15 @@ def add_time(
             covariates = tuple(
                 FIRST_AGE if name.casefold() == "age" else name for name in covariates
             )
-    names = [name.casefold() for name in settings.longitudinal.time_columns]
-    named = {by_name[name]: table[by_name[name]] for name in names if name in by_name}
-    candidates = ((name, typed(values)) for name, values in named.items())
-    column, own = next((one for one in candidates if _varies(one[1], people)), (None, None))
+    column, values = _named_time(table, settings.longitudinal.time_columns, by_name)
     if column is None:
         if _DATE in table.columns and table[_DATE].notna().any():
             times, unit = _dates(table[_DATE]), _DAYS_PER_YEAR
         if times is not None:
             first = times.groupby(people).transform("min")
-            column, own = TIME, (times - first) / unit
+            column, values = TIME, (times - first) / unit
     if column is not None:
-        columns[column] = own
+        columns[column] = values
     time = VisitTime(table.assign(**columns), column, covariates)
     if comparison and (comparison.endpoint or settings.longitudinal.random == "visits"):
         return _with_visits(time, settings, comparison)

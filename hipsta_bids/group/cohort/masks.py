@@ -40,22 +40,21 @@ def mask_sheets(
     for hemi, side in measured.sides.items():
         is_masked = np.zeros((len(side.rows), *side.shape), dtype=bool)
         visits = measured.table.index[side.rows]
-        for sheet, record in enumerate(by_place[visit, hemi] for visit in visits):
+        for sheet, visit in enumerate(visits):
+            result = by_place[visit, hemi].result
             if REPAIRED in masks:
-                columns = read_sheet(record.result.path("sheet"), [], [REPAIRED], side.shape)
-                is_masked[sheet] |= columns[REPAIRED] == "true"
+                columns = read_sheet(result.path("sheet"), [], [REPAIRED], side.shape)
+                is_masked[sheet] = columns[REPAIRED] == "true"
             for table in tables:
-                for row in table.about(record.result.name):
+                for row in table.about(result.name):
                     is_masked[(sheet, *_node(row, side.shape, table.path))] = True
         maps = {name: np.where(is_masked, np.nan, values) for name, values in side.maps.items()}
         sides[hemi] = replace(side, maps=maps, unmasked=side.maps["curvature"])
-        shares += [
-            {"visit": visit, "side": hemi, "share": share}
-            for visit, share in zip(visits, is_masked.mean(axis=(1, 2)), strict=True)
-        ]
+        share = is_masked.mean(axis=(1, 2))
+        shares.append(pd.DataFrame({"visit": visits, "side": hemi, "share": share}))
     names = [(record.result.name, None) for record in records]
     notes = [note for table in tables for note in table.notes(names)]
-    return replace(measured, sides=sides), pd.DataFrame(shares), notes
+    return replace(measured, sides=sides), pd.concat(shares, ignore_index=True), notes
 
 
 def mask_note(shares: pd.DataFrame, groups: pd.Series | None) -> str:

@@ -1,6 +1,6 @@
 """Finished analyses side by side: one table of effects, one figure, and agreement of maps."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations, count
@@ -173,27 +173,44 @@ def _comparable(first: Tested, second: Tested) -> bool:
     )
 
 
+def _flat_grounds(
+    entries: Sequence[Entry], measure: str
+) -> tuple[list[dict[str, Ground]], list[dict[str, None]]]:
+    """Read unfolded sheets by side, and names of subfields, of each analysis."""
+    grounds = [read_grounds(entry.results, entry.measure or measure) for entry in entries]
+    flat = [{hemi: replace(g, surface=None) for hemi, g in sides.items()} for sides in grounds]
+    return flat, [dict.fromkeys(n for g in sides.values() for n in g.names) for sides in flat]
+
+
+def _comparable_tests(
+    entry: Entry, first: Mapping[MapKey, Tested], measure: str, contrast: str
+) -> dict[str, Any]:
+    """Return the tests of a map, by side, that can be compared with the first analysis."""
+    keys = [key for key in first if (key.measure, key.contrast) == (measure, contrast)]
+    maps = entry.maps
+    return {k.hemi: maps[k][0] for k in keys if k in maps and _comparable(first[k], maps[k])}
+
+
+def _scale(tests: Iterable[Mapping[str, Any]]) -> tuple[str, dict[str, Any]]:
+    """Return name and colors of the effects of some tests, which are by side."""
+    every_test = [test for by_side in tests for test in by_side.values()]
+    kind = every_test[0].kind
+    effects = [display.Effects(t.kind, t.effect, t.statistic, t.df) for t in every_test]
+    reach, (low, colors, _) = display.effect_reach(effects), display.effect_colors(kind)
+    return EFFECT_NAMES[kind], {"cmap": colors, "vmin": low * reach, "vmax": reach}
+
+
 def effect_rows(
     entries: Sequence[Entry], measure: str
 ) -> tuple[dict[str, Ground], list[list[Row]]]:
     """Show the effect maps of a measure in one scale: a row per analysis, a block per contrast."""
     drawn = [entry for entry in entries if measure in {key.measure for key in entry.maps}]
-    grounds = [read_grounds(entry.results, entry.measure or measure) for entry in drawn]
-    flat = [{hemi: replace(one, surface=None) for hemi, one in own.items()} for own in grounds]
-    names = [dict.fromkeys(n for one in own.values() for n in one.names) for own in flat]
-    uniform = all(list(own) == list(names[0]) for own in names)
+    flat, names = _flat_grounds(drawn, measure)
+    uniform = all(list(subfields) == list(names[0]) for subfields in names)
     first, number, blocks = drawn[0].maps, count(), list[list[Row]]()
     for contrast in dict.fromkeys(key.contrast for key in first if key.measure == measure):
-        keys = [key for key in first if (key.measure, key.contrast) == (measure, contrast)]
-        tests = [
-            {k.hemi: e.maps[k][0] for k in keys if k in e.maps and _comparable(first[k], e.maps[k])}
-            for e in drawn
-        ]
-        every_test = [test for own in tests for test in own.values()]
-        reach = display.effect_reach(
-            [display.Effects(t.kind, t.effect, t.statistic, t.df) for t in every_test]
-        )
-        low, colors, _ = display.effect_colors(every_test[0].kind)
+        tests = [_comparable_tests(entry, first, measure, contrast) for entry in drawn]
+        label, scale = _scale(tests)
         blocks.append(
             [
                 Row(
@@ -201,19 +218,20 @@ def effect_rows(
                     index=next(number),
                     title=f"{contrast}: {entry.name} (n = {entry.results.record['participants']})"
                     # One line of names below all rows would be wrong.
-                    + ("" if uniform else f"; {', '.join(own_names)}"),
-                    label=EFFECT_NAMES[every_test[0].kind],
-                    scale={"cmap": colors, "vmin": low * reach, "vmax": reach},
-                    values={hemi: test.effect for hemi, test in own.items()},
-                    survive={hemi: test.rejected for hemi, test in own.items()},
+                    + f"; {', '.join(subfields)}" * (not uniform),
+                    label=label,
+                    scale=scale,
+                    values={hemi: test.effect for hemi, test in by_side.items()},
+                    survive={hemi: test.rejected for hemi, test in by_side.items()},
                     grounds=sides,
                 )
-                for entry, own, sides, own_names in zip(drawn, tests, flat, names, strict=True)
-                if own
+                for entry, by_side, sides, subfields in zip(drawn, tests, flat, names, strict=True)
+                if by_side
             ]
         )
-    shared = flat[0] if uniform else {h: replace(one, names=()) for h, one in flat[0].items()}
-    return shared, blocks
+    if not uniform:
+        flat[0] = {hemi: replace(ground, names=()) for hemi, ground in flat[0].items()}
+    return flat[0], blocks
 
 
 def differences(entries: Sequence[Entry]) -> Iterator[str]:

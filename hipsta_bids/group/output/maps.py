@@ -5,6 +5,8 @@ No model is fitted for a figure: what a figure shows is in the tables of its fol
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from itertools import chain
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -178,26 +180,25 @@ def _count_rows(results: GroupResults, measure: str) -> Iterator[Row]:
 
 
 def contrasts(
-    every_test: Tests, measure: str, like: Mapping[str, str] | None = None
+    every_test: Tests, measure: str, like: Mapping[str, str] = MappingProxyType({})
 ) -> Iterator[list[Row]]:
     """Show effect sizes and corrected p-values of each contrast of a measure.
 
     Tests of all measures share their colors; ``like`` names contrasts that
     have the colors of others.
     """
-    tests = {hemi: own[measure] for hemi, own in every_test.items() if measure in own}
+    tests = {hemi: maps[measure] for hemi, maps in every_test.items() if measure in maps}
     signed = {
-        hemi: {
-            name: group_maps.signed_logarithm(test.adjusted, test.statistic)
-            for name, test in own.items()
-        }
-        for hemi, own in tests.items()
+        (hemi, name): group_maps.signed_logarithm(test.adjusted, test.statistic)
+        for hemi, by_name in tests.items()
+        for name, test in by_name.items()
     }
-    top = display.significance_reach([one for own in signed.values() for one in own.values()])
-    for index, name in enumerate(dict.fromkeys(name for own in tests.values() for name in own)):
-        sides = {hemi: own[name] for hemi, own in tests.items() if name in own}
+    top = display.significance_reach(list(signed.values()))
+    names = dict.fromkeys(chain.from_iterable(tests.values()))
+    for index, name in enumerate(names):
+        sides = {hemi: by_name[name] for hemi, by_name in tests.items() if name in by_name}
         first = next(iter(sides.values()))
-        reach = _reach(every_test, first.kind, (like or {}).get(name, name), sides)
+        reach = _reach(every_test, first.kind, like.get(name, name), sides)
         low, colors, p_colors = display.effect_colors(first.kind)
         survive = {hemi: test.rejected for hemi, test in sides.items()}
         word = "Joint evidence" if first.kind == "z" else "Effect"
@@ -217,7 +218,7 @@ def contrasts(
                 title=f"Significant: {_counts(sides)}",
                 label="corrected p" + (", signed" if low else ""),
                 scale={"cmap": p_colors, "vmin": low * top, "vmax": top},
-                values={hemi: signed[hemi][name] for hemi in sides},
+                values={hemi: signed[hemi, name] for hemi in sides},
                 survive=survive,
                 level=first.alpha,
             ),

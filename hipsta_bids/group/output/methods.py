@@ -12,7 +12,7 @@ from hipsta_bids.group.cohort.crop import REACH
 from hipsta_bids.group.cohort.data import SIZES, Cohort
 from hipsta_bids.group.cohort.read import LEAST_SHARE
 from hipsta_bids.group.output.citations import Citations, code, escaped, joined
-from hipsta_bids.group.output.results import Analysis
+from hipsta_bids.group.output.results import Analysis, SitePlan
 from hipsta_bids.group.output.tables import opposite_notes
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.protocols import EXPERIMENTAL
@@ -47,6 +47,19 @@ PROCEDURES: Mapping[str, str] = {
 }
 
 
+def _sample_notes(demographics: pd.DataFrame, ratings: Mapping[str, int] | None) -> str:
+    text = ""
+    if tests := escaped(joined(demographic_tests(demographics))):
+        text = f" Demographics of the groups were compared by {tests}."
+    if ratings is not None:
+        counts = ", ".join(f"{n} {rating}" for rating, n in ratings.items())
+        text += (
+            f" Hemispheres were rated on their report pages ({counts}); hemispheres rated exclude"
+            " were excluded."
+        )
+    return text
+
+
 def methods_text(
     cohort: Cohort,
     analysis: Analysis,
@@ -62,14 +75,7 @@ def methods_text(
     """Return methods and results, as a paper prints them."""
     cite = Citations()
     paragraphs = [_sample(cohort, analysis, n_out, cite, surfaces)]
-    if tests := escaped(joined(demographic_tests(demographics))):
-        paragraphs[0] += f" Demographics of the groups were compared by {tests}."
-    if ratings is not None:
-        counts = ", ".join(f"{n} {rating}" for rating, n in ratings.items())
-        paragraphs[0] += (
-            f" Hemispheres were rated on their report pages ({counts}); hemispheres rated exclude"
-            " were excluded."
-        )
+    paragraphs[0] += _sample_notes(demographics, ratings)
     aligned = [_registration(analysis, settings, cite)] if analysis.registrations else []
     aligned += _other_maps(surfaces, cropped)
     if aligned:
@@ -199,6 +205,11 @@ def _rims(analysis: Analysis) -> str:
     )
 
 
+def _preserved(plan: SitePlan) -> str:
+    text = code(plan.formula) if plan.names else "no variable"
+    return text if plan.icv is None else f"{text}, and for {SIZES} also {escaped(plan.icv)}"
+
+
 def _harmonization(
     analysis: Analysis, settings: GroupSettings, cite: Callable[[str], str]
 ) -> list[str]:
@@ -209,14 +220,11 @@ def _harmonization(
     counts = ", ".join(f"{escaped(site)} {n}" for site, n in plan.counts.items())
     column = escaped(plan.column)
     sources = f"{cite('johnson')}, {cite('combat')}"
-    preserved = code(plan.formula) if plan.names else "no variable"
-    if plan.icv is not None:
-        preserved += f", and for {SIZES} also {escaped(plan.icv)}"
     text = (
         f"Effects of {column} ({counts} participants) on"
         f"{' registered' if analysis.registered else ''} maps and summary measures were removed by"
         f" ComBat {sources}. ComBat estimated a shift and a scale of each {column} from the"
-        f" residuals of a linear model at each point, and preserved {preserved}."
+        f" residuals of a linear model at each point, and preserved {_preserved(plan)}."
     )
     if plan.estimated and settings.harmonization.pooling:
         text += (
@@ -229,10 +237,10 @@ def _harmonization(
             f" within participants {cite('beer')}."
         )
     if plan.saved is not None:
-        saved_sites = sum(site in plan.saved.sites for site in plan.counts)
-        text += f" Parameters of {saved_sites} levels were taken from an earlier analysis"
-        new = escaped(", ".join(plan.estimated))
-        text += f"; parameters of {new} were estimated here." if new else "."
+        n_saved = len(plan.counts.keys() & plan.saved.sites.keys())
+        text += f" Parameters of {n_saved} levels were taken from an earlier analysis"
+        new = f"; parameters of {escaped(', '.join(plan.estimated))} were estimated here"
+        text += f"{new * bool(plan.estimated)}."
     if plan.estimated and not analysis.comparison.pair:
         columns_lost = len(plan.counts) - 1
         text += (
@@ -280,11 +288,20 @@ def _models(analysis: Analysis, settings: GroupSettings, cite: Callable[[str], s
         text += f" Contrasts of several rows were tested by F {cite('fai')}."
     text += _slopes(analysis, cite) if analysis.comparison.longitudinal else ""
     text += f" {_correction(settings.multiplicity, cite, analysis)}"
+    text += _effect_sizes(analysis, settings, d, cite)
+    return f"{text}{_nonlinear(analysis, settings)}"
+
+
+def _effect_sizes(
+    analysis: Analysis, settings: GroupSettings, d: str, cite: Callable[[str], str]
+) -> str:
+    """Return the definitions of effect sizes, and how summary measures were tested."""
+    contrasts = analysis.design.contrasts
     kinds = [f"Cohen's d ({d})"] * any(one.n_rows == 1 for one in contrasts)
     kinds += ["partial eta squared"] * any(one.n_rows > 1 for one in contrasts)
     adjusted = any(formula != analysis.model.formula for _, formula in analysis.measures)
     sizes = f"; {SIZES} were also adjusted for intracranial volume" if adjusted else ""
-    text += (
+    text = (
         f" Effect sizes are {' or '.join(kinds)}, with {settings.glm.confidence:.0%} confidence"
         f" limits from non-central distributions {cite('steiger')}."
     )
@@ -296,7 +313,7 @@ def _models(analysis: Analysis, settings: GroupSettings, cite: Callable[[str], s
             " rate was controlled over all measures, sides and models of a contrast (families of"
             f" tests: {n_families})."
         )
-    return f"{text}{_nonlinear(analysis, settings)}"
+    return text
 
 
 def _tests(contrasts: Sequence[Contrast]) -> str:
@@ -317,8 +334,7 @@ def _visits(analysis: Analysis, settings: GroupSettings, cite: Callable[[str], s
             f" It had random {effects} of participants, and was estimated by restricted maximum"
             f" likelihood. Degrees of freedom were Satterthwaite's {cite('mixed')}."
         )
-    kind, *sessions = analysis.comparison.endpoint or ("",)
-    first = escaped(sessions[0] if sessions else "")
+    kind, first, *_ = map(escaped, (*(analysis.comparison.endpoint or ()), "", ""))
     if kind == "ancova":
         text = f" The value at {first} was a covariate at each point (analysis of covariance)."
     else:

@@ -121,6 +121,13 @@ def explain(figure: "Figure", axis: "Axes", title: str | None = None) -> None:
     legend.set_title(title or "")
 
 
+def share_limits(axes: "Sequence[Axes]") -> None:
+    """Give panels the same vertical range, which has all of theirs."""
+    limits = np.array([axis.get_ylim() for axis in axes])
+    for axis in axes:
+        axis.set_ylim(limits[:, 0].min(), limits[:, 1].max())
+
+
 def letter_panels(axes: "Sequence[Axes]") -> None:
     """Put letters on panels, beside their titles."""
     for axis, letter in zip(axes, cycle(LETTERS), strict=False):

@@ -72,6 +72,15 @@ def _replace(scratch: Path, final: Path) -> None:
     shutil.rmtree(old, ignore_errors=True)
 
 
+def _write_effects(
+    folder: Path, analyses: Mapping[str, results.Analysis], labels: Mapping[str, list[str]]
+) -> None:
+    parts = [a.harmonization for a in analyses.values() if a.harmonization is not None]
+    if effects := results.effects_of(parts, results.digests(analyses[SHEET].registrations)):
+        effects = effects.model_copy(update={"labels": dict(labels)})
+        files.write_json(folder / "harmonization.json", effects.model_dump(by_alias=True))
+
+
 def write_results(
     folder: Path,
     cohorts: Mapping[str, Cohort],
@@ -113,10 +122,7 @@ def write_results(
     if templates := results.templates_of(analysis.registrations):
         files.write_json(folder / "template.json", templates)
     if analysis.harmonization is not None:
-        parts = [one.harmonization for one in analyses.values() if one.harmonization is not None]
-        if effects := results.effects_of(parts, results.digests(analysis.registrations)):
-            effects = effects.model_copy(update={"labels": dict(labels)})
-            files.write_json(folder / "harmonization.json", effects.model_dump(by_alias=True))
+        _write_effects(folder, analyses, labels)
     for surface, one in analyses.items():
         _write_surfaces(folder, cohorts[surface], one)
         write_stats(folder, stats_of(results.tested_maps(one)), _about_tests(one, settings))
