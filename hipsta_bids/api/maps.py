@@ -85,10 +85,10 @@ class Measurement:
     def _repr_html_(self) -> str:
         from matplotlib.figure import Figure  # noqa: PLC0415  (slow to load)
 
-        from hipsta_bids.api.plots import plot_sheet  # noqa: PLC0415  (it draws what is here)
+        from hipsta_bids.api.drawing import draw_map  # noqa: PLC0415  (as above)
 
         figure, content = Figure(figsize=(3.4, 2.6), layout="constrained"), BytesIO()
-        plot_sheet(self, ax=figure.subplots())
+        draw_map(figure.subplots(), self.table, "thickness", self.side)
         figure.savefig(content, format="png", dpi=80)
         code = b64encode(content.getvalue()).decode()
         picture = f'<img alt="Thickness on the sheet" src="data:image/png;base64,{code}">'

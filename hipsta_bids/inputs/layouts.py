@@ -244,7 +244,7 @@ def _ashs_reason(file: LabelFile, best: LabelFile) -> str:
 
 def _ashs_protocol(_: Layout, file: LabelFile, context: Context, hemi: str) -> Verdict:
     """Identify the atlas."""
-    return (context.atlases or atlas_finder(context)).identify(file, hemi)
+    return (context.identify_atlas or atlas_finder(context).identify)(file, hemi)
 
 
 #: Subjects whose files are opened to find out a dataset's atlas, spread over the dataset.

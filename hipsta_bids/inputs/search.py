@@ -297,7 +297,7 @@ def _search(source: Source, selection: Selection, option: Protocol | None, resul
     results.renamed += [folder for folder in folders if folder.renamed]
     renaming = _renaming(folders)
     context = Context(source=source, selection=selection, atlas=option)
-    context = replace(context, atlases=atlas_finder(context))
+    context = replace(context, identify_atlas=atlas_finder(context).identify)
     searched = [layout for layout in LAYOUTS if layout.kind in source.layouts]
     closed: list[tree.Ignored] = []
     visits = list(filter(selection.wants_visit, tree.list_visits(folders, closed)))

@@ -8,16 +8,13 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from hipsta_bids import opening
 from hipsta_bids.errors import HipstaError, InputError, ProtocolError, UsageError
 from hipsta_bids.inputs import scan, tree
 from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.protocols.protocol import Protocol
-
-if TYPE_CHECKING:
-    from hipsta_bids.inputs.ashs import AtlasFinder
 
 #: The entry of the filter file that applies to segmentations.
 _QUERY = "dseg"
@@ -132,7 +129,8 @@ class Context:
     atlas: Protocol | None
     """Of ``--ashs-atlas``."""
     visit: tree.VisitFolders = tree.NO_VISIT
-    atlases: "AtlasFinder | None" = None
+    identify_atlas: Callable[[LabelFile, str], Verdict] | None = None
+    """Finds the atlas of a file of ASHS, and of one side."""
     longitudinal: bool = False
     """Which of FreeSurfer's runs the visit is represented by."""
 
