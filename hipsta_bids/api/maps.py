@@ -327,7 +327,7 @@ def measure(
         (I, J, K) on the grid of the labels, a path or an image of nibabel. Or a mapping from codes,
         among them each code of the sheet and its layer, to these.
     region : {"body", "extended", "entorhinal", "headbody", "whole"}
-        What to measure; the second and third need labels of the cortex beside it, the last two,
+        What to measure; the second and third need labels of the cortex next to it, the last two,
         which are experimental, labels of subfields in the head.
     settings : Settings, str or Path, optional
         Settings of the participant level, or a TOML file with some.
@@ -366,7 +366,7 @@ def measure(
     >>> print(f"{left.summary['thickness_mean']:.1f} {left.units['thickness']}")
     2.0 mm
 
-    With xarray, values are found by their coordinates:
+    With xarray, values are selected by their coordinates:
 
     >>> middle = left.dataset.sel(y=0.0)
     >>> dict(middle.sizes)

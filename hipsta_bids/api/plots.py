@@ -329,7 +329,7 @@ def _points(data: Measurement | xr.Dataset, level: str) -> Float:
 
 
 def _light(corners: Float, elevation: float, azimuth: float) -> Float:
-    """Brightness of faces (N, 3, 3) that a lamp beside the viewer lights on both sides."""
+    """Brightness of faces (N, 3, 3) that a lamp next to the viewer lights on both sides."""
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     length = np.linalg.norm(normals, axis=1)
     high, around = np.radians([elevation + 15, azimuth + 15])

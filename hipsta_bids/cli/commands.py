@@ -149,7 +149,7 @@ def write_demo_data(arguments: Sequence[str]) -> ExitCode:
 
 
 def run_demo(arguments: Sequence[str]) -> ExitCode:
-    """Write the demo dataset, run on it, and print true beside measured thickness."""
+    """Write the demo dataset, run on it, and print true and measured thickness."""
     folder = _demo_folder("demo", arguments)
     data, out = folder / "bids", folder / "out"
     _write_demo(data)
@@ -258,7 +258,7 @@ def run_compare(arguments: Sequence[str]) -> ExitCode:
 
 
 def run_replicate(arguments: Sequence[str]) -> ExitCode:
-    """Put the published numbers beside the numbers of an analysis."""
+    """Compare the published numbers with the numbers of an analysis."""
     options = replicate_parser().parse_intermixed_args(arguments)
     from hipsta_bids.group.questions.replicate import replicate  # noqa: PLC0415  (heavy)
 

@@ -459,7 +459,7 @@ def _rebuild_reports(root: Path, name: str | None) -> ExitCode:
 
 
 def _settings(parsed: argparse.Namespace) -> "GroupSettings":
-    """Read the settings, and put those in that have an option of their own."""
+    """Read the settings, and put those in that have a separate option."""
     from hipsta_bids.group.settings import load_group_settings  # noqa: PLC0415  (start-up time)
 
     choices = {

@@ -23,7 +23,7 @@ _OF_PATHS = {errno.ENAMETOOLONG, errno.ELOOP, errno.ENOTDIR, errno.EACCES, errno
 _LONGEST_PATH = 300  # characters shown
 _SIGNALED = 128  # shells report death by signal n as 128 + n
 
-#: Commands beside the BIDS App: name, its function in `commands`, arguments and meaning for the
+#: Commands other than the BIDS App: name, its function in `commands`, arguments and meaning for the
 #: help. They are loaded when they are called.
 _CORE = (
     ("protocols", "list_protocols", "", "list the known segmentation protocols (also: schemes)"),

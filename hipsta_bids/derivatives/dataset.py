@@ -357,7 +357,9 @@ def citation_text(
     PyBIDS and probabilities of labels are in it only if they are used.
     """
     about, body, sheet = TEXTS["methods"], settings.body, settings.sheet
-    titles = "; ".join(f"{one.title} [@seg-{one.name}]" for one in protocols) or "none"
+    titles = (
+        "; ".join(f"{protocol.title} [@seg-{protocol.name}]" for protocol in protocols) or "none"
+    )
     text = about["text"].format(
         version=__version__,
         titles=titles,
@@ -559,7 +561,7 @@ def provenance_of(record: Mapping[str, Any]) -> dict[str, str]:
 
 
 def write_inputs(root: Path, rows: Iterable[Row], *, is_whole: bool = True) -> None:
-    """Write ``inputs.tsv``, an account of what a search found.
+    """Write ``inputs.tsv``, which lists the results of a search.
 
     Rows of earlier searches stay if they are about other participants and this one was not about
     every participant.

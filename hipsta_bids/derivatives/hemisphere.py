@@ -158,7 +158,9 @@ def _write_layers(result: ResultPlace, layers: Sheet) -> None:
 def _numbers(axes: Iterable[str], shape: tuple[int, ...]) -> dict[str, list[str]]:
     """Node numbers of all points of a grid, from 1, last axis fastest."""
     numbers = (index.ravel() + 1 for index in np.indices(shape))
-    return {axis: [str(n) for n in own.tolist()] for axis, own in zip(axes, numbers, strict=True)}
+    return {
+        axis: [str(n) for n in values.tolist()] for axis, values in zip(axes, numbers, strict=True)
+    }
 
 
 def _positions(points: Float) -> dict[str, list[str]]:
@@ -172,7 +174,7 @@ def _truths(values: Bool) -> list[str]:
 
 
 def _formatted(rows: Sequence[Column], values: Mapping[str, Float]) -> dict[str, list[str]]:
-    """Format columns in the catalog's order, each with its own number of decimals."""
+    """Format columns in the catalog's order, each with its number of decimals."""
     return {row.name: format_column(values[row.name], row.digits) for row in rows}
 
 

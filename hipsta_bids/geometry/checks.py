@@ -29,7 +29,7 @@ from hipsta_bids.protocols.protocol import Part, Tissue, lateral_rank
 from hipsta_bids.settings import CheckSettings
 from hipsta_bids.types import Bool, Finding, Flag, Float, Sheet
 
-#: A flag concerns the columns within this distance of what was found, mm.
+#: A flag concerns the columns within this distance of a finding, mm.
 FLAG_REACH = 1.0
 
 #: A cut this near, mm, to both the subiculum and CA2 or CA3 severs but turns that touch.
@@ -341,11 +341,11 @@ def check_labels(body: Body, settings: CheckSettings) -> list[Finding]:
             reason=reason,
             value=value,
             limit=limit,
-            text=what,
+            text=text,
             remedy=remedy,
             points=digital.to_ras(voxels, body.affine),
         )
-        for reason, (value, limit), what, voxels, remedy in rows
+        for reason, (value, limit), text, voxels, remedy in rows
     ]
 
 

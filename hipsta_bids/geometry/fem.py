@@ -32,7 +32,7 @@ class Laplace:
     """The Laplace operator on triangles or tetrahedra; the matrices are made once.
 
     LaPy (Reuter et al. 2006, Computer-Aided Design 38:342-366) makes them. With the solver
-    ``lapy`` it also solves its own equations. ``two-level`` takes less time: it iterates where most
+    ``lapy`` it also solves its equations. ``two-level`` takes less time: it iterates where most
     vertices of a large volume are free, uses the symmetry of matrices, and asks ARPACK for no more
     vectors than it needs, which ``Solver.poisson`` and ``Solver.eigs`` have no options for.
     """

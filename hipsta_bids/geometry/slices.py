@@ -1,6 +1,6 @@
 """Between thick slices: the shape of each slice is moved into the next one.
 
-Where slices are much thicker than their pixels, the ribbon moves sideways by its own thickness from
+Where slices are much thicker than their pixels, the ribbon moves sideways by its thickness from
 one slice to the next, and blending slices in place would break it. Each slice becomes a signed
 distance from its outline (``outlines``); the ribbons of neighboring slices are aligned
 (``ribbon``), or registered where one is none, and the shapes between them are blends of both, moved
@@ -32,7 +32,7 @@ PATH_SMOOTHING = 1.0
 #: Standard deviation of the window of the registration of slices, mm.
 FLOW_WINDOW = 1.0
 #: Added to the mean squared slope in a window, which is 1 where outlines fill it: keeps
-#: displacements small where the outlines do not tell them.
+#: displacements small where the outlines do not show them.
 FLOW_RIDGE = 0.02
 #: Standard deviation of the Gaussian on displacements after each iteration, mm.
 FLOW_SMOOTHING = 0.5
@@ -216,7 +216,7 @@ def has_thick_slices(affine: Float, settings: SliceSettings) -> bool:
 
 def sample_slices(body: Body, points: Float, settings: SliceSettings) -> Stack:
     """Sample the body's mask between and beyond its thick slices, at points (N, 3), RAS mm."""
-    body = _in_own_order(body)
+    body = _in_slice_order(body)
     pixel = float(np.linalg.norm(body.affine[:3, :3], axis=0)[1:].mean())
     labeled = _labeled_ends(body)
     part = _bounds(body, outlines.DISTANCE_REACH / pixel, labeled)
@@ -235,7 +235,7 @@ def sample_slices(body: Body, points: Float, settings: SliceSettings) -> Stack:
     return np.asarray(np.clip(distance / (2 * RAMP_HALF_WIDTH) + 0.5, 0, 1), dtype=np.float32)
 
 
-def _in_own_order(body: Body) -> Body:
+def _in_slice_order(body: Body) -> Body:
     """Count the body's slices from posterior to anterior, first, and voxels from medial to lateral.
 
     So the order in which an image stores its voxels decides nothing. What refers to voxels by their

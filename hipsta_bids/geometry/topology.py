@@ -169,8 +169,8 @@ def _second_choices(field: Field, edits: Sequence[membranes.Edit]) -> Field | No
     """Cut where holes were filled, and fill where bridges were cut, if that was as likely."""
     values = field.values.copy()
     for edit in edits:
-        if edit.rival is not None:
-            nodes = edit.rival - membranes.FIRST
+        if edit.alternative is not None:
+            nodes = edit.alternative - membranes.FIRST
             nodes = nodes[((nodes >= 0) & (nodes < values.shape)).all(axis=1)]
             values[tuple(nodes.T)] = -0.1 if edit.kind == "fill" else 0.1
     return None if np.array_equal(values, field.values) else replace(field, values=values)
@@ -346,13 +346,13 @@ def _describe(
         position=(float(center[0]), float(center[1]), float(center[2])),
         subfield=locate(center[None]),
         excess=float("inf")
-        if edit.doubtful or (kind == "fill" and _beside_slit(inside, field))
+        if edit.doubtful or (kind == "fill" and _touches_slit(inside, field))
         else max(cost / max(limit, 1e-9), 0.0 if kind == "uncus" else len(nodes) / (share * size)),
         points=points,
     )
 
 
-def _beside_slit(nodes: digital.Index, field: Field) -> bool:
+def _touches_slit(nodes: digital.Index, field: Field) -> bool:
     """Whether a hole lies next to a slit between turns, which then went through a wall."""
     if field.separated is None:
         return False
@@ -458,7 +458,7 @@ def _changed_nodes(solid: SolidField, points: Float) -> tuple[Float, Float]:
 
 
 def _cells(points: Float, columns: digital.Index, parts: digital.Index) -> Float:
-    """Interpolate round columns, up to halfway to their neighbors; NaN beside undefined ones."""
+    """Interpolate round columns, up to halfway to their neighbors; NaN next to undefined ones."""
     steps = [np.linspace(-0.5, 0.5, int(n) + 1) for n in parts]
     offsets = np.stack(np.meshgrid(*steps, indexing="ij"), axis=-1).reshape(-1, 2)
     last = np.array(points.shape[:2]) - 1

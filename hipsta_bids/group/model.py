@@ -152,9 +152,9 @@ class Comparison:
     def suffix(self) -> str:
         """The part of names that distinguishes folders of results of one formula."""
         if self.pair:
-            return f"_change-{'-'.join(one.removeprefix('ses-') for one in self.pair)}"
+            return f"_change-{'-'.join(label.removeprefix('ses-') for label in self.pair)}"
         if self.endpoint:
-            return f"_{'-'.join(one.removeprefix('ses-') for one in self.endpoint)}"
+            return f"_{'-'.join(label.removeprefix('ses-') for label in self.endpoint)}"
         return "_longitudinal" if self.longitudinal else ""
 
     @property

@@ -1,6 +1,6 @@
 """Probabilities of labels: which files have them, and whether no label of the sheet lacks one.
 
-They are searched for where a program writes them (``layouts.toml``), and beside the labels as BIDS
+They are searched for where a program writes them (``layouts.toml``), and next to the labels as BIDS
 names them: ``*_hemi-H_*label-LABEL_probseg``, where LABEL is a name, an abbreviation or a code of
 the protocol, or one ``*_hemi-H_*_probseg`` with a volume per label, in the order of ``LabelMap`` in
 its sidecar or of the label table.

@@ -57,7 +57,7 @@ class InputRequest:
     participants_map: Path | None = None
     """Table with the participant and session of each folder."""
     probabilities: str | Path = "never"
-    """``auto`` (beside the labels), ``never``, or the folder that has all probabilities."""
+    """``auto`` (next to the labels), ``never``, or the folder that has all probabilities."""
 
     @property
     def uses_pybids(self) -> bool:
@@ -159,7 +159,7 @@ class HemisphereInput(Hemisphere):
     notes: tuple[str, ...] = ()
     """What a reader should know about this choice."""
     provenance: Mapping[str, str] = field(default_factory=dict, hash=False)
-    """Tool, version and so on, as far as names tell (``PROVENANCE`` of ``derivatives``)."""
+    """Tool, version and so on, as far as names show (``PROVENANCE`` of ``derivatives``)."""
     edits: tuple[Edit, ...] = ()
     """Corrections by a person that take the place of what the files say."""
     ends: tuple[GivenEnd, ...] = ()
@@ -181,7 +181,7 @@ class HemisphereInput(Hemisphere):
         return self.subject, self.hemi, self.protocol.name
 
     def path_of(self, name: str) -> Path:
-        """Return the path of a file that was passed over: beside the labels, or as written."""
+        """Return the path of a file that was passed over: next to the labels, or as written."""
         return self.files[0].parent / name if Path(name).name == name else Path(name)
 
     @property
@@ -221,7 +221,7 @@ _IGNORED = tuple(
 
 
 LAYOUTS = ("freesurfer", "ashs", "hippunfold", "tools", "named")
-"""Kinds of folders that can be searched; ``tools`` are those without an option of their own, and
+"""Kinds of folders that can be searched; ``tools`` are those without a separate option, and
 ``named`` is any ``_hemi-?_..._dseg`` file with names."""
 
 

@@ -3,14 +3,14 @@
 The flow: which datasets to search, and which subjects and sessions they hold (``scan``), which
 files are segmentations (``layouts``; ``freesurfer``, ``ashs`` and ``generic`` have what is
 special), and which of several to take. No image is opened, except where ASHS's atlas
-can only be told from the labels.
+can only be identified from the labels.
 
 A picture of labels on an image from another space misleads, so pages show only these images:
 
 - FreeSurfer: ``norm.mgz``, else ``brain.mgz``, of the same ``mri`` folder;
-- ASHS: the T2-weighted image that it segmented, ``tse.nii.gz`` or one with that ending, beside the
+- ASHS: the T2-weighted image that it segmented, ``tse.nii.gz`` or one with that ending, next to the
   segmentation or in the folder above ``final``;
-- any other: a T1w or T2w image beside the labels or of the same visit in the BIDS dataset, if its
+- any other: a T1w or T2w image next to the labels or of the same visit in the BIDS dataset, if its
   space is that in the name of the labels (HippUnfold's ``space-cropT1w``), or if it has the same
   grid of voxels.
 """
@@ -63,7 +63,7 @@ _LISTED_NAMES = 6
 
 @dataclass(frozen=True, kw_only=True)
 class Findings:
-    """What a search found."""
+    """Results of a search."""
 
     items: tuple[HemisphereInput, ...]
     """Sorted by subject, session, hemisphere, protocol. Some may have a ``problem``."""
@@ -105,7 +105,7 @@ def find_inputs(request: InputRequest) -> Findings:
     selection = make_selection(request)
     option = choose_atlas(request)
     forget_tables()
-    results = _Found()
+    results = _Search()
     sources = scan.list_sources(request, results.unused)
     results.edited = list_edits(request, selection, results.unused)
     for source in sources:
@@ -173,8 +173,8 @@ def _search_notes(
 
 
 @dataclass(kw_only=True)
-class _Found:
-    """What the search has found so far."""
+class _Search:
+    """Results of the search so far."""
 
     items: list[HemisphereInput] = field(default_factory=list)
     edited: list[EditedFile] = field(default_factory=list)
@@ -185,7 +185,7 @@ class _Found:
     def entries(self, sources: Sequence[Source]) -> list[tree.Ignored]:
         """List each entry that was not used once, sorted by path."""
         # What is known about an entry inside of a subject's folder comes first.
-        beside = [entry for entry in self.unused if entry.inside and entry.template]
+        templates = [entry for entry in self.unused if entry.inside and entry.template]
         strays = [entry for entry in self.unused if entry.inside is None]
         missed = [entry for entry in self.unused if entry.inside and not entry.template]
         searched = {os.path.realpath(source.path) for source in sources}
@@ -194,7 +194,7 @@ class _Found:
         for entry in (*missed, *strays):
             entry_of.setdefault((_place(entry.path), entry.hemi), entry)
         listed = map(looked_into, _with_row(entry_of, searched))
-        return sorted(listed, key=lambda entry: (entry.path, entry.hemi or "")) + beside
+        return sorted(listed, key=lambda entry: (entry.path, entry.hemi or "")) + templates
 
 
 def _with_row(
@@ -288,8 +288,10 @@ def sheet_notes(items: Iterable[HemisphereInput]) -> list[str]:
     return notes
 
 
-def _search(source: Source, selection: Selection, option: Protocol | None, results: _Found) -> None:
-    """Search one dataset for all kinds of segmentations, and add the edited files beside them."""
+def _search(
+    source: Source, selection: Selection, option: Protocol | None, results: _Search
+) -> None:
+    """Search one dataset for all kinds of segmentations, and add the edited files next to them."""
     all_folders, strays = source.folders()
     refused = tree.same_labels(all_folders)
     folders = list(filter(selection.wants_folder, all_folders))
@@ -302,12 +304,12 @@ def _search(source: Source, selection: Selection, option: Protocol | None, resul
     closed: list[tree.Ignored] = []
     visits = list(filter(selection.wants_visit, tree.list_visits(folders, closed)))
     results.unused += closed
-    # Folders that cannot be listed have rows of their own, and the parents of sessions need none.
+    # Folders that cannot be listed have separate rows, and the parents of sessions need none.
     explained = {entry.subject for entry in closed} | {
         visit.subject for visit in visits if visit.session
     }
     for visit in visits:
-        results.edited += edits_of_visit(visit, source.path, source.name, beside=True)
+        results.edited += edits_of_visit(visit, source.path, source.name, in_dataset=True)
         visit_context = replace(context, visit=visit)
         items = [item for layout in searched for item in find(layout, visit_context)]
         results.unused += without_side(visit) if "named" in source.layouts else ()
@@ -325,7 +327,7 @@ def _search(source: Source, selection: Selection, option: Protocol | None, resul
 
 
 def _not_fetched(paths: Sequence[Path]) -> InputError | None:
-    """Tell that the content of a file is elsewhere."""
+    """Describe that the content of a file is elsewhere."""
     for path in paths:
         if message := not_fetched(path):
             return InputError(f"{path}: {message}", reason="not-fetched")

@@ -117,7 +117,7 @@ class Verdict:
     problem: HipstaError | None = None
     notes: tuple[str, ...] = ()
     provenance: dict[str, str | None] = field(default_factory=dict)
-    """What the file's name does not tell."""
+    """What the file's name does not show."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -177,7 +177,7 @@ class Context:
         best = files[0]
         verdict = replace(
             verdict,
-            problem=verdict.problem or rivals_problem(files),
+            problem=verdict.problem or ambiguity(files),
             provenance=self.provenance(tool, best) | verdict.provenance,
         )
         return self.input(hemi, verdict, [best.path], passed_over, bilateral=best.hemi is None)
@@ -203,15 +203,15 @@ class Context:
 DESIGNS = ("cross-sectional", "longitudinal")
 
 
-def rivals_problem(files: Sequence[LabelFile]) -> InputError | None:
+def ambiguity(files: Sequence[LabelFile]) -> InputError | None:
     """Refuse to choose between files of which none is better."""
-    rivals = [file.path for file in files if file.rank == files[0].rank]
-    if len(rivals) == 1:
+    equal_files = [file.path for file in files if file.rank == files[0].rank]
+    if len(equal_files) == 1:
         return None
-    folder = Path(os.path.commonpath([path.parent for path in rivals]))
-    names = " and ".join(str(path.relative_to(folder)) for path in rivals)
+    folder = Path(os.path.commonpath([path.parent for path in equal_files]))
+    names = " and ".join(str(path.relative_to(folder)) for path in equal_files)
     remedy = "keep one of them in the subject's folder"
-    if len({path.name for path in rivals}) < len(rivals):
+    if len({path.name for path in equal_files}) < len(equal_files):
         remedy = "name the folder to use with --participants-map"
     elif files[0].traits.get("suffix") == "dseg":
         remedy = "choose by entities with --bids-filter-file"

@@ -87,7 +87,7 @@ class Ignored:
     status: str = NOT_USED
     """Or ``NO_SEGMENTATION``, which nobody misses."""
     quiet: bool = False
-    """For the full account only."""
+    """For the full list only."""
     inside: Path | None = None
     """The subject's folder that it is in, if it is not that itself."""
 
@@ -107,7 +107,7 @@ NO_SUBJECT = "no subject's folder"
 
 
 def no_segmentation(path: Path, reason: str) -> Ignored:
-    """Account for an entry that holds no participant."""
+    """Describe an entry that holds no participant."""
     return Ignored(path=path, reason=reason, status=NO_SEGMENTATION, quiet=True)
 
 
@@ -322,7 +322,7 @@ def _renamed(
 
 
 def _tools_inside(path: Path, *, if_closed: str) -> frozenset[str]:
-    """Tell whose subject's folder it looks like: programs, and ``base`` of longitudinal runs."""
+    """Return programs whose subject's folder it may be, and ``base`` of longitudinal runs."""
     try:
         with os.scandir(path) as entries:
             names = {entry.name for entry in entries}

@@ -424,7 +424,7 @@ def checked_foreign(content: object, kind: type[Table]) -> Table:
 def rounded(value: Any) -> Any:  # noqa: ANN401  (nested lists of numbers)
     """Round numbers to nine digits, in lists and arrays too; null where one is missing."""
     if isinstance(value, (list, np.ndarray)):
-        return [rounded(one) for one in (value if isinstance(value, list) else value.tolist())]
+        return [rounded(entry) for entry in (value if isinstance(value, list) else value.tolist())]
     if isinstance(value, int):
         return value
     return float(f"{value:.9g}") if math.isfinite(value) else None

@@ -55,7 +55,7 @@ EFFECT_TABLE = "phantom_effect.tsv"
 NODES = (41, 21)
 
 #: Of a phantom with a head: digitations at most, and mm of a mean subject: radius of the spiral,
-#: tail, body, and what lies between the body and the hook beside the digitations.
+#: tail, body, and what lies between the body and the hook next to the digitations.
 _MOST_DIGITATIONS, _RADIUS, _TAIL, _BODY, _BEFORE_HOOK = 4, 5.0, 8.0, 15.0, 10.0
 _MOST_SUBJECTS = 10_000
 
@@ -81,7 +81,7 @@ class CohortPlan:
     """One of ``REGIONS``, or ``head`` of a phantom with a head."""
     shift: float = 0.0
     """mm, by which the pattern of the wall and the subfields' borders lie more lateral in the
-    other groups; a method has to tell this from thinning."""
+    other groups; a method has to distinguish this from thinning."""
     seed: int = 0
     kind: str = "spiral"
     """Shape of the cross-section."""
@@ -94,7 +94,7 @@ class CohortPlan:
     hemisphere_sd: float = 0.03
     """mm"""
     offset_sd: float = 0.3
-    """mm, of each subject's own shift along x."""
+    """mm, of each subject's shift along x."""
     age_slope: float = -0.004
     """mm per year."""
     sites: tuple[float, ...] = (0.0, 0.03)
@@ -155,7 +155,7 @@ class Subject:
 
 
 def make_cohort(plan: CohortPlan) -> list[Subject]:
-    """Draw subjects, each with its own random generator: more subjects do not change the first."""
+    """Draw subjects, each with its random generator: more subjects do not change the first."""
     return [_make_subject(plan, number) for number in range(plan.n_subjects)]
 
 
@@ -276,8 +276,14 @@ def write_cohort(
         probabilities=plan.probabilities,
         columns=_columns(plan),
         rows={
-            one.label: (one.group, f"{one.age:.1f}", one.sex, f"{one.icv:.1f}", one.site)
-            for one in subjects
+            subject.label: (
+                subject.group,
+                f"{subject.age:.1f}",
+                subject.sex,
+                f"{subject.icv:.1f}",
+                subject.site,
+            )
+            for subject in subjects
         },
     )
     for item in hemispheres:
@@ -357,7 +363,7 @@ def _write_head_effect(out: Path, plan: CohortPlan) -> None:
     )
     rows = []
     for part in ("tail", "body", "head"):
-        a, b = (one.region_summary(part)["thickness_mean"] for one in (without, planted))
+        a, b = (phantom.region_summary(part)["thickness_mean"] for phantom in (without, planted))
         rows.append([part, str(int(part == "head")), f"{b - a:.5f}"])
     files.write_tsv(out / EFFECT_TABLE, ["part", "in_region", "difference"], rows)
     columns = {

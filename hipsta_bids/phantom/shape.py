@@ -163,7 +163,7 @@ class PhantomSpec:
 
     @property
     def section_bend(self) -> Bend:
-        """Curvature of the mid-curve, with the user's own end values if there are any."""
+        """Curvature of the mid-curve, with the user's end values if there are any."""
         preset = KINDS[self.kind]
         if self.curvature is None:
             return preset
@@ -439,7 +439,7 @@ class Body:
         return np.column_stack([-medial, superior]), w
 
     def _refuse_folds(self) -> None:
-        """Refuse a wall or an axis that is bent more sharply than its own extent allows."""
+        """Refuse a wall or an axis that is bent more sharply than its extent allows."""
         spec = self.spec
         s = np.linspace(0.0, spec.width, 1001)
         sharpest = np.abs(self.curve.curvature(s)).max()

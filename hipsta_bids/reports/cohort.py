@@ -110,7 +110,7 @@ class Cohort:
 
     def values(self, name: HemisphereName, measure: str) -> Float:
         """Collect a number of all hemispheres of the same kind, without NaN."""
-        values = [other.summary.get(measure, np.nan) for other in self.like(name)]
+        values = [hemisphere.summary.get(measure, np.nan) for hemisphere in self.like(name)]
         array = np.array(values, dtype=np.float64)
         return array[np.isfinite(array)]
 
@@ -290,7 +290,7 @@ _NIFTI = (".nii", ".nii.gz")
 def card_of(hemisphere: Hemisphere, cohort: Cohort, views: Views | None) -> Mapping[str, Any]:
     """Collect the head of a hemisphere's page, and its links."""
     key, record = hemisphere.result.name.title, hemisphere.record
-    order = [other.result.name.title for other in cohort.ranking]
+    order = [hemisphere.result.name.title for hemisphere in cohort.ranking]
     n = order.index(key) if key in order else None
     before = cohort.ranking[n - 1] if n else None
     after = cohort.ranking[n + 1] if n is not None and n + 1 < len(order) else None
@@ -320,7 +320,7 @@ def _link(hemisphere: Hemisphere | None, cohort: Cohort) -> tuple[str, str] | No
     title = name.title
     verdict = cohort.verdicts[title].title.lower()
     words = f"sub-{name.subject}{f' ses-{name.session}' if name.session else ''} {hemisphere.side}"
-    if len({other.result.name.protocol for other in cohort.hemispheres}) > 1:
+    if len({hemisphere.result.name.protocol for hemisphere in cohort.hemispheres}) > 1:
         words += " " + " ".join(filter(None, (name.seg, name.region_title)))
     return f"{participant_report(name.subject, name.session)}#{title}", f"{words}: {verdict}"
 
@@ -334,7 +334,7 @@ def open_commands(hemisphere: Hemisphere, anatomy: Path | None = None) -> list[t
     labels, mask = input_path(hemisphere), result.path("body_mask")
     volumes, behind = [], []
     if labels is not None and labels.exists():
-        # Docker's own paths mean nothing outside; Apptainer's are those of the machine.
+        # Docker's paths mean nothing outside; Apptainer's are those of the machine.
         hidden = container_of_process().get("Type") == "docker"
         address = f"LABELS_DIR/{labels.name}" if hidden else _from(result.root, labels)
         volumes.append((address, ":colormap=lut:opacity=0.5"))

@@ -95,7 +95,7 @@ def _analyses(results: GroupResults) -> Mapping[str, Any] | None:
 
 
 def _maps(results: GroupResults) -> Mapping[str, Any] | None:
-    """Show effect maps beside each other, and how far they agree."""
+    """Show effect maps side by side, and how far they agree."""
     table = results.table("agreement")
     columns = ["measure", "hemi", "contrast", "analysis", "other", "r", "dice", "n_significant"]
     text = (
@@ -161,5 +161,5 @@ def comparison_page(folder: Path) -> str:
 
 
 def write_comparison_report(folder: Path) -> None:
-    """Write the page of a comparison, beside its folder."""
+    """Write the page of a comparison, next to its folder."""
     files.write_text(folder.with_name(f"{folder.name}.html"), comparison_page(folder))

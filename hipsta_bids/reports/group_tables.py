@@ -398,9 +398,13 @@ def scores(results: GroupResults) -> Mapping[str, Any] | None:
 def score_rows(table: pd.DataFrame) -> list[tuple[str, str, list[pd.Series]]]:
     """List scores ``w`` by measure and side, of the ``reference`` and of the others."""
     return [
-        (str(measure), str(hemi), [rows.loc[members, "w"].dropna() for members in (known, ~known)])
+        (
+            str(measure),
+            str(hemi),
+            [rows.loc[members, "w"].dropna() for members in (is_known, ~is_known)],
+        )
         for (measure, hemi), rows in table.groupby(["measure", "hemi"], sort=False)
-        for known in [rows["reference"].astype(bool)]
+        for is_known in [rows["reference"].astype(bool)]
     ]
 
 

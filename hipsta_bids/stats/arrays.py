@@ -72,9 +72,9 @@ def sheets_of(maps: Mapping[str, Float], name: str, rows: Bool | Int) -> Float:
     return maps[name][rows]
 
 
-def parts_of_sheets(maps: Mapping[str, Float], name: str, own: Bool | Int) -> Iterator[Float]:
+def parts_of_sheets(maps: Mapping[str, Float], name: str, selected: Bool | Int) -> Iterator[Float]:
     """Take sheets of one map, some at a time; the order is kept."""
-    rows = np.flatnonzero(own) if own.dtype == np.bool_ else own
+    rows = np.flatnonzero(selected) if selected.dtype == np.bool_ else selected
     return (sheets_of(maps, name, rows[part]) for part in blocks(len(rows), SHEETS))
 
 

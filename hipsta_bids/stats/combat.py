@@ -89,7 +89,7 @@ def fit_effects(
     square of the conditional residuals, as the variant MSR of Beer et al. (2020): without effects
     of sites it leaves the values as they are. Every one of the ``n_sites`` has visits. Where
     effects are ``pooled``, points inform each other (empirical Bayes), as points of one map do;
-    else each site's own mean and variance are removed.
+    else each site's mean and variance are removed.
 
     Parameters are NaN at points where missing values leave sites and columns inseparable; moments
     are of residuals before harmonization.
@@ -223,7 +223,7 @@ def _residuals(
 ) -> Iterator[tuple[slice, Float]]:
     """Take what columns and participants explain out of values, at one block of points at a time.
 
-    A participant's own part is the mean of what the model leaves, shrunk as the best linear
+    A participant's part is the mean of what the model leaves, shrunk as the best linear
     unbiased prediction is.
     """
     for part in chunks(values.shape, 4):
@@ -315,4 +315,4 @@ def _pool(n: Float, mean: Float, around: Float, is_informed: Bool) -> tuple[Floa
 
 
 #: Names of the arrays of :class:`SiteEffects`, and those that have one value per point.
-ARRAYS = tuple(one.name for one in fields(SiteEffects))
+ARRAYS = tuple(column.name for column in fields(SiteEffects))

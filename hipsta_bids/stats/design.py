@@ -210,7 +210,7 @@ def _check_matrix(
             f"model: no row has {columns[int(np.argmin(lengths))]!r}; remove it from the formula"
         )
     unit = matrix / lengths
-    # What is left of each unit column beside those before it.
+    # The part of each unit column that is orthogonal to the columns before it.
     remainders = np.abs(np.diag(np.linalg.qr(unit, mode="r")))
     if (remainders < DEPENDENCE).any():
         last = int(np.argmax(remainders < DEPENDENCE))
@@ -223,7 +223,7 @@ def _check_matrix(
 
 
 def _refuse_more_columns(n_columns: int, n_rows: int, settings: DesignSettings) -> None:
-    """Refuse more columns than the rows can tell apart."""
+    """Refuse more columns than the rows can distinguish."""
     if n_rows - n_columns < settings.min_residual_df:
         raise ModelError(
             f"model: {n_rows} complete rows are too few for {n_columns} columns; at least"

@@ -142,7 +142,7 @@ def varies_between(tested: Float, visits: Visits) -> bool:
     An equal curve of time in all of them does not.
     """
     member = visits.classes()[1][:, None] == np.unique(visits.classes()[1])
-    curves = orth(np.hstack([member * one[:, None] for one in _powers(visits, _POWERS)]))
+    curves = orth(np.hstack([member * power[:, None] for power in _powers(visits, _POWERS)]))
     return not all(spans(curves, column) for column in tested.T)
 
 
@@ -214,6 +214,6 @@ def _between(tested: Float, nuisance: Float, visits: Visits, *, changes: bool) -
     common = _powers(visits, _POWERS if changes else 1)
     model = np.column_stack([tested, nuisance])
     conditions: list[Bool | bool] = [
-        spans(nuisance, one) or not spans(model, one) for one in common
+        spans(nuisance, column) or not spans(model, column) for column in common
     ]
     return all(conditions)

@@ -473,7 +473,7 @@ def _levels(values: pd.Series, name: str, settings: DesignSettings) -> list[str]
     check_spelling(counts, name)
     levels = sorted(counts, key=in_order)
     numbers = pd.to_numeric(pd.Series(levels), errors="coerce")
-    codes = [one for one, n in zip(levels, numbers, strict=True) if n in settings.missing_codes]
+    codes = [level for level, n in zip(levels, numbers, strict=True) if n in settings.missing_codes]
     if codes and numbers.isna().any():
         raise ModelError(
             f"model: column {name!r} has {', '.join(f'{code} ({counts[code]})' for code in codes)}"

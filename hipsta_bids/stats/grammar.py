@@ -214,7 +214,7 @@ def _call_end(tokens: Sequence[_Token], start: int) -> int:
 
 
 def _column(text: str, word: str) -> str:
-    """Name of a column; Python's own words have a meaning unless they are quoted."""
+    """Name of a column; Python's words have a meaning unless they are quoted."""
     if keyword.iskeyword(word):
         _refuse(text, word)
     return word.strip("`")

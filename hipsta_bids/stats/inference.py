@@ -100,8 +100,8 @@ def permute(
     groups = [[part] if isinstance(part, PermutationPart) else part for part in parts]
     runs = [_Run(group, contrast, settings, blocks, combine) for group in groups]
     parts_alone = [part for group in groups for part in group]
-    subjects = [one.subjects for one in parts_alone]
-    subjects += [one.visits.people for one in parts_alone if one.visits]
+    subjects = [part.subjects for part in parts_alone]
+    subjects += [part.visits.people for part in parts_alone if part.visits]
     n_subjects = 1 + max(int(numbers.max()) for numbers in subjects)
     batch = min(_BATCH, max(_KEYS // n_subjects, 1))
 
@@ -299,7 +299,7 @@ class _Run:
         """Count (3, points) permutations that reach the observed values."""
         pairs = ((t, self._observed), (highest, self._observed), (highest_enhanced, self._enhanced))
         # Values may be off by rounding.
-        reach = [np.abs(values) >= np.abs(seen) * (1 - _ROUNDING) for values, seen in pairs]
+        reach = [np.abs(values) >= np.abs(observed) * (1 - _ROUNDING) for values, observed in pairs]
         return np.stack([values.sum(axis=0, dtype=np.float64) for values in reach])
 
     def result(self) -> PermutationTest:
@@ -413,7 +413,7 @@ def correct_joint(
         rules = rules.changed(method=_MAXIMUM)
 
     def parts(key: MapKey) -> list[PermutationPart]:
-        return [_part(*one, model, rules) for one in groups[key].values()]
+        return [_part(*members, model, rules) for members in groups[key].values()]
 
     tested = {key: contrasts[key.contrast] for key in groups}
     blocks = row_blocks(model, table, rules)
@@ -491,8 +491,8 @@ def correct(
     """Determine the points that survive, in families."""
     tests = {
         MapKey(measure, test.contrast.name, hemi): test
-        for hemi, one in fitted.items()
-        for measure, fit in one.fits.items()
+        for hemi, side in fitted.items()
+        for measure, fit in side.fits.items()
         for test in fit.tests
     }
     if rules.method not in PERMUTATIONS:

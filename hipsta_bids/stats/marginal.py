@@ -104,7 +104,10 @@ class Terms:
     def _columns_of(self, variables: frozenset[str]) -> list[int]:
         """Return places of the columns of terms with exactly these variables."""
         names = {
-            name for own, columns in self._structures() if own == variables for name in columns
+            name
+            for structure, columns in self._structures()
+            if structure == variables
+            for name in columns
         }
         return [place for place, name in enumerate(self.columns) if name in names]
 
@@ -130,7 +133,7 @@ class Terms:
             return np.eye(size)[[self.names.index(name)]]
         free, fixed = self._free_and_fixed(name, contrast)
         variables = frozenset(free)
-        if variables and not any(variables <= own for own, _ in self._structures()):
+        if variables and not any(variables <= structure for structure, _ in self._structures()):
             raise ModelError(
                 f"contrast {contrast!r}: the formula has no {':'.join(free)}; add the term, or"
                 " contrast something else"

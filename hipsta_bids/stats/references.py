@@ -15,7 +15,7 @@ _NEGATIONS = frozenset(_WORDS["negations"])
 _WHOLE_LEVELS = frozenset(_WORDS["alone"])
 #: Beginnings that negate another level: nondemented, unaffected.
 _NEGATING = ("non", "un", "a")
-_MINUS = re.compile(r"(.+?)\s*[-\u2212\u2013]")  # APOE4- beside APOE4+
+_MINUS = re.compile(r"(.+?)\s*[-\u2212\u2013]")  # APOE4-, if APOE4+ is a level
 
 
 @dataclass(frozen=True)
@@ -96,8 +96,8 @@ def _is_negation(level: str, levels: Sequence[str], spelled: Mapping[str, str]) 
     if _NEGATIONS & set(spelled[level].split()):
         return True
     minus = _MINUS.fullmatch(level.strip())
-    if minus and any(other.replace(" ", "") == f"{minus[1]}+" for other in levels):
+    if minus and any(label.replace(" ", "") == f"{minus[1]}+" for label in levels):
         return True
     whole = spelled[level].replace(" ", "")
     spellings = {text.replace(" ", "") for name, text in spelled.items() if name != level}
-    return any(whole == f"{start}{other}" for start in _NEGATING for other in spellings)
+    return any(whole == f"{start}{spelling}" for start in _NEGATING for spelling in spellings)

@@ -57,7 +57,7 @@ def _shifts(warps: Float) -> Float:
 def register(profiles: Float, settings: RegistrationSettings) -> Registration:
     """Register profiles to a template that is made from them.
 
-    ``registr`` takes turns: each profile is warped onto its own approximation by the mean and
+    ``registr`` takes turns: each profile is warped onto its approximation by the mean and
     the principal components; these are estimated again from the warped profiles (Wrobel et al.
     2018, as in version 2.1.1 of the R package of that name). Unlike R, each profile is first
     standardized (setting ``standardize``; else all are divided by one standard deviation, since

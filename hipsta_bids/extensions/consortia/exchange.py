@@ -383,7 +383,9 @@ def _check_model(analysis: Analysis, settings: GroupSettings) -> None:
             f"with {match[1]}() has other columns at each site; write numbers that are the same"
             " everywhere, as I((age - 65) / 10)"
         )
-    elif not any(one.n_rows == 1 and not one.side for one in analysis.design.contrasts):
+    elif not any(
+        contrast.n_rows == 1 and not contrast.side for contrast in analysis.design.contrasts
+    ):
         problem = "has no two-sided contrast of one row; others cannot be combined"
     if problem is not None:
         raise ModelError(f"--export-summary: a model {problem}")
@@ -444,7 +446,9 @@ def _model(
     """Fit the model where all participants have a value, and spell the results."""
     names = [test.contrast.name for test in tests]
     contrasts = [
-        one for one in design.contrasts if one.n_rows == 1 and not one.side and one.name in names
+        contrast
+        for contrast in design.contrasts
+        if contrast.n_rows == 1 and not contrast.side and contrast.name in names
     ]
     complete = np.isfinite(values).all(axis=0)
     fit = fit_points(np.where(complete, values, 0.0), design.matrix, contrasts, settings.glm)
@@ -457,7 +461,7 @@ def _model(
     return {
         "columns": list(design.columns),
         "df": len(design.matrix) - len(design.columns),
-        "contrasts": {one.name: one.weights[0].tolist() for one in contrasts},
+        "contrasts": {contrast.name: contrast.weights[0].tolist() for contrast in contrasts},
         "sd": known(fit.sigma),
         "estimate": {test.contrast.name: known(test.estimate[0]) for test in fit.tests},
         "se": {test.contrast.name: known(test.se[0]) for test in fit.tests},

@@ -101,7 +101,7 @@ def _columns() -> dict[str, str]:
 
 def _write_maps(folder: Path, meta: Meta) -> None:
     """Write maps of both models as GIFTI and CIFTI, and the sheets to draw them on."""
-    tests = (one for item in meta.of("map") for one in meta.tests(item))
+    tests = (test for item in meta.of("map") for test in meta.tests(item))
     write.write_stats(
         folder, write.stats_of((key, test, meta.discoveries[key]) for key, test, _ in tests)
     )
@@ -138,7 +138,7 @@ def _figures(meta: Meta) -> Iterator[tuple[str, Drawing]]:
     places = grounds_of(cohort, {hemi: _place(meta, hemi, cohort) for hemi in tests})
     like = {item.label(RANDOM): item.label(FIXED) for item in maps}
     for measure in dict.fromkeys(item.model.measures[0] for item in maps):
-        sides = {hemi: one for hemi, one in places.items() if measure in tests[hemi]}
+        sides = {hemi: points for hemi, points in places.items() if measure in tests[hemi]}
         blocks = list(contrasts(tests, measure, like))
         items = [item for item in maps if item.model.measures[0] == measure]
         for number, contrast in enumerate(dict.fromkeys(item.contrast for item in items)):
@@ -271,9 +271,9 @@ def _methods(meta: Meta) -> str:
     )
     paragraphs = [f"{measure_text} {aligned}", effects, errors]
     survivors = [
-        f"- {escaped(f'{key.measure}, {key.contrast}, {key.hemi}')}: {int(found.rejected.sum())} of"
-        f" {found.n_tests} points"
-        for key, found in meta.discoveries.items()
+        f"- {escaped(f'{key.measure}, {key.contrast}, {key.hemi}')}: {int(test.rejected.sum())} of"
+        f" {test.n_tests} points"
+        for key, test in meta.discoveries.items()
     ]
     if survivors:
         paragraphs.append("\n".join(["Significant points after correction:", "", *survivors]))

@@ -247,7 +247,7 @@ def meta_page(folder: Path) -> str:
 
 
 def write_meta_page(out_dir: Path) -> Path:
-    """Write the page of a meta-analysis beside its folder, and return its path."""
+    """Write the page of a meta-analysis next to its folder, and return its path."""
     path = out_dir / REPORT
     files.remove([path])  # it may be that of an earlier one
     files.write_text(path, meta_page(out_dir / FOLDER))

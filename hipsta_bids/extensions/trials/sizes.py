@@ -288,7 +288,7 @@ def repeatability(
     columns = size * ((sessions - grand) ** 2).sum(axis=0) / (k - 1)
     error = (residual**2).sum(axis=(0, 1)) / ((size - 1) * (k - 1))
     usable &= error > 0
-    rows, columns, error = (np.where(usable, one, np.nan) for one in (rows, columns, error))
+    rows, columns, error = (np.where(usable, squares, np.nan) for squares in (rows, columns, error))
     freedom = size * (k - 1)
     within = np.sqrt(((k - 1) * columns + (size - 1) * (k - 1) * error) / freedom)
     tails = np.array([[(1 + confidence) / 2], [(1 - confidence) / 2]])

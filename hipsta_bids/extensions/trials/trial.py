@@ -52,7 +52,7 @@ MAPS: dict[str, tuple[str, str, str]] = {
 }
 #: Months per unit of columns of time with these names.
 _MONTHS = {"years": 12.0, "months": 1.0, "days": 12 / 365.25}
-#: Sessions that tell a participant's change from noise.
+#: Sessions that distinguish a participant's change from noise.
 _SLOPE_SESSIONS = 3
 
 
@@ -94,7 +94,7 @@ class Retested:
         self._table = table[self.complete]
         self.participants = sorted(self._table[PARTICIPANT].unique())
         names = [*[""] * ("" in counts.index), *self.sessions]
-        sessions_text = listed([f"{one or 'without a name'} ({counts[one]})" for one in names])
+        sessions_text = listed([f"{name or 'without a name'} ({counts[name]})" for name in names])
         if len(self.sessions) < 2:  # noqa: PLR2004 -- two sessions
             raise ModelError(
                 f"--retest: there is no second session, only {sessions_text}; measure repeated"
@@ -230,20 +230,22 @@ class Modeled:
         mean = mean_of_known(values, 0)
         people = np.unique(participants.astype(str), return_inverse=True)[1]
         counts = glm.sum_by(people, np.isfinite(values).astype(np.float64))
-        own_means = glm.sum_by(people, np.nan_to_num(values)) / np.where(counts > 0, counts, np.nan)
+        person_means = glm.sum_by(people, np.nan_to_num(values)) / np.where(
+            counts > 0, counts, np.nan
+        )
         plain = trials.Reference(
             n=n,
             mean=mean,
             variance=fit.sigma**2,
             freedom=np.maximum(n - float(len(self.model.design.columns)), 1.0),
-            mean_limits=mean + _reach(own_means, self._settings.glm),
+            mean_limits=mean + _reach(person_means, self._settings.glm),
         )
         if self.time is None:
             return plain
         months = self._table[self.time].iloc[rows].to_numpy(dtype=np.float64) * self.months
         visits = glm.sum_by(people, np.stack([np.ones_like(months), months, months**2], axis=1))
         spreads = visits[:, 2] - visits[:, 1] ** 2 / visits[:, 0]
-        (test,) = (one for one in fit.tests if one.contrast.name == self.time)
+        (test,) = (test for test in fit.tests if test.contrast.name == self.time)
         slope, se = test.estimate[0] / self.months, test.se[0] / self.months
         reach = stats.t.ppf((1 + self._settings.glm.confidence) / 2, test.df) * se
         return replace(
@@ -281,7 +283,7 @@ def _reach(means: Float, settings: GlmSettings | RetestSettings) -> Float:
 
 
 def _check_times(table: pd.DataFrame, time: str | None, settings: GroupSettings) -> None:
-    """Refuse a reference in which change cannot be told from noise."""
+    """Refuse a reference in which change cannot be distinguished from noise."""
     if time is None:
         raise ModelError(
             "--power with --visits needs the time of each session of the reference: a column"

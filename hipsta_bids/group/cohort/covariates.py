@@ -72,7 +72,7 @@ def read_covariates(
     """Join covariates to visits; cells stay text. Also who is not in participants.tsv.
 
     In this order: ``participants.tsv``, ``sessions.tsv`` of the participants, ``phenotype/*.tsv``,
-    and the user's own tables. A later table fills or replaces columns of the same name. Columns
+    and the user's tables. A later table fills or replaces columns of the same name. Columns
     whose ``Levels`` a sidecar lists are factors, with the names of the levels instead of numbers.
     """
     joined = visits.copy()
@@ -332,16 +332,16 @@ def add_icv(
 
 
 def read_icv(sources: Sequence[str], roots: Sequence[Path]) -> list[float | None]:
-    """Intracranial volumes in mm^3 as the segmentations' own programs estimated them.
+    """Intracranial volumes in mm^3 as the segmentations' programs estimated them.
 
-    FreeSurfer's ``stats/aseg.stats`` (EstimatedTotalIntraCranialVol) beside the ``mri`` folder, or
-    ASHS's ``*_icv.txt`` beside or above the segmentation.
+    FreeSurfer's ``stats/aseg.stats`` (EstimatedTotalIntraCranialVol) next to the ``mri`` folder, or
+    ASHS's ``*_icv.txt`` next to or above the segmentation.
     """
     paths = locate_sources(sources, roots)
-    return [None if path is None else _icv_beside(path) for path in paths]
+    return [None if path is None else _icv_of(path) for path in paths]
 
 
-def _icv_beside(path: Path) -> float | None:
+def _icv_of(path: Path) -> float | None:
     stats = path.parent.parent / "stats" / "aseg.stats"
     if stats.exists():
         for line in _read_text(stats).splitlines():

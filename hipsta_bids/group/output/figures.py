@@ -167,32 +167,32 @@ def _draw_pairs(
     width: float | None = None,
     **options: Any,  # noqa: ANN401  (of matplotlib)
 ) -> "list[Figure]":
-    """Draw a row for each pair of groups, with its legend beside it: the first added measure."""
+    """Draw a row for each pair of groups, with its legend next to it: the first added measure."""
     first = _first_added(curves)
     n = max(map(len, first.values()))
     width = width or (style.TWO_COLUMNS if n > 1 else style.ONE_COLUMN)
-    beside = n == 1 or width > style.ONE_COLUMN  # is the legend
-    side = (width - 6.0) / (n + beside)
-    letters = int((side if beside else width - 12.0) / (0.22 * style.SMALL))
+    legend_right = n == 1 or width > style.ONE_COLUMN  # is the legend
+    side = (width - 6.0) / (n + legend_right)
+    letters = int((side if legend_right else width - 12.0) / (0.22 * style.SMALL))
     legends = {pair: _legend(pair, by_side, title, letters) for pair, by_side in first.items()}
     lines = max("\n".join(legend).count("\n") + 1 for legend in legends.values())
     text = 18.0 + 3.2 * lines
     n_rows, height, ratios = 1, max(side + 13, text), None
-    if not beside:
+    if not legend_right:
         n_rows, height, ratios = 2, side + 13 + text, [side + 13, text] * len(first)
-    shape = n_rows * len(first), n + beside
+    shape = n_rows * len(first), n + legend_right
     figure, axes = style.new_panels(*shape, (width, len(first) * height), ratios)
     for number, (pair, by_side) in enumerate(first.items()):
         row, *below = axes[n_rows * number : n_rows * (number + 1)]
         for axis, (hemi, side_curves) in zip(row, by_side.items(), strict=False):
             _draw_curves(axis, side_curves, options)
-            axis.set_title(_sides_name(hemi), loc="center" if beside else "right")
+            axis.set_title(_sides_name(hemi), loc="center" if legend_right else "right")
             axis.set(xlabel=labels[0], aspect="equal")
         row[0].set_ylabel(labels[1])
         empty = [*row[len(by_side) :], *chain(*below)]
         for axis in empty:
             axis.set_axis_off()
-        _add_legend(row[-1] if beside else empty[-n], legends[pair])
+        _add_legend(row[-1] if legend_right else empty[-n], legends[pair])
     style.letter_panels([axis for axis in axes.flat if axis.axison])
     return [figure]
 
@@ -317,7 +317,7 @@ def draw_sections(
     places = {name: round(share * last) for share, name in _SECTIONS.items()}
     if (parts := parts_of(cohort.y)) is not None:
         named = {name: np.flatnonzero(parts == name) for name in ("tail", "body", "head")}
-        places = {name: int(np.median(own)) for name, own in named.items() if len(own)}
+        places = {name: int(np.median(counts)) for name, counts in named.items() if len(counts)}
     figure, axes = style.new_panels(len(shapes), len(places), (style.TWO_COLUMNS, 55 * len(shapes)))
     for i, (hemi, shape) in enumerate(shapes.items()):
         for j, (name, node) in enumerate(places.items()):
@@ -484,14 +484,14 @@ def deviation_rows(scored: Mapping[str, ScoredMaps], measure: str) -> Iterator[p
         for hemi, side in scored.items()
         if measure in side.scores
     }
-    means = {hemi: mean_of_known(own, 0) for hemi, own in z.items()}
+    means = {hemi: mean_of_known(values, 0) for hemi, values in z.items()}
     below = _LOW
     low = {
-        hemi: 100 * mean_of_known(np.where(np.isfinite(own), own < below, np.nan), 0)
-        for hemi, own in z.items()
+        hemi: 100 * mean_of_known(np.where(np.isfinite(values), values < below, np.nan), 0)
+        for hemi, values in z.items()
     }
-    reach = max(1.0, *(np.nanmax(np.abs(one), initial=0.0) for one in means.values()))
-    highest = max(20.0, *(np.nanmax(one, initial=0.0) for one in low.values()))
+    reach = max(1.0, *(np.nanmax(np.abs(mean), initial=0.0) for mean in means.values()))
+    highest = max(20.0, *(np.nanmax(share, initial=0.0) for share in low.values()))
     for kind, title, label, colors, ends, values in (
         ("effect", "Mean deviation", "mean z", "RdBu_r", (-reach, reach), means),
         ("error", "Below the 5th centile", "participants [%]", "magma", (0.0, highest), low),
@@ -515,7 +515,7 @@ def draw_figures(
         yield f"{measure}_maps", partial(draw_measure, saved, measure, views, dpi)
     yield from _site_figures(cohorts, analyses)
     analysis = analyses[SHEET]
-    templates = [one.template for one in analysis.registrations.values()]
+    templates = [registration.template for registration in analysis.registrations.values()]
     if templates and None not in templates:
         yield "registration", partial(draw_registration, saved)
     unregistered = {key.measure for key in analysis.unregistered}

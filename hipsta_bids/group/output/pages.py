@@ -21,7 +21,7 @@ def write_page(out_dir: Path, name: str, *, reports: bool) -> tuple[Path | None,
 
 
 def write_comparison_page(folder: Path, *, reports: bool) -> None:
-    """Write the page of a comparison beside its folder."""
+    """Write the page of a comparison next to its folder."""
     files.remove([folder.with_name(f"{folder.name}.html")])  # it may be that of an earlier one
     if reports:
         write_comparison_report(folder)

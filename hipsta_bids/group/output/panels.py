@@ -16,7 +16,7 @@ from hipsta_bids.group.output import style
 from hipsta_bids.group.output.color_bar import Scale, draw_bar
 from hipsta_bids.group.output.ground import Ground, beyond, middles_of
 from hipsta_bids.group.output.style import DOTS_PER_INCH, LETTER, MM, SMALL, TITLE
-from hipsta_bids.group.output.views import View, across, draw_mesh, laid_out, look
+from hipsta_bids.group.output.views import View, across, draw_mesh, flat_layout, look
 from hipsta_bids.reports.display import X_ENDS, Y_ENDS
 from hipsta_bids.reports.group_maps import map_id
 from hipsta_bids.reports.maps import new_figure
@@ -149,7 +149,7 @@ def draw_view(
     colors[~np.isfinite(pixels)] = _UNKNOWN
     if survive is not None:
         inside = view.region(survive.ravel().astype(np.int64), 1)
-        borders = borders | view.border(inside, style.FOUND_LINE * point)
+        borders = borders | view.border(inside, style.SIGNIFICANT_LINE * point)
     return view.picture(colors, borders)
 
 
@@ -221,7 +221,7 @@ def _surfaces(
 
 
 def _unfolded_column(hemi: str, ground: Ground, left: float, width: float) -> _Column:
-    ends = X_ENDS if ground.mesh is None else laid_out(ground.mesh)[1]
+    ends = X_ENDS if ground.mesh is None else flat_layout(ground.mesh)[1]
     box = round(left), round(width)
     return _Column(hemi=hemi, ground=ground, box=box, title="unfolded", ends=ends)
 
@@ -233,7 +233,7 @@ def _view_columns(
     left: float,
     viewer: _Viewer,
 ) -> Iterator[_Column]:
-    """Place the views of a surface beside each other, from ``left``, pixels."""
+    """Place the views of a surface side by side, from ``left``, pixels."""
     mesh, axes_of = surface
     medial, lateral = (f"{word[:3]}." for word in X_ENDS)
     for title, axes in axes_of.items():
@@ -261,7 +261,7 @@ def _draw_rows(
     if n_flat and _VIEW_WIDTH * widest(2) < _LEAST_VIEW:
         surfaces = {}
     unit = widest(2 * bool(surfaces))
-    upright = _UPRIGHT if all(parts_of(one.y) is None for one in sides.values()) else _LONG
+    upright = _UPRIGHT if all(parts_of(ground.y) is None for ground in sides.values()) else _LONG
     feet = _feet_height(sides, unit)
     tallest = (_TALLEST - _TOP - feet) / len(rows) - _HEAD
     unit = min(unit, max(tallest, _LEAST_VIEW / _VIEW_WIDTH))
@@ -485,11 +485,11 @@ def _enclose(axes: "Axes", ground: Ground, survive: Bool) -> None:
     """Draw a line round the points that survive."""
     if not survive.any():
         return
-    line: Any = {"levels": [_HALF], "colors": "black", "linewidths": style.FOUND_LINE}
+    line: Any = {"levels": [_HALF], "colors": "black", "linewidths": style.SIGNIFICANT_LINE}
     if ground.mesh is not None:
         from matplotlib.tri import Triangulation  # noqa: PLC0415  (slow to load)
 
-        plane = laid_out(ground.mesh)[0]
+        plane = flat_layout(ground.mesh)[0]
         grid = Triangulation(plane[:, 0], plane[:, 1], ground.mesh.triangles)
         axes.tricontour(grid, survive.ravel().astype(np.float64), **line)
         return

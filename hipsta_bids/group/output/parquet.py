@@ -51,7 +51,7 @@ def write_maps(
             fields.append(pa.field(f"subfield{suffix}", _WORD, metadata={"description": text}))
         fields += [_number(f"{name}{suffix}", cohorts[SHEET], name, text) for name in measures]
     fields += [
-        _number(name, one, name, "as given") for name, one in cohorts.items() if name != SHEET
+        _number(name, cohort, name, "as given") for name, cohort in cohorts.items() if name != SHEET
     ]
     about = {
         "description": "one row per visit, hemisphere and point; x medial to lateral, "
@@ -71,7 +71,11 @@ def _write(path: Path, schema: pa.Schema, rows: Iterable[Columns]) -> None:
 
     Measured values hardly repeat: a dictionary of them takes longer than it saves.
     """
-    repeated = [one.name for one in schema if one.name in "xy" or not pa.types.is_float32(one.type)]
+    repeated = [
+        column.name
+        for column in schema
+        if column.name in "xy" or not pa.types.is_float32(column.type)
+    ]
     try:
         with pq.ParquetWriter(path, schema, compression="zstd", use_dictionary=repeated) as writer:
             for columns in rows:
@@ -104,8 +108,8 @@ def _map_blocks(
                 if surface == SHEET:
                     for suffix, state in zip(_SUFFIXES, states, strict=False):
                         columns[f"subfield{suffix}"] = _subfields(state[hemi], part)
-                        own_maps = some_sheets(state[hemi].maps, part)
-                        columns |= _value_columns(own_maps, slice(None), suffix)
+                        sheet_maps = some_sheets(state[hemi].maps, part)
+                        columns |= _value_columns(sheet_maps, slice(None), suffix)
                 else:
                     columns |= _value_columns(side.maps, part)
                 yield columns
@@ -172,7 +176,7 @@ def write_scores(
         {
             **_visit_columns(table, side.rows[part], shape[0] * shape[1], hemi=hemi),
             **_node_columns(cohort, shape, len(side.rows[part])),
-            **_value_columns({n: one.w for n, one in side.scores.items()}, part, f"_{letter}"),
+            **_value_columns({n: score.w for n, score in side.scores.items()}, part, f"_{letter}"),
         }
         for hemi, side in sides.items()
         for part in blocks(len(side.rows), _ROWS_OF_SCORES)

@@ -1,4 +1,4 @@
-"""What an analysis found: the values that tables, figures and pages are made of."""
+"""Results of an analysis: the values that tables, figures and pages are made of."""
 
 import hashlib
 import json
@@ -99,7 +99,11 @@ class ScoredMaps:
 
 def templates_of(registrations: Mapping[str, alignment.Registration]) -> dict[str, Any] | None:
     """Write the templates of registration for ``template.json``; ``None`` without registration."""
-    templates = {hemi: one.template for hemi, one in registrations.items() if one.template}
+    templates = {
+        hemi: registration.template
+        for hemi, registration in registrations.items()
+        if registration.template
+    }
     return templates_to_json(templates) if templates else None
 
 
@@ -218,7 +222,7 @@ def effects_of(parts: Sequence[Harmonization], templates: Mapping[str, str]) -> 
         formula=plan.formula,
         levels={name: list(levels) for name, levels in plan.levels.items()},
         columns=list(plan.names),
-        sites={one: known_sites.get(one, plan.counts.get(one, 0)) for one in plan.sites},
+        sites={site: known_sites.get(site, plan.counts.get(site, 0)) for site in plan.sites},
         repeated=plan.visits.participant is not None,
         icv=plan.icv,
         templates=dict(templates),

@@ -21,7 +21,7 @@ from hipsta_bids.types import SIDES
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-#: Numbers that are compared: of single slices, and of the sheet beside them.
+#: Numbers that are compared: of single slices, and of the whole sheet.
 _NUMBERS = ("thickness", "thickness_mesh")
 
 

@@ -259,9 +259,9 @@ def stats_of(
         key: {
             test.kind: test.statistic,
             **({"d": test.cohen_d} if test.kind == "t" else {"eta2": test.eta_squared}),
-            "pcorrected": found.adjusted,
+            "pcorrected": discoveries.adjusted,
         }
-        for key, test, found in tested
+        for key, test, discoveries in tested
     }
 
 
@@ -320,7 +320,9 @@ def write_stats(folder: Path, maps: Mapping[MapKey, _Stats], about: _About | Non
             grouped.setdefault(name, {})[key.hemi] = stats
     for name, sides in grouped.items():
         names = list(next(iter(sides.values())))
-        stacked = {hemi: np.stack([own[stat] for stat in names]) for hemi, own in sides.items()}
+        stacked = {
+            hemi: np.stack([values[stat] for stat in names]) for hemi, values in sides.items()
+        }
         files.write_bytes(folder / f"{name}.dscalar.nii", gifti.cifti_bytes(stacked, names))
 
 
