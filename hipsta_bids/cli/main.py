@@ -121,7 +121,7 @@ def _terminable() -> Iterator[None]:
 
 
 def _dispatch(arguments: list[str]) -> ExitCode:
-    """Tell the other commands from the BIDS App, whose dataset may be called like one of them."""
+    """Distinguish commands from the BIDS App, whose dataset may have the name of a command."""
     if _DESCRIPTOR in arguments:
         echo((files("hipsta_bids.cli") / "descriptor.json").read_text(encoding="utf-8").rstrip())
         return ExitCode.OK

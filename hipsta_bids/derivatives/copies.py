@@ -1,4 +1,4 @@
-"""Labels that occur twice in an output dataset: found by hashes of quality records, and marked."""
+"""Labels that occur twice in an output dataset, by hashes of quality records."""
 
 import contextlib
 from collections.abc import Iterable, Mapping, Sequence

@@ -1,8 +1,8 @@
 """What must hold before a map is written, and what a person should look at.
 
 Labels with noise or thin gaps, cross-sections that do not resemble their neighbors, and coordinates
-that contradict the labels. What the sheet itself shows is in ``sheet_checks``. What checks found
-becomes flags here, with their place and what they mean for the map.
+that contradict the labels. What the sheet itself shows is in ``sheet_checks``. Findings
+become flags here, with their place and what they mean for the map.
 """
 
 from collections.abc import Callable, Sequence

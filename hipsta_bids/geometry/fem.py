@@ -132,7 +132,7 @@ class Laplace:
     def first_near(self, values: Float, similar: "Laplace") -> Float:
         """Compute the first eigenfunction (V,), roughly, from a similar operator's.
 
-        The other one's factors take the place of its own (LOBPCG: Knyazev 2001, SIAM J Sci Comput
+        The factors of the other operator are used (LOBPCG: Knyazev 2001, SIAM J Sci Comput
         23:517-541).
         """
         matrix, mass = self._fem.stiffness, self._fem.mass

@@ -205,7 +205,7 @@ def tetrahedralize(
 
     TetGen: Si 2015, ACM Trans Math Softw 41:11. ``nobisect`` keeps the surface as it is, so that
     boundary sets of the surface are valid in the volume. TetGen makes other meshes of the
-    same surface elsewhere, or of its mirror image: it gets the surface in the body's own ``frame``
+    same surface elsewhere, or of its mirror image: it gets the surface in the ``frame`` of the body
     (3, 3), which may be left-handed.
     """
     axes = np.eye(3) if frame is None else frame
@@ -273,7 +273,7 @@ def tetra_volumes(vertices: Float, tetrahedra: Int) -> Float:
 
 
 def cross(a: Float, b: Float) -> Float:
-    """Cross products of the rows of (N, 3) arrays, in half the time of NumPy's own."""
+    """Cross products of the rows of (N, 3) arrays, in half the time of NumPy."""
     return np.column_stack(
         [
             a[:, 1] * b[:, 2] - a[:, 2] * b[:, 1],

@@ -115,7 +115,7 @@ def is_flipped(sheet: Sheet, hemi: str) -> bool:
 
 
 def check_flipped(sheet: Sheet, hemi: str) -> Finding:
-    """Flag a sheet whose interior side, found by labels, does not fit its hemisphere."""
+    """Flag a sheet whose interior side, by labels, does not fit its hemisphere."""
     return Finding(
         reason="side-doubtful",
         value=float(is_flipped(sheet, hemi)),

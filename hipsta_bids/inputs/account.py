@@ -34,7 +34,7 @@ _DEPTH, _MOST_ENTRIES = 5, 3000
 
 
 def selection_table(items: Iterable[HemisphereInput]) -> list[dict[str, str]]:
-    """Describe the segmentations found and the reasons, one row per hemisphere and protocol."""
+    """Describe the selected segmentations with reasons, one row per hemisphere and protocol."""
     return [
         {
             "subject": item.subject,

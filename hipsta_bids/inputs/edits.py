@@ -44,7 +44,7 @@ class EditedFile(Visit):
 
     edit: scan.Edit
     in_dataset: bool
-    """Found in a dataset of segmentations, not in the folder of edits."""
+    """Whether it is in a dataset of segmentations, not in the folder of edits."""
 
     @property
     def names(self) -> dict[str, str]:

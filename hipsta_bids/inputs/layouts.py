@@ -175,7 +175,7 @@ def _scaled(file: LabelFile) -> bool:
 
 
 def _unfold_rank(file: LabelFile, _: Context) -> tuple[Any, ...]:
-    """Rank the finest grid in the subject's space (``space-crop*``), then the image's own."""
+    """Rank the finest grid in the subject's space (``space-crop*``), then that of the image."""
     atlas = file.traits.get("atlas")
     index = _ATLASES.index(atlas) if atlas in _ATLASES else len(_ATLASES)
     return _scaled(file), index, not _cropped(file)
@@ -267,7 +267,7 @@ def atlas_finder(context: Context) -> ashs.AtlasFinder:
     return ashs.AtlasFinder(context.source.path, context.atlas, sample)
 
 
-#: What programs do in ways of their own.
+#: Steps that differ between programs.
 _SPECIAL: dict[str, dict[str, Any]] = {
     "freesurfer": {"choose": freesurfer.choose_run},
     "ashs": {"rank": _ashs_rank, "reason": _ashs_reason, "protocol": _ashs_protocol},

@@ -17,7 +17,7 @@ from hipsta_bids.io.files import MISSING
 from hipsta_bids.protocols.protocol import Protocol, Tissue
 from hipsta_bids.types import GivenEnd, Hemisphere
 
-# What is asked for, and what was found: the values that the search for inputs works with.
+# Values of the search for inputs: requests and results.
 
 
 #: Hemispheres as BIDS spells them.
@@ -155,7 +155,7 @@ class HemisphereInput(Hemisphere):
     passed_over: tuple[tuple[str, str], ...] = ()
     """Other files of this hemisphere and why they were not taken."""
     problem: HipstaError | None = None
-    """Found, but not usable: this hemisphere fails, the others go on."""
+    """Why it is not usable: this hemisphere fails, the others go on."""
     notes: tuple[str, ...] = ()
     """What a reader should know about this choice."""
     provenance: Mapping[str, str] = field(default_factory=dict, hash=False)
@@ -232,9 +232,9 @@ class Source:
     name: str
     path: Path
     explicit: bool
-    """Given by the user, not found by default."""
+    """Given by the user, not by default."""
     origin: str = ""
-    """Where it was found by default: ``derivatives`` or ``sourcedata``."""
+    """Its folder if searched by default: ``derivatives`` or ``sourcedata``."""
     layouts: tuple[str, ...] = LAYOUTS
     """Kinds of segmentation to look for here."""
     generators: Mapping[str, str] = field(default_factory=dict)
@@ -262,7 +262,7 @@ def list_sources(
     ``--hippunfold-dir``), then ``BIDS_DIR/derivatives``, ``BIDS_DIR/sourcedata``, and ``BIDS_DIR``
     itself where it is a derivative dataset. Folders of these that hold no ``sub-*`` are searched
     two levels down, and ``sourcedata`` inside of derivatives too (fMRIPrep keeps FreeSurfer's
-    folder there). Our own outputs are excluded. What cannot be listed, unless the user named it,
+    folder there). Outputs are excluded. What cannot be listed, unless the user named it,
     and what looks like a subject outside of these datasets is added to ``ignored``.
     """
     sources: dict[Path, Source] = {}

@@ -492,7 +492,7 @@ def _named(labels: Path, hemisphere: Hemisphere, folders: tuple[Path, ...]) -> I
                 and pairs.get("sub", hemisphere.subject) == hemisphere.subject
                 and pairs.get("ses", hemisphere.session) == hemisphere.session
             ):
-                # An image whose name has no space is in its own.
+                # An image whose name has no space defines one.
                 image_space = pairs.get("space", pairs["suffix"])
                 images.append((folder / name, image_space, pairs["suffix"]))
     counts = Counter((path.parent, image_space) for path, image_space, _ in images)

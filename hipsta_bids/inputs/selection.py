@@ -1,4 +1,4 @@
-"""Which of what is found is wanted, by options and the filter file, and which of several files."""
+"""Selection of inputs by options and the filter file, and choice among several files."""
 
 import difflib
 import json

@@ -93,7 +93,7 @@ class PhantomSpec:
     kind: str = "spiral"
     """One of ``KINDS``: how the cross-section bends."""
     curvature: tuple[float, float] | None = None
-    """1/mm at the medial and the lateral end, in place of the kind's own."""
+    """1/mm at the medial and the lateral end, in place of those of the kind."""
     thickness: Annotated[float, (0.1, 10.0)] = 2.0
     """mm, mean over the sheet."""
     variation: Annotated[float, (0.0, 0.9)] = 0.0
@@ -460,7 +460,7 @@ class Body:
         """Refuse a wall of which one turn runs into another.
 
         Two turns overlap exactly if, from a boundary point of one, some other point of the
-        mid-curve is nearer than its own, or as near where they coincide.
+        mid-curve is nearer than the one it belongs to, or as near where they coincide.
         """
         u, v = np.meshgrid(np.linspace(0.0, 1.0, 801), np.linspace(0.0, 1.0, 5), indexing="ij")
         half = self.thickness(u, v).ravel() / 2.0

@@ -1,4 +1,4 @@
-"""The page about one analysis: what it found and where, in whom, and how."""
+"""The page about one analysis: results, places, participants and methods."""
 
 import base64
 import contextlib

@@ -15,7 +15,7 @@ from hipsta_bids.types import DIFFERENCE, FAMILY, JOINT, SIDES, p_text
 
 _ALPHA = 0.05  # of tests of summary measures and of models, for a word only
 _LEAST_SHARE = 0.01  # share of a map; what survives in less of it is no finding of the same rank
-_VISIBLE_ROWS = 12  # of summary measures in what was found; more are folded
+_VISIBLE_ROWS = 12  # of summary measures among the findings; more are folded
 _MOST_ROWS = 200  # of lists, so that pages stay small
 #: Summary measures of the thickness of the whole sheet.
 _THICKNESS = ("thickness_mean", "thickness_nodes")

@@ -151,7 +151,7 @@ class Hemisphere:
 
     @property
     def protocol(self) -> Protocol | None:
-        """Its protocol; ``None`` if that is not one of the package's own."""
+        """Its protocol; ``None`` if the package does not have it."""
         name = str(self.record.get("scheme", ""))
         try:
             return load_protocol(name) if name in protocol_names() else None

@@ -19,7 +19,7 @@ Key = tuple[str, str]
 #: More sheets of a side are kept in single precision, whose rounding is less than a hundredth of
 #: that of the tables, and registered whenever they are asked for, to save memory.
 MOST_KEPT = 10_000
-#: Sheets in memory at once, where each counts on its own.
+#: Sheets in memory at once, where each is processed alone.
 SHEETS = 4000
 
 

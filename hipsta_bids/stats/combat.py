@@ -177,7 +177,7 @@ def extend_effects(
 def harmonize(values: Float, visits: Visits, effects: SiteEffects) -> Float:
     """Take shifts and scales of sites out of values (visits, points).
 
-    What the columns explain stays, and with repeated sessions what participants have of their own.
+    What the columns explain stays, and with repeated sessions the effects of participants.
     Visits without a site or column are NaN.
     """
     rows = np.flatnonzero(visits.site >= 0)

@@ -20,7 +20,7 @@ from hipsta_bids.stats.references import references_note
 from hipsta_bids.stats.settings import DefaultModelSettings, DesignSettings
 from hipsta_bids.types import PARTICIPANT, Float, Int64
 
-#: A column is a combination of other columns if less than this fraction of its length is its own.
+#: A column is a combination of other columns if a smaller share is orthogonal to these.
 DEPENDENCE = 1e-9
 #: Age at the first visit, where that of each visit is known.
 FIRST_AGE = "age_first"

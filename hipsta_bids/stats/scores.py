@@ -53,7 +53,7 @@ def w_scores(maps: Float, matrix: Float, reference: Bool, settings: GlmSettings)
         leverage = np.einsum("psi,si->sp", rotated @ inverse, rotated)
         residuals = values - rotated @ fit.scores.T
         df = np.where(np.isfinite(fit.sigma), fit.n - basis.shape[1], np.nan) - member
-        # A subject that alone determines a coefficient cannot be told without it.
+        # A subject that alone determines a coefficient cannot be predicted without it.
         left = np.where(member, 1 - leverage, 1.0)
         left[left <= np.sqrt(np.finfo(np.float64).eps)] = np.nan
         # Of members, the variance without themselves.

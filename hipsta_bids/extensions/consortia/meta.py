@@ -230,7 +230,7 @@ def _random_effects(method: str, cite: Citations) -> str:
 
 
 def _methods(meta: Meta) -> str:
-    """Return what was done and what was found."""
+    """Return methods and results."""
     rules, sites = meta.settings.meta, meta.sites
     cite = Citations()
     counts = Counter[str]()

@@ -19,7 +19,7 @@ from hipsta_bids.reports.group_tables import map_unit
 from hipsta_bids.reports.page import Section, build_sections, render
 from hipsta_bids.types import SIDES, p_text
 
-#: Folder and page, in an output folder of their own.
+#: Folder and page, in a separate output folder.
 FOLDER, REPORT = "meta", "meta.html"
 _PREFIX = "meta"
 #: Forest plots of summary measures on the page; all are in the table.

@@ -1,4 +1,4 @@
-"""Templates of an analysis as a BIDS dataset of their own, which other studies can name."""
+"""Templates of an analysis as a separate BIDS dataset, which other studies can name."""
 
 import re
 from pathlib import Path
