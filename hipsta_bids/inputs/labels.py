@@ -42,7 +42,7 @@ def read_label_volume(item: HemisphereInput, region: str = "body") -> LabelVolum
 
     The volume is cropped to the hippocampal labels, and the cortical ones of the region, plus 5 mm
     on each side, as far as the image extends; with the shares of voxels, if it has probabilities.
-    The affine is that of the image, moved by the crop:
+    The affine of the image is moved by the crop:
     scanner RAS for MGZ, sform before qform for NIfTI. A NIfTI without either has no known left and
     right, and is refused. Labels and masks edited by hand are separate files, on any grid.
 
@@ -217,8 +217,7 @@ def label_values(path: Path) -> frozenset[int]:
 
 def _empty(path: Path) -> InputError:
     return InputError(
-        f"{path}: all labels are zero; check that the segmentation finished",
-        reason="empty-labels",
+        f"{path}: all labels are zero; check that the segmentation finished", reason="empty-labels"
     )
 
 

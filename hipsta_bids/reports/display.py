@@ -231,7 +231,7 @@ def subfield_title(name: str) -> str:
 
 
 def palette(protocol: Protocol | None, names: Sequence[str]) -> dict[str, str]:
-    """Choose the colors of subfields: those of the protocol, of the body where parts differ."""
+    """Choose the colors of subfields by the protocol, of the body where parts differ."""
     labels = protocol.labels if protocol is not None else ()
     colors = {
         label.abbreviation or label.name: label.color
