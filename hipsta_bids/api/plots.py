@@ -298,9 +298,7 @@ def _sheet(data: Measurement | xr.Dataset, columns: dict[str, Float]) -> SheetTa
 
 
 def _bare_sheet(
-    columns: dict[str, Float],
-    state: dict[str, NDArray[Any]],
-    ends: tuple[int, int] | None = None,
+    columns: dict[str, Float], state: dict[str, NDArray[Any]], ends: tuple[int, int] | None = None
 ) -> SheetTable:
     """Make a sheet without positions, whose columns are valid unless the state says otherwise."""
     shape = next(iter(columns.values())).shape

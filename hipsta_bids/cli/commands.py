@@ -268,11 +268,7 @@ def run_replicate(arguments: Sequence[str]) -> ExitCode:
 
 
 #: Options of ``figure`` that have another name than its arguments in Python.
-_FIGURE_OPTIONS = {
-    "file": "output",
-    "participant": "participant-label",
-    "session": "session-label",
-}
+_FIGURE_OPTIONS = {"file": "output", "participant": "participant-label", "session": "session-label"}
 
 
 def draw_figure(arguments: Sequence[str]) -> ExitCode:
@@ -360,5 +356,5 @@ def run_validation(arguments: Sequence[str]) -> ExitCode:
     """Refuse, as validation is no part of the package; takes any arguments."""
     raise UsageError(
         "validate: run it from a checkout of hipsta_bids, by `make validation` or"
-        f" `{' '.join(('python -m validation', *arguments))}`",
+        f" `{' '.join(('python -m validation', *arguments))}`"
     )

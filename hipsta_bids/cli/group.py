@@ -478,10 +478,7 @@ def _settings(parsed: argparse.Namespace) -> "GroupSettings":
             "base": tuple(parsed.base) or None,
             "added": () if parsed.no_classification else None,
         },
-        "joint": {
-            "measures": tuple(parsed.joint) or None,
-            "sides": parsed.joint_sides or None,
-        },
+        "joint": {"measures": tuple(parsed.joint) or None, "sides": parsed.joint_sides or None},
     }
     for question in find_questions():
         if question.settings:

@@ -180,11 +180,7 @@ def _formatted(rows: Sequence[Column], values: Mapping[str, Float]) -> dict[str,
 
 def _measure(row: Column, wording: str = "{}") -> dict[str, object]:
     """Define the column of a measure, with where its formula comes from."""
-    return {
-        "Description": wording.format(row.definition),
-        "Units": row.unit,
-        "Source": row.source,
-    }
+    return {"Description": wording.format(row.definition), "Units": row.unit, "Source": row.source}
 
 
 def summary_definition(column: str) -> dict[str, object]:
@@ -297,10 +293,7 @@ def _flag_entry(flag: Flag) -> dict[str, Any]:
 
 
 def write_failure(
-    result: ResultPlace,
-    error: HipstaError,
-    record: Mapping[str, Any],
-    body: BodyMask | None = None,
+    result: ResultPlace, error: HipstaError, record: Mapping[str, Any], body: BodyMask | None = None
 ) -> None:
     """Leave nothing of a failed hemisphere but its quality record, and its body to be corrected."""
     remove_results(result)

@@ -298,8 +298,7 @@ def find_boundaries(
     for bend, anisotropy in TILTS:
         operator = wall.operator(
             settings.changed(
-                sharp_bend=bend * settings.sharp_bend,
-                anisotropy=anisotropy * settings.anisotropy,
+                sharp_bend=bend * settings.sharp_bend, anisotropy=anisotropy * settings.anisotropy
             )
         )
         if first is None:

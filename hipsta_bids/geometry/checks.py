@@ -443,9 +443,7 @@ def flag_margins(findings: Sequence[Finding]) -> dict[str, float]:
 
 
 def raise_flags(
-    findings: Sequence[Finding],
-    sheet: Sheet,
-    position: Callable[[Float], str],
+    findings: Sequence[Finding], sheet: Sheet, position: Callable[[Float], str]
 ) -> list[Flag]:
     """Turn findings beyond their limits into flags, with place and consequence for the map.
 

@@ -130,10 +130,7 @@ def whole_surface(
 
 
 def find_faces(
-    surface: Surface,
-    volume: LabelVolume,
-    field: NDArray[np.float32],
-    grid: Float,
+    surface: Surface, volume: LabelVolume, field: NDArray[np.float32], grid: Float
 ) -> Faces:
     """Find the interior and the exterior face, and the strip between them."""
     points, triangles = surface.vertices, surface.triangles

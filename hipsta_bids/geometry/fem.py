@@ -239,10 +239,7 @@ class Directed:
 def _factor(matrix: sparse.csc_array) -> linalg.SuperLU:
     """Factorize a symmetric positive definite matrix."""
     return linalg.splu(
-        matrix,
-        permc_spec="MMD_AT_PLUS_A",
-        diag_pivot_thresh=0.0,
-        options={"SymmetricMode": True},
+        matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
     )
 
 

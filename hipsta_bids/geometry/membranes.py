@@ -273,8 +273,7 @@ def _implausibility(kind: Kind, nodes: Index, solid: Bool) -> float:
     the inside of a bend, unless it is the lid of a tunnel that opens at an end plane.
     """
     areas = np.array(
-        [len(np.unique(np.delete(nodes, axis, axis=1), axis=0)) for axis in range(3)],
-        dtype=float,
+        [len(np.unique(np.delete(nodes, axis, axis=1), axis=0)) for axis in range(3)], dtype=float
     )
     oriented = len(nodes) >= ORIENTED_NODES
     across = areas[2] ** 2 / float(areas @ areas)
@@ -327,11 +326,7 @@ def _continues(nodes: Index, solid: Bool) -> bool:
     return bool(continued.mean() > SEVER_SHARE)
 
 
-def _thicken(
-    state: Bool,
-    lifted: NDArray[np.float32],
-    nodes: Index,
-) -> Index:
+def _thicken(state: Bool, lifted: NDArray[np.float32], nodes: Index) -> Index:
     """Make a filled membrane as thick as the wall around it (in place), if the topology allows.
 
     Half the wall's thickness at a node of the membrane is the mean depth of the nearest nodes along

@@ -236,11 +236,7 @@ def _way_out(outline: Stack, neighbors: Stack) -> Bool | None:
     first, second, length = (np.concatenate(part) for part in zip(*steps, strict=True))
     graph = sparse.csr_array((length, (first, second)), shape=(cost.size,) * 2)
     distance, before, _ = csgraph.dijkstra(
-        graph,
-        directed=False,
-        indices=nodes[hole],
-        return_predecessors=True,
-        min_only=True,
+        graph, directed=False, indices=nodes[hole], return_predecessors=True, min_only=True
     )
     at = int(nodes[outside][np.argmin(distance[nodes[outside]])])
     path = np.zeros(cost.size, dtype=bool)

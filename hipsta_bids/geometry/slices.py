@@ -346,10 +346,7 @@ def _misfit(stack: _SliceStack, share: Stack, usable: Bool, pixel: float, soft: 
 
 
 def _align(
-    flows: Stack,
-    bends: Stack,
-    ribbons: list[Float | None],
-    settings: SliceSettings,
+    flows: Stack, bends: Stack, ribbons: list[Float | None], settings: SliceSettings
 ) -> None:
     """Replace, in place, displacements between slices with nodes by those of the nodes."""
     up = settings.upsampling

@@ -98,10 +98,7 @@ class SolidField:
 
 
 def repair_topology(
-    field: Field,
-    settings: TopologySettings,
-    locate: Locate,
-    contact: Contact,
+    field: Field, settings: TopologySettings, locate: Locate, contact: Contact
 ) -> SolidField:
     """Make the positive part of a field one solid piece without tunnels.
 

@@ -122,10 +122,7 @@ class Layout:
                 if traits is None or (self.bids and not context.selection.wants_file(path)):
                     continue
                 file = LabelFile(
-                    path=path,
-                    hemi=self.side(name),
-                    traits=traits,
-                    longitudinal=folder.longitudinal,
+                    path=path, hemi=self.side(name), traits=traits, longitudinal=folder.longitudinal
                 )
                 files.append(replace(file, rank=self.rank(file, context)))
         return sorted(files, key=lambda file: (file.rank, str(file.path)))

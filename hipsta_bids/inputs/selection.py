@@ -215,10 +215,7 @@ def ambiguity(files: Sequence[LabelFile]) -> InputError | None:
         remedy = "name the folder to use with --participants-map"
     elif files[0].traits.get("suffix") == "dseg":
         remedy = "choose by entities with --bids-filter-file"
-    return InputError(
-        f"{folder}: {names} are equally good; {remedy}",
-        reason="several-files",
-    )
+    return InputError(f"{folder}: {names} are equally good; {remedy}", reason="several-files")
 
 
 def make_selection(request: scan.InputRequest) -> Selection:

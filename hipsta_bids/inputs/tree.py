@@ -32,10 +32,7 @@ _BASE_END = re.compile(r"[-_.]*(?:base|template)$", re.IGNORECASE)
 _TEMPLATE = re.compile(r"fsaverage.*|cvs_avg35.*|[lr]h\.EC_average|V1_average")
 
 _SESSION = re.compile(r"ses-(?P<session>[A-Za-z0-9+]+)")
-_NO_SESSION = (
-    "its name is not ses-LABEL, of letters and digits",
-    "a session inside of a session",
-)
+_NO_SESSION = ("its name is not ses-LABEL, of letters and digits", "a session inside of a session")
 
 #: Folders below a subject or a session that can hold segmentations.
 _INNER = re.compile(r"anat|mri|final|seg\w*")

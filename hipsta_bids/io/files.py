@@ -249,8 +249,7 @@ def read_json(path: Path, limit: float = opening.TABLE) -> dict[str, Any]:
         ) from error
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(
-            f"{path}: not readable as JSON ({error}); correct or restore it",
-            reason="bad-json",
+            f"{path}: not readable as JSON ({error}); correct or restore it", reason="bad-json"
         ) from error
     if not isinstance(value, dict):
         raise InputError(f"{path}: not a JSON object; correct or restore it", reason="bad-json")

@@ -109,10 +109,7 @@ def surface_bytes(
     points: Float, triangles: Int, *, hemi: str, secondary: str | None, unfolded: bool
 ) -> bytes:
     """Encode a surface, (N, 3) vertices in mm: scanner RAS, or the plane of the unfolded sheet."""
-    meta = {
-        _PRIMARY: _STRUCTURE[hemi],
-        "GeometricType": "Flat" if unfolded else "Anatomical",
-    }
+    meta = {_PRIMARY: _STRUCTURE[hemi], "GeometricType": "Flat" if unfolded else "Anatomical"}
     if secondary:
         meta["AnatomicalStructureSecondary"] = secondary
     vertices = _array(points, "POINTSET", meta)

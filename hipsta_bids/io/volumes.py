@@ -418,8 +418,7 @@ def _checked_affine(image: Any, path: Path, limits: tuple[float, float]) -> Floa
         )
     if not np.isfinite(affine).all():
         raise InputError(
-            f"{path}: the affine contains NaN or infinity; repair the header",
-            reason="bad-affine",
+            f"{path}: the affine contains NaN or infinity; repair the header", reason="bad-affine"
         )
     sizes = np.linalg.norm(linear, axis=0)
     volume = abs(np.linalg.det(linear))

@@ -397,12 +397,7 @@ class Body:
         return np.asarray(self._sweep(section, w) @ rotation.T + shift)
 
     def locate(
-        self,
-        points: Float,
-        *,
-        hemi: str = "L",
-        pose: Float | None = None,
-        reach: float = np.inf,
+        self, points: Float, *, hemi: str = "L", pose: Float | None = None, reach: float = np.inf
     ) -> Float:
         """Sheet coordinates (N, 3) of scanner points (N, 3): the inverse of :meth:`place`.
 

@@ -302,10 +302,7 @@ def card_of(hemisphere: Hemisphere, cohort: Cohort, views: Views | None) -> Mapp
         "findings": hemisphere.findings,
         "notes": record.get("notes") or [],
         "edited": [str(e.get("what")) for e in record.get("edited") or []],
-        "neighbors": [
-            ("previous", _link(before, cohort)),
-            ("next", _link(after, cohort)),
-        ],
+        "neighbors": [("previous", _link(before, cohort)), ("next", _link(after, cohort))],
         "commands": open_commands(
             hemisphere, views.anatomy.path if views and views.anatomy else None
         ),

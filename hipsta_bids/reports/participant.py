@@ -11,13 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hipsta_bids.protocols import EXPERIMENTAL
-from hipsta_bids.reports.cohort import (
-    MEASURES,
-    SMALLEST_COHORT,
-    Cohort,
-    card_of,
-    correction_of,
-)
+from hipsta_bids.reports.cohort import MEASURES, SMALLEST_COHORT, Cohort, card_of, correction_of
 from hipsta_bids.reports.display import (
     MAP_KINDS,
     THICKNESS,

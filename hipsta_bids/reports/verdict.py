@@ -31,11 +31,7 @@ _SOUND = "No check raised a flag, and no label was repaired."
 _ROUNDING = 0.005
 """mm; means that differ by less read the same."""
 
-_TITLES = {
-    Decision.USE: "Use",
-    Decision.LOOK: "Look before use",
-    Decision.FAILED: "Do not use",
-}
+_TITLES = {Decision.USE: "Use", Decision.LOOK: "Look before use", Decision.FAILED: "Do not use"}
 #: By which pages sort.
 _ORDER = (Decision.FAILED, Decision.LOOK, Decision.USE)
 

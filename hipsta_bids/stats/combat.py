@@ -150,11 +150,7 @@ def fit_effects(
 
 
 def extend_effects(
-    effects: SiteEffects,
-    values: Float,
-    visits: Visits,
-    *,
-    pooled: bool,
+    effects: SiteEffects, values: Float, visits: Visits, *, pooled: bool
 ) -> tuple[SiteEffects, SiteMoments]:
     """Estimate the effects of further sites, with all else as it was estimated before.
 
@@ -259,11 +255,7 @@ def _moments(effects: SiteEffects, values: Float, visits: Visits) -> tuple[Float
 
 
 def _with_shifts(
-    effects: SiteEffects,
-    values: Float,
-    visits: Visits,
-    *,
-    pooled: bool,
+    effects: SiteEffects, values: Float, visits: Visits, *, pooled: bool
 ) -> tuple[SiteEffects, SiteMoments]:
     """Complete effects by the shifts and scales that standardized residuals show."""
     n, mean, around = _moments(effects, values, visits)

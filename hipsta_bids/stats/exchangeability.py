@@ -191,10 +191,7 @@ def choose_exchange(
 
 
 def exchange_text(
-    matrix: Float,
-    contrasts: Sequence[Contrast],
-    visits: Visits,
-    choice: Literal["auto"] | Exchange,
+    matrix: Float, contrasts: Sequence[Contrast], visits: Visits, choice: Literal["auto"] | Exchange
 ) -> str:
     """Word the exchange of each contrast, without a final period."""
     kinds: dict[Exchange, list[str]] = {}

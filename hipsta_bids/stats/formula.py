@@ -274,10 +274,7 @@ def level_labels(values: pd.Series) -> pd.Series:
 
 
 def columns_of(
-    table: pd.DataFrame,
-    formula: str,
-    levels: Mapping[str, Sequence[str]],
-    source: str,
+    table: pd.DataFrame, formula: str, levels: Mapping[str, Sequence[str]], source: str
 ) -> tuple[Float, tuple[str, ...], Int64]:
     """Make columns of a formula with given levels, without intercept; and rows that have all."""
     closed = closed_formula(formula)

@@ -451,11 +451,7 @@ class FittedMaps:
 
 
 def fit_maps(
-    hemi: str,
-    side: SideMaps,
-    model: RowModel,
-    *,
-    contrasts: tuple[Contrast, ...] | None = None,
+    hemi: str, side: SideMaps, model: RowModel, *, contrasts: tuple[Contrast, ...] | None = None
 ) -> FittedMaps:
     """Fit a model at each point of all maps of a hemisphere."""
     _, positions, rows = np.intersect1d(

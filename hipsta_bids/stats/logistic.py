@@ -65,11 +65,7 @@ def is_separated(matrix: Float, case: Bool) -> bool:
 
 
 def fit_logistic(
-    matrix: Float,
-    case: Bool,
-    *,
-    firth: bool,
-    free: Bool | None = None,
+    matrix: Float, case: Bool, *, firth: bool, free: Bool | None = None
 ) -> LogisticFit:
     """Fit a logistic regression by maximum likelihood, or by Firth's method.
 
@@ -161,10 +157,7 @@ def _scales(matrix: Float) -> Float:
 
 
 def firth_maxima(
-    matrix: Float,
-    case: Bool,
-    weights: Float,
-    free: Bool | None = None,
+    matrix: Float, case: Bool, weights: Float, free: Bool | None = None
 ) -> tuple[Float, Float]:
     """Penalize the likelihood by the root of the information's determinant (Firth 1993).
 

@@ -277,10 +277,7 @@ def _tested(
 
 
 def _fit(
-    maps: Float,
-    basis: Float,
-    participants: Int,
-    rotated: Sequence[Float],
+    maps: Float, basis: Float, participants: Int, rotated: Sequence[Float]
 ) -> dict[str, Float]:
     """Fit intercepts at some points; points last."""
     sums = collect_sums(maps, basis, participants)
@@ -307,12 +304,7 @@ def _fit(
 
 
 def _fit_slopes(
-    maps: Float,
-    basis: Float,
-    participants: Int,
-    rotated: Sequence[Float],
-    *,
-    times: Float,
+    maps: Float, basis: Float, participants: Int, rotated: Sequence[Float], *, times: Float
 ) -> dict[str, Float]:
     """Fit intercepts and slopes at some points; points last."""
     unit = float(times.std())

@@ -110,10 +110,7 @@ class _Moments:
 
 
 def fit_template(
-    profiles: Float,
-    warps: Float,
-    splines: int,
-    components: int,
+    profiles: Float, warps: Float, splines: int, components: int
 ) -> tuple[Template, Float]:
     """Estimate mean, components and noise of profiles at given warps.
 

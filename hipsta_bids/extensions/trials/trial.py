@@ -124,9 +124,7 @@ class Retested:
         data = layer.data
         values = self.arrange(data, layer.rows)
         agreed = trials.repeatability(
-            values,
-            confidence=self._settings.confidence,
-            least=self._settings.min_participants,
+            values, confidence=self._settings.confidence, least=self._settings.min_participants
         )
         # Of one visit, the variance between and within; of several, that within.
         n = agreed["n"]

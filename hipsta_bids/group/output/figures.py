@@ -121,9 +121,7 @@ def draw_calibration(analysis: Analysis) -> "list[Figure]":
     return _draw_pairs(curves, labels, "slope, Brier score", marker="o", markersize=3)
 
 
-def _first_added(
-    curves: Sequence[Curve],
-) -> dict[tuple[str, str], dict[str, list[Curve]]]:
+def _first_added(curves: Sequence[Curve]) -> dict[tuple[str, str], dict[str, list[Curve]]]:
     """Return the curves of the first added measure, by pair of groups and side."""
     first: dict[tuple[str, str], dict[str, list[Curve]]] = {}
     for curve in curves:

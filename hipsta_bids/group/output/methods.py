@@ -451,9 +451,7 @@ def _families(rules: MultiplicitySettings, maps: Iterable[inference.MapKey]) -> 
 
 
 def discovery_text(
-    rules: MultiplicitySettings,
-    cite: Callable[[str], str],
-    maps: Iterable[inference.MapKey],
+    rules: MultiplicitySettings, cite: Callable[[str], str], maps: Iterable[inference.MapKey]
 ) -> str:
     """Return how the false discovery rate was controlled."""
     return (

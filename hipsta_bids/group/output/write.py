@@ -251,9 +251,7 @@ def _write_surfaces(folder: Path, cohort: Cohort, analysis: results.Analysis) ->
 _Stats = dict[str, Float]
 
 
-def stats_of(
-    tested: Iterable[tuple[MapKey, PointTest, Discoveries]],
-) -> dict[MapKey, _Stats]:
+def stats_of(tested: Iterable[tuple[MapKey, PointTest, Discoveries]]) -> dict[MapKey, _Stats]:
     """Collect statistics, effect sizes and corrected p-values."""
     return {
         key: {
