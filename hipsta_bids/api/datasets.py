@@ -195,9 +195,7 @@ def _lazy_dataset(root: Path, hemispheres: list[Hemisphere], table: pd.DataFrame
 
 def _further_maps(measured: list[Hemisphere]) -> dict[str, tuple[tuple[str, ...], dict[str, str]]]:
     """Columns of tables of SDs and of sampled maps: their table, and what they are."""
-    maps = {
-        entry["name"] for hemisphere in measured for entry in hemisphere.record.get("maps") or ()
-    }
+    maps = {entry["name"] for h in measured for entry in h.record.get("maps") or ()}
     variables = {}
     for key in (("uncertainty",), *(("map_table", name) for name in sorted(maps))):
         paths = (hemisphere.result.path(*key).with_suffix(".json") for hemisphere in measured)

@@ -321,11 +321,7 @@ def references() -> dict[str, str]:
 def _layer_rule(settings: BodySettings, protocols: Sequence[Protocol]) -> str:
     """Describe the molecular layer, and the protocols with which it was excluded."""
     texts: Mapping[str, str] = TEXTS["methods"]["layer"]
-    separate = [
-        protocol.name
-        for protocol in protocols
-        if Tissue.MOLECULAR_LAYER in protocol.interior and not protocol.layer
-    ]
+    separate = [p.name for p in protocols if Tissue.MOLECULAR_LAYER in p.interior and not p.layer]
     rule = texts[settings.layer_rule]
     if settings.join_every_layer or not separate:
         return rule

@@ -158,9 +158,7 @@ def _write_layers(result: ResultPlace, layers: Sheet) -> None:
 def _numbers(axes: Iterable[str], shape: tuple[int, ...]) -> dict[str, list[str]]:
     """Node numbers of all points of a grid, from 1, last axis fastest."""
     numbers = (index.ravel() + 1 for index in np.indices(shape))
-    return {
-        axis: [str(n) for n in values.tolist()] for axis, values in zip(axes, numbers, strict=True)
-    }
+    return {axis: [str(n) for n in v.tolist()] for axis, v in zip(axes, numbers, strict=True)}
 
 
 def _positions(points: Float) -> dict[str, list[str]]:

@@ -95,9 +95,7 @@ def input_table(
         if item.probabilities:
             text = f"probabilities of the same labels, files: {len(item.probabilities.files)}"
             reasons.append((item.probabilities.files[0][0], status, text))
-        reasons += [
-            (item.path_of(name), tree.NOT_USED, reason) for name, reason in item.passed_over
-        ]
+        reasons += [(item.path_of(name), tree.NOT_USED, r) for name, r in item.passed_over]
         of_item = [row(path, item, *reason) for path, *reason in reasons]
         of_item[0] = item.origin | of_item[0]
         rows += [cells | {"seg": item.protocol.name} for cells in of_item]

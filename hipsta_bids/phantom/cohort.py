@@ -275,16 +275,7 @@ def write_cohort(
         voxel_size=voxel_size,
         probabilities=plan.probabilities,
         columns=_columns(plan),
-        rows={
-            subject.label: (
-                subject.group,
-                f"{subject.age:.1f}",
-                subject.sex,
-                f"{subject.icv:.1f}",
-                subject.site,
-            )
-            for subject in subjects
-        },
+        rows={s.label: (s.group, f"{s.age:.1f}", s.sex, f"{s.icv:.1f}", s.site) for s in subjects},
     )
     for item in hemispheres:
         if isinstance(item.spec, PhantomSpec):

@@ -392,11 +392,7 @@ def make_sprites(
     """
     shapes = [maps_of_side[MAP_KINDS[0].column].shape for maps_of_side in maps if maps_of_side]
     usual = max(set(shapes), key=shapes.count) if shapes else (0, 0)
-    drawn = [
-        row
-        for row, columns in enumerate(maps)
-        if columns and next(iter(columns.values())).shape[0] == usual[0]
-    ]
+    drawn = [row for row, c in enumerate(maps) if c and next(iter(c.values())).shape[0] == usual[0]]
     longest = max((shape[1] for shape in shapes if shape[0] == usual[0]), default=0)
     columns = min(_COLUMNS, max(1, len(drawn)))
     step = 1 if len(drawn) <= _FULL_SIZE else 2

@@ -73,11 +73,7 @@ def _environment() -> "Environment":
         loader=ChoiceLoader(
             [
                 PackageLoader("hipsta_bids.reports"),
-                *(
-                    PackageLoader(extension.package)
-                    for extension in find_extensions()
-                    if extension.has_templates
-                ),
+                *(PackageLoader(e.package) for e in find_extensions() if e.has_templates),
             ]
         ),
         autoescape=True,

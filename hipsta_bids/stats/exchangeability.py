@@ -210,7 +210,5 @@ def _between(tested: Float, nuisance: Float, visits: Visits, *, changes: bool) -
         return False
     common = _powers(visits, _POWERS if changes else 1)
     model = np.column_stack([tested, nuisance])
-    conditions: list[Bool | bool] = [
-        spans(nuisance, column) or not spans(model, column) for column in common
-    ]
+    conditions: list[Bool | bool] = [spans(nuisance, c) or not spans(model, c) for c in common]
     return all(conditions)

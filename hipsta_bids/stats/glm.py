@@ -116,10 +116,7 @@ def fit_points(
     names = ("scores", "covariance", "sigma", "n")
     fit = PointBlock(*(np.concatenate([getattr(fit, name) for fit in fits]) for name in names))
     df = np.where(np.isfinite(fit.sigma), fit.n - columns, np.nan)
-    tests = tuple(
-        _test(contrast, contrast.weights @ inverse, fit, df, settings.confidence)
-        for contrast in contrasts
-    )
+    tests = tuple(_test(c, c.weights @ inverse, fit, df, settings.confidence) for c in contrasts)
     return PointwiseFit(inverse @ fit.scores.T, fit.sigma, fit.n, tests)
 
 
@@ -407,13 +404,10 @@ def with_mean(design: Design) -> tuple[Contrast, ...]:
     """Contrasts of a design, with the model's mean over all rows in front."""
     mean = Contrast(MEAN, design.matrix.mean(axis=0))
     matching = [
-        contrast
-        for contrast in design.contrasts
-        if contrast.name == MEAN
-        or (
-            contrast.weights.shape == mean.weights.shape
-            and np.allclose(contrast.weights, mean.weights)
-        )
+        c
+        for c in design.contrasts
+        if c.name == MEAN
+        or (c.weights.shape == mean.weights.shape and np.allclose(c.weights, mean.weights))
     ]
     return design.contrasts if matching else (mean, *design.contrasts)
 

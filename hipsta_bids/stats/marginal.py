@@ -103,12 +103,7 @@ class Terms:
 
     def _columns_of(self, variables: frozenset[str]) -> list[int]:
         """Return places of the columns of terms with exactly these variables."""
-        names = {
-            name
-            for structure, columns in self._structures()
-            if structure == variables
-            for name in columns
-        }
+        names = {name for s, columns in self._structures() if s == variables for name in columns}
         return [place for place, name in enumerate(self.columns) if name in names]
 
     def _free_and_fixed(self, name: str, contrast: str) -> tuple[list[str], dict[str, str]]:

@@ -70,9 +70,7 @@ class Sums:
         sizes = self.sizes[:, None]
         spread = 1 + sizes * ratio
         take = (ratio / spread, 1 / spread**2, -2 * sizes / spread**3)
-        off, first, second = (
-            -np.einsum("kp,kpij->pij", weights, self.person_squares) for weights in take
-        )
+        off, first, second = (-np.einsum("kp,kpij->pij", w, self.person_squares) for w in take)
         whole = self.squares + off
         inverse = np.linalg.inv(whole[:, :-1, :-1])
         scores = np.einsum("pij,pj->pi", inverse, whole[:, :-1, -1])
@@ -215,9 +213,7 @@ def _larger_where_better(
     """Join the fits of some points: with slopes, except where the likelihood gains nothing."""
     gain = intercepts["loss"] - slopes["loss"]
     is_worse = gain < _NO_GAIN
-    chosen_values = {
-        name: np.where(is_worse, intercepts[name], values) for name, values in slopes.items()
-    }
+    chosen_values = {name: np.where(is_worse, intercepts[name], v) for name, v in slopes.items()}
     chosen_values["slope"] = np.where(is_worse, 0.0, slopes["slope"])
     gain = np.where(gain < 0, 0.0, gain)
     chosen_values["slopes_p"] = (special.chdtrc(1, gain) + special.chdtrc(2, gain)) / 2

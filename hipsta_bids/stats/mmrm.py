@@ -454,9 +454,7 @@ def visit_model(
 
 def _equal_at_first(design: Design, arms: str) -> Design:
     """Remove columns of arms at the first visit, which is the reference of visits."""
-    names = [
-        [atom.partition("[")[0] for atom in split_name(column)[0]] for column in design.columns
-    ]
+    names = [[atom.partition("[")[0] for atom in split_name(c)[0]] for c in design.columns]
     is_first = np.array([arms in atoms and VISIT not in atoms for atoms in names])
     if not any(arms in atoms and VISIT in atoms for atoms in names):
         raise ModelError(
@@ -468,9 +466,7 @@ def _equal_at_first(design: Design, arms: str) -> Design:
         matrix=design.matrix[:, keep],
         columns=tuple(np.array(design.columns)[keep].tolist()),
         contrasts=tuple(
-            contrast
-            if contrast.weights.shape[1] == keep.sum()
-            else replace(contrast, weights=contrast.weights[:, keep])
-            for contrast in design.contrasts
+            c if c.weights.shape[1] == keep.sum() else replace(c, weights=c.weights[:, keep])
+            for c in design.contrasts
         ),
     )

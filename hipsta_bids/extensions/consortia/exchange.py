@@ -383,9 +383,7 @@ def _check_model(analysis: Analysis, settings: GroupSettings) -> None:
             f"with {match[1]}() has other columns at each site; write numbers that are the same"
             " everywhere, as I((age - 65) / 10)"
         )
-    elif not any(
-        contrast.n_rows == 1 and not contrast.side for contrast in analysis.design.contrasts
-    ):
+    elif not any(c.n_rows == 1 and not c.side for c in analysis.design.contrasts):
         problem = "has no two-sided contrast of one row; others cannot be combined"
     if problem is not None:
         raise ModelError(f"--export-summary: a model {problem}")
@@ -445,11 +443,7 @@ def _model(
 ) -> dict[str, Any]:
     """Fit the model where all participants have a value, and spell the results."""
     names = [test.contrast.name for test in tests]
-    contrasts = [
-        contrast
-        for contrast in design.contrasts
-        if contrast.n_rows == 1 and not contrast.side and contrast.name in names
-    ]
+    contrasts = [c for c in design.contrasts if c.n_rows == 1 and not c.side and c.name in names]
     complete = np.isfinite(values).all(axis=0)
     fit = fit_points(np.where(complete, values, 0.0), design.matrix, contrasts, settings.glm)
     traceable = is_traceable(values, cells, settings.exchange.min_cell)

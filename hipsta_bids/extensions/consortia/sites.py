@@ -285,11 +285,7 @@ def _sites(meta: Meta) -> pd.DataFrame:
     for site in meta.sites:
         counts = {k: shown_counts(levels) for k, levels in site.factors.items()}
         levels = {f"{k}_{level}": n for k, levels in counts.items() for level, n in levels.items()}
-        numbers = {
-            f"{k}_{statistic}": v
-            for k, numbers in site.covariates.items()
-            for statistic, v in numbers.items()
-        }
+        numbers = {f"{k}_{s}": v for k, n in site.covariates.items() for s, v in n.items()}
         people = {"site": site.site, "n": site.participants, **levels, **numbers}
         about = {"version": site.version, "template": site.template_hash}
         rows.append({**people, "df": site.models[0].df, **about})

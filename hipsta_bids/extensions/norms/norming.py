@@ -153,8 +153,7 @@ def _score_people(
             numbers[at], people.take(rows[at]), len(file.sites), least
         )
     scored = {
-        name: _score_maps(cohort_of_maps, values, extended, people, adapted)
-        for name, cohort_of_maps in cohorts.items()
+        name: _score_maps(c, values, extended, people, adapted) for name, c in cohorts.items()
     }
     scoring = _Scoring(
         path, controls, file, extended, people, cohorts, values, tables, n_sites, scored, adapted

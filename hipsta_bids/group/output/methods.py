@@ -163,9 +163,7 @@ def _registration(analysis: Analysis, settings: GroupSettings, cite: Callable[[s
         f" ({_SIDES[hemi]})"
         for hemi, fit in analysis.registrations.items()
     )
-    extreme = sum(
-        int(registration.extreme.sum()) for registration in analysis.registrations.values()
-    )
+    extreme = sum(int(r.extreme.sum()) for r in analysis.registrations.values())
     standardization = (
         " Each profile was standardized to mean 0 and standard deviation 1."
         if rules.standardize
@@ -324,11 +322,7 @@ def _tests(contrasts: Sequence[Contrast]) -> str:
     """Return the names of contrasts, and the alternatives of one-sided tests."""
     names = escaped(joined([contrast.name for contrast in contrasts]))
     text = f" Contrasts were {names}." if len(contrasts) > 1 else f" The contrast was {names}."
-    if sided := [
-        f"{escaped(contrast.name)} ({contrast.hypothesis})"
-        for contrast in contrasts
-        if contrast.side
-    ]:
+    if sided := [f"{escaped(c.name)} ({c.hypothesis})" for c in contrasts if c.side]:
         text += f" Tests were one-sided, with this alternative and margin: {joined(sided)}."
     return text
 
@@ -392,11 +386,7 @@ def _slopes(analysis: Analysis, cite: Callable[[str], str]) -> str:
 
 def _nonlinear(analysis: Analysis, settings: GroupSettings) -> str:
     """Return how age was modeled, and in how many summary measures it was not linear."""
-    names = [
-        contrast.name
-        for contrast in analysis.design.contrasts
-        if contrast.name.endswith(" nonlinear")
-    ]
+    names = [c.name for c in analysis.design.contrasts if c.name.endswith(" nonlinear")]
     if not names or settings.model.age == "linear":
         return ""
     curve = "its square" if settings.model.age == "quadratic" else "a natural cubic spline"

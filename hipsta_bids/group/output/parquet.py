@@ -50,9 +50,7 @@ def write_maps(
         if suffix != "_harmonized":
             fields.append(pa.field(f"subfield{suffix}", _WORD, metadata={"description": text}))
         fields += [_number(f"{name}{suffix}", cohorts[SHEET], name, text) for name in measures]
-    fields += [
-        _number(name, cohort, name, "as given") for name, cohort in cohorts.items() if name != SHEET
-    ]
+    fields += [_number(name, c, name, "as given") for name, c in cohorts.items() if name != SHEET]
     about = {
         "description": "one row per visit, hemisphere and point; x medial to lateral, "
         "y posterior to anterior; empty without the measure"
@@ -71,11 +69,7 @@ def _write(path: Path, schema: pa.Schema, rows: Iterable[Columns]) -> None:
 
     Measured values hardly repeat: a dictionary of them takes longer than it saves.
     """
-    repeated = [
-        column.name
-        for column in schema
-        if column.name in "xy" or not pa.types.is_float32(column.type)
-    ]
+    repeated = [c.name for c in schema if c.name in "xy" or not pa.types.is_float32(c.type)]
     try:
         with pq.ParquetWriter(path, schema, compression="zstd", use_dictionary=repeated) as writer:
             for columns in rows:

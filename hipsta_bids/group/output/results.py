@@ -99,11 +99,7 @@ class ScoredMaps:
 
 def templates_of(registrations: Mapping[str, alignment.Registration]) -> dict[str, Any] | None:
     """Write the templates of registration for ``template.json``; ``None`` without registration."""
-    templates = {
-        hemi: registration.template
-        for hemi, registration in registrations.items()
-        if registration.template
-    }
+    templates = {hemi: r.template for hemi, r in registrations.items() if r.template}
     return templates_to_json(templates) if templates else None
 
 

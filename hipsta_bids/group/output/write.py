@@ -318,9 +318,7 @@ def write_stats(folder: Path, maps: Mapping[MapKey, _Stats], about: _About | Non
             grouped.setdefault(name, {})[key.hemi] = stats
     for name, sides in grouped.items():
         names = list(next(iter(sides.values())))
-        stacked = {
-            hemi: np.stack([values[stat] for stat in names]) for hemi, values in sides.items()
-        }
+        stacked = {hemi: np.stack([v[stat] for stat in names]) for hemi, v in sides.items()}
         files.write_bytes(folder / f"{name}.dscalar.nii", gifti.cifti_bytes(stacked, names))
 
 
