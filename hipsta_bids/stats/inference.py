@@ -440,13 +440,9 @@ def _permuted(
             if report is not None:
                 report(before + number_done, len(groups) * rules.permutations)
 
+        parts, first = [part(key) for key in keys], tested[keys[0]]
         results = permute(
-            [part(key) for key in keys],
-            tested[keys[0]],
-            settings=rules,
-            blocks=blocks,
-            report=count,
-            combine=combine,
+            parts, first, settings=rules, blocks=blocks, report=count, combine=combine
         )
         corrected = [result.p_enhanced if enhanced else result.p_max for result in results]
         points = [result.p_uncorrected for result in results]
