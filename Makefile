@@ -57,6 +57,7 @@ lint: $(STAMP)
 	"$(BIN)/python" -m ruff format --check .
 	"$(BIN)/codespell"
 	"$(BIN)/python" tools/names.py
+	"$(BIN)/python" tools/functions.py
 	"$(BIN)/python" tools/words.py
 
 types: $(STAMP)

@@ -1,4 +1,4 @@
-"""The joints at which extensions meet the program: commands of their own, and parts of an analysis.
+"""The joints at which extensions meet the program: separate commands, and parts of an analysis.
 
 An extension is a folder of ``hipsta_bids.extensions``, whose ``__init__`` declares it. It names its
 functions as ``module:function``; they are loaded when they are called.
@@ -26,7 +26,7 @@ def load(place: str) -> Any:  # noqa: ANN401  (what the module has by this name)
 
 @dataclass(frozen=True, kw_only=True)
 class Command:
-    """A command beside the BIDS App."""
+    """A command other than the BIDS App."""
 
     name: str
     run: str

@@ -1,6 +1,6 @@
-"""What a long run is at: its stages and how much of one is done, told to whoever listens.
+"""Progress of a long run: its stages and how much of a stage is done, for a listener.
 
-Without a listener, as in the Python interface, nothing is told. The command line listens.
+Without a listener, as in the Python interface, nothing is reported. The command line listens.
 """
 
 from collections.abc import Callable, Iterator, Sequence

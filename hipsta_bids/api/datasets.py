@@ -155,7 +155,7 @@ def _lazy_dataset(root: Path, hemispheres: list[Hemisphere], table: pd.DataFrame
         decision[at] = word
     measured = {at: side for at, side in zip(index, hemispheres, strict=True) if side.measured}
 
-    extras = _beside_sheets(list(measured.values()))
+    extras = _further_maps(list(measured.values()))
 
     def read(name: str, at: tuple[int, ...]) -> NDArray[Any] | None:
         key, _ = extras.get(name, (("sheet",), {}))
@@ -193,12 +193,12 @@ def _lazy_dataset(root: Path, hemispheres: list[Hemisphere], table: pd.DataFrame
     return make_dataset(variables, coordinates, {"region": table["region"].iloc[0]})
 
 
-def _beside_sheets(measured: list[Hemisphere]) -> dict[str, tuple[tuple[str, ...], dict[str, str]]]:
+def _further_maps(measured: list[Hemisphere]) -> dict[str, tuple[tuple[str, ...], dict[str, str]]]:
     """Columns of tables of SDs and of sampled maps: their table, and what they are."""
-    maps = {entry["name"] for one in measured for entry in one.record.get("maps") or ()}
+    maps = {entry["name"] for h in measured for entry in h.record.get("maps") or ()}
     variables = {}
     for key in (("uncertainty",), *(("map_table", name) for name in sorted(maps))):
-        paths = (one.result.path(*key).with_suffix(".json") for one in measured)
+        paths = (hemisphere.result.path(*key).with_suffix(".json") for hemisphere in measured)
         path = next((path for path in paths if path.is_file()), None)
         for name, about in files.read_json(path).items() if path else ():
             if name.endswith("_sd") if key == ("uncertainty",) else name.partition("_")[0] in maps:

@@ -33,6 +33,16 @@ _DEFAULT = ("thickness", "curvature")
 _MOST_DPI = 2400  # a page has 0.4 gigapixels
 
 
+def _curves(results: GroupResults, what: str, width: float | None) -> "Figure":
+    """Draw registration or receiver operating characteristics, if the analysis has them."""
+    if what == "registration" and not (results.folder / "template.json").exists():
+        raise NothingToDoError(f"{results.folder}: no registration in this analysis")
+    if what == "roc" and not len(results.table("roc")):
+        raise NothingToDoError(f"{results.folder}: no classification in this analysis")
+    draw = figures.draw_roc if what == "roc" else figures.draw_registration
+    return draw(results, width)[0]
+
+
 def figure(
     what: str,
     out_dir: str | Path,
@@ -109,14 +119,8 @@ def figure(
             rows = list(_participant_rows(sides, measures or _DEFAULT, limits))
         else:
             results = _analysis(root, name)
-            if what == "registration" and not (results.folder / "template.json").exists():
-                raise NothingToDoError(f"{results.folder}: no registration in this analysis")
-            if what == "roc" and not len(results.table("roc")):
-                raise NothingToDoError(f"{results.folder}: no classification in this analysis")
-            if what == "registration":
-                return _written(figures.draw_registration(results, width)[0], file, kind, dpi)
-            if what == "roc":
-                return _written(figures.draw_roc(results, width)[0], file, kind, dpi)
+            if what in {"registration", "roc"}:
+                return _written(_curves(results, what, width), file, kind, dpi)
             measure = _measure(results, measures)
             grounds = read_grounds(results, measure)
             rows = list(_group_rows(results, measure, what, contrasts, limits))

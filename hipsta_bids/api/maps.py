@@ -2,6 +2,7 @@
 
 from base64 import b64encode
 from collections.abc import Mapping
+from collections.abc import Set as AbstractSet
 from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import cached_property
@@ -84,10 +85,10 @@ class Measurement:
     def _repr_html_(self) -> str:
         from matplotlib.figure import Figure  # noqa: PLC0415  (slow to load)
 
-        from hipsta_bids.api.plots import plot_sheet  # noqa: PLC0415  (it draws what is here)
+        from hipsta_bids.api.drawing import draw_map  # noqa: PLC0415  (as above)
 
         figure, content = Figure(figsize=(3.4, 2.6), layout="constrained"), BytesIO()
-        plot_sheet(self, ax=figure.subplots())
+        draw_map(figure.subplots(), self.table, "thickness", self.side)
         figure.savefig(content, format="png", dpi=80)
         code = b64encode(content.getvalue()).decode()
         picture = f'<img alt="Thickness on the sheet" src="data:image/png;base64,{code}">'
@@ -326,7 +327,7 @@ def measure(
         (I, J, K) on the grid of the labels, a path or an image of nibabel. Or a mapping from codes,
         among them each code of the sheet and its layer, to these.
     region : {"body", "extended", "entorhinal", "headbody", "whole"}
-        What to measure; the second and third need labels of the cortex beside it, the last two,
+        What to measure; the second and third need labels of the cortex next to it, the last two,
         which are experimental, labels of subfields in the head.
     settings : Settings, str or Path, optional
         Settings of the participant level, or a TOML file with some.
@@ -365,7 +366,7 @@ def measure(
     >>> print(f"{left.summary['thickness_mean']:.1f} {left.units['thickness']}")
     2.0 mm
 
-    With xarray, values are found by their coordinates:
+    With xarray, values are selected by their coordinates:
 
     >>> middle = left.dataset.sel(y=0.0)
     >>> dict(middle.sizes)
@@ -396,6 +397,14 @@ def measure(
     )
 
 
+def _check_complete(volume: LabelVolume, tissues: AbstractSet[Tissue]) -> None:
+    sheet = (*volume.protocol.sheet, *volume.protocol.layer)
+    present = {tissue for tissue in sheet if (volume.tissue == tissue).any()}
+    if lacking := present - tissues:
+        names = ", ".join(sorted(tissue.name for tissue in lacking))
+        raise InputError(f"no probabilities of {names}; add them", reason="bad-probabilities")
+
+
 def _with_probabilities(volume: LabelVolume, source: Any) -> LabelVolume:  # noqa: ANN401  (as above)
     """Add probabilities of the sheet, or of codes, to labels."""
     sheet = (*volume.protocol.sheet, *volume.protocol.layer)
@@ -403,10 +412,7 @@ def _with_probabilities(volume: LabelVolume, source: Any) -> LabelVolume:  # noq
     if isinstance(source, Mapping):
         for code in source:
             check_choice("probabilities: code", code, tissues)
-        lacking = {tissue for tissue in sheet if (volume.tissue == tissue).any()}
-        if lacking := lacking.difference(tissues[code] for code in source):
-            names = ", ".join(sorted(tissue.name for tissue in lacking))
-            raise InputError(f"no probabilities of {names}; add them", reason="bad-probabilities")
+        _check_complete(volume, {tissues[code] for code in source})
         by_tissue = [(tissues[code], f" of code {code}", values) for code, values in source.items()]
     else:
         # All of the sheet, whichever of its tissues has the name.

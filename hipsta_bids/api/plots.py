@@ -8,13 +8,12 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from hipsta_bids.api.maps import Measurement, attributes, check_choice
+from hipsta_bids.api.drawing import add_color_bar, draw_map, map_kind
+from hipsta_bids.api.maps import Measurement, check_choice
 from hipsta_bids.api.models import GroupFit
 from hipsta_bids.derivatives.results import STATE
-from hipsta_bids.geometry.catalog import MAPS
 from hipsta_bids.io.gifti import sheet_triangles
 from hipsta_bids.reports import display
-from hipsta_bids.reports.cells import display_name, unit_of
 from hipsta_bids.reports.group_maps import EFFECT_NAMES
 from hipsta_bids.reports.maps import draw_sheet
 from hipsta_bids.reports.results import SheetTable
@@ -82,16 +81,8 @@ def plot_sheet(
         data = data.to_dataset(name=measure)
     data = _one_hemisphere(data)
     columns, side = _columns(data, measure)
-    sheet = _sheet(data, columns)
-    kind = _kind(measure)
     ax = ax or _current_axes()
-    names = "extent_x", "extent_y"
-    extents = [float(np.nanmean(columns[n])) if n in columns else np.nan for n in names]
-    scale = limits or display.scale_of(kind, [columns[measure]])
-    image = draw_sheet(ax, sheet, kind, scale, extents=extents, hemi=side)
-    ax.set_ylabel("  ←  →  ".join(display.Y_ENDS))
-    if colorbar:
-        _bar(ax, image, kind)
+    draw_map(ax, _sheet(data, columns), measure, side, limits=limits, colorbar=colorbar)
     return ax
 
 
@@ -142,7 +133,7 @@ def plot_surface(
 
     data = _one_hemisphere(data)
     columns, side = _columns(data, measure)
-    kind = _kind(measure)
+    kind = map_kind(measure)
     points = _points(data, level)
     triangles = sheet_triangles(*points.shape[:2])
     corners = points.reshape(-1, 3)[triangles]
@@ -177,7 +168,7 @@ def plot_surface(
     for letter, position in (("P", ends["P"] - beyond), ("A", ends["A"] + beyond)):
         ax.text(*position, letter, ha="center", va="center", weight="bold")
     if colorbar:
-        _bar(ax, ScalarMappable(scale, kind.colors), kind)
+        add_color_bar(ax, ScalarMappable(scale, kind.colors), kind)
     return ax
 
 
@@ -247,7 +238,7 @@ def plot_group(
     names = np.full(effect.shape, "") if subfield is None else np.asarray(subfield, dtype=np.str_)
     test = fit.test(side, contrast).kind
     colors = display.EFFECT_COLORS
-    kind = replace(_kind("effect"), title=EFFECT_NAMES[test], colors=colors, centered=True)
+    kind = replace(map_kind("effect"), title=EFFECT_NAMES[test], colors=colors, centered=True)
     sheet = _bare_sheet({"effect": effect}, {"subfield": names})
     statistic, df = (fit.maps[name][at] for name in ("statistic", "df"))
     reach = display.effect_reach([display.Effects(test, effect, statistic, df)])
@@ -261,7 +252,7 @@ def plot_group(
     ax.set_aspect("auto")
     ax.set_ylabel("  ←  nodes  →  ".join(display.Y_ENDS))
     if colorbar:
-        _bar(ax, image, kind)
+        add_color_bar(ax, image, kind)
     return ax
 
 
@@ -307,9 +298,7 @@ def _sheet(data: Measurement | xr.Dataset, columns: dict[str, Float]) -> SheetTa
 
 
 def _bare_sheet(
-    columns: dict[str, Float],
-    state: dict[str, NDArray[Any]],
-    ends: tuple[int, int] | None = None,
+    columns: dict[str, Float], state: dict[str, NDArray[Any]], ends: tuple[int, int] | None = None
 ) -> SheetTable:
     """Make a sheet without positions, whose columns are valid unless the state says otherwise."""
     shape = next(iter(columns.values())).shape
@@ -338,31 +327,10 @@ def _points(data: Measurement | xr.Dataset, level: str) -> Float:
 
 
 def _light(corners: Float, elevation: float, azimuth: float) -> Float:
-    """Brightness of faces (N, 3, 3) that a lamp beside the viewer lights on both sides."""
+    """Brightness of faces (N, 3, 3) that a lamp next to the viewer lights on both sides."""
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     length = np.linalg.norm(normals, axis=1)
     high, around = np.radians([elevation + 15, azimuth + 15])
     lamp = [np.cos(high) * np.cos(around), np.cos(high) * np.sin(around), np.sin(high)]
     facing = np.abs(normals @ np.array(lamp)) / np.where(length > 0, length, 1)
     return np.asarray(1 - _SHADE + _SHADE * facing)
-
-
-def _kind(measure: str) -> display.MapKind:
-    """How a map is shown: as the pages do, or after its unit."""
-    kinds = {kind.column: kind for kind in display.MAP_KINDS}
-    if measure in kinds:
-        return kinds[measure]
-    is_map = measure in {row.name for row in MAPS}
-    return replace(
-        display.kind_of(measure),
-        column=measure,
-        title=display_name(measure).capitalize(),
-        unit=unit_of(attributes(measure)["units"]) if is_map else "",
-        digits=3,
-    )
-
-
-def _bar(ax: Any, image: Any, kind: display.MapKind) -> None:  # noqa: ANN401  (of matplotlib)
-    label = kind.title.lower() if kind.unit else kind.title
-    unit = f" [{kind.unit}]" if kind.unit else ""
-    ax.figure.colorbar(image, ax=ax, label=f"{label}{unit}", extend="both", shrink=0.8)

@@ -84,7 +84,7 @@ def write_demo_data(arguments: Sequence[str]) -> ExitCode:
 
 
 def run_demo(arguments: Sequence[str]) -> ExitCode:
-    """Write the demo dataset, run on it, and print true beside measured thickness."""
+    """Write the demo dataset, run on it, and print true and measured thickness."""
     folder = _demo_folder("demo", arguments)
     data, out = folder / "bids", folder / "out"
     _write_demo(data)
@@ -150,11 +150,7 @@ def write_phantoms(arguments: Sequence[str]) -> ExitCode:
 
 
 #: Options of ``figure`` that have another name than its arguments in Python.
-_FIGURE_OPTIONS = {
-    "file": "output",
-    "participant": "participant-label",
-    "session": "session-label",
-}
+_FIGURE_OPTIONS = {"file": "output", "participant": "participant-label", "session": "session-label"}
 
 
 def draw_figure(arguments: Sequence[str]) -> ExitCode:
@@ -189,5 +185,5 @@ def run_validation(arguments: Sequence[str]) -> ExitCode:
     """Refuse, as validation is no part of the package; takes any arguments."""
     raise UsageError(
         "validate: run it from a checkout of hipsta_bids, by `make validation` or"
-        f" `{' '.join(('python -m validation', *arguments))}`",
+        f" `{' '.join(('python -m validation', *arguments))}`"
     )

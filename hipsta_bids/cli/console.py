@@ -163,7 +163,7 @@ class Progress:
 
 @contextmanager
 def searching(*, has_bar: bool) -> Iterator[None]:
-    """Show that segmentations are sought; the results have lines of their own."""
+    """Show that segmentations are sought; the results have separate lines."""
     with Progress(0 if has_bar else -1) as progress:
         progress.show(_SEARCH)
         yield
@@ -256,7 +256,7 @@ def echo_table(rows: Sequence[Mapping[str, str]]) -> None:
 
 
 def _echo_records(rows: Sequence[Mapping[str, str]], columns: Sequence[str], room: int) -> None:
-    """Print each row as lines of its own, one per cell that has something."""
+    """Print each row as separate lines, one per cell that has something."""
     indent = " " * (2 * _GAP)
     for row in rows:
         head, *cells = (f"{c}: {row[c]}" for c in columns if row[c])

@@ -3,7 +3,7 @@
 import argparse
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -112,6 +112,11 @@ def _add_sheets(parser: Parser) -> None:
         choices=REGIONS,
         default=REGIONS[0],
     )
+    _add_selection(add)
+
+
+def _add_selection(add: Callable[..., None]) -> None:
+    """Add the options that select and exclude participants, visits, hemispheres and points."""
     for label, prefix in (("participant", "sub-"), ("session", "ses-")):
         add(
             f"--{label}-label",
@@ -231,6 +236,19 @@ def _add_methods(parser: Parser) -> None:
         " dataset of a template",
     )
     add(
+        "--base",
+        "MEASURE...",
+        "measures and covariates of the base model of classification (default: volume)",
+    )
+    add("--no-classification", "", "omit the classification of groups by logistic models")
+    add(
+        "--settings", "FILE.toml", "settings that change results (see `hipsta-bids settings group`)"
+    )
+
+
+def _add_tests(add: Callable[..., None]) -> None:
+    """Add the options of corrections, permutations and joint tests."""
+    add(
         "--correction",
         "",
         "false discovery rate (fdr2, the default; bh), or family-wise error by permutation "
@@ -259,15 +277,6 @@ def _add_methods(parser: Parser) -> None:
         " (non-parametric combination, family-wise error)",
     )
     add("--joint-sides", "", "with --joint: left and right together, too")
-    add(
-        "--base",
-        "MEASURE...",
-        "measures and covariates of the base model of classification (default: volume)",
-    )
-    add("--no-classification", "", "omit the classification of groups by logistic models")
-    add(
-        "--settings", "FILE.toml", "settings that change results (see `hipsta-bids settings group`)"
-    )
 
 
 def _add_reports(parser: Parser) -> None:
@@ -330,7 +339,7 @@ def run_group_level(arguments: Sequence[str]) -> ExitCode:
         return _run(parsed, arguments)
 
 
-def _run(parsed: argparse.Namespace, arguments: Sequence[str]) -> ExitCode:
+def _check_model(parsed: argparse.Namespace) -> None:
     if parsed.model is not None and (parsed.formula or parsed.contrast):
         raise UsageError("give --model, or --formula and --contrast")
     if parsed.age_model is not None and (parsed.model or parsed.formula):
@@ -338,6 +347,10 @@ def _run(parsed: argparse.Namespace, arguments: Sequence[str]) -> ExitCode:
             "--age-model is of the default model; write poly(age, 2) in the formula, and --contrast"
             ' "nonlinear(age)"'
         )
+
+
+def _run(parsed: argparse.Namespace, arguments: Sequence[str]) -> ExitCode:
+    _check_model(parsed)
     if parsed.reports_only:
         return _rebuild_reports(parsed.output_dir, parsed.name)
     # Thousands of tiny fits: threads of the linear algebra would only get in each other's way.
@@ -397,7 +410,7 @@ def _rebuild_reports(root: Path, name: str | None) -> ExitCode:
 
 
 def _settings(parsed: argparse.Namespace) -> "GroupSettings":
-    """Read the settings, and put those in that have an option of their own."""
+    """Read the settings, and put those in that have a separate option."""
     from hipsta_bids.group.settings import load_group_settings  # noqa: PLC0415  (start-up time)
 
     choices = {
@@ -415,10 +428,7 @@ def _settings(parsed: argparse.Namespace) -> "GroupSettings":
             "base": tuple(parsed.base) or None,
             "added": () if parsed.no_classification else None,
         },
-        "joint": {
-            "measures": tuple(parsed.joint) or None,
-            "sides": parsed.joint_sides or None,
-        },
+        "joint": {"measures": tuple(parsed.joint) or None, "sides": parsed.joint_sides or None},
     }
     for question in joints.find_questions():
         if question.settings:

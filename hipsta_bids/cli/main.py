@@ -23,7 +23,7 @@ _OF_PATHS = {errno.ENAMETOOLONG, errno.ELOOP, errno.ENOTDIR, errno.EACCES, errno
 _LONGEST_PATH = 300  # characters shown
 _SIGNALED = 128  # shells report death by signal n as 128 + n
 
-#: Commands beside the BIDS App: name, its function in `commands`, arguments and meaning for the
+#: Commands other than the BIDS App: name, its function in `commands`, arguments and meaning for the
 #: help. They are loaded when they are called.
 _CORE = (
     ("protocols", "list_protocols", "", "list the known segmentation protocols (also: schemes)"),
@@ -115,7 +115,7 @@ def _terminable() -> Iterator[None]:
 
 
 def _dispatch(arguments: list[str]) -> ExitCode:
-    """Tell the other commands from the BIDS App, whose dataset may be called like one of them."""
+    """Distinguish commands from the BIDS App, whose dataset may have the name of a command."""
     if _DESCRIPTOR in arguments:
         echo((files("hipsta_bids.cli") / "descriptor.json").read_text(encoding="utf-8").rstrip())
         return ExitCode.OK

@@ -104,7 +104,7 @@ class Parser(argparse.ArgumentParser):
         return super().parse_known_args(spelled, namespace)
 
     def error(self, message: str) -> NoReturn:
-        """Turn argparse's message into the package's own error; name words like unknown ones."""
+        """Turn argparse's message into the package's error; name words like unknown ones."""
         hint = ""
         option, values = self._longest_values()
         if values and (lacking := _LACKING.match(message)):

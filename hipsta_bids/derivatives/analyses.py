@@ -64,7 +64,7 @@ class GroupResults:
     def everywhere(self, name: str) -> pd.DataFrame:
         """Join a table of the sheets and tables of other programs' maps."""
         prefixes = [*((self.record.get("inputs") or {}).get("maps") or {}), JOINT]
-        parts = [self.table(name), *(self.table(f"{other}_{name}") for other in prefixes)]
+        parts = [self.table(name), *(self.table(f"{prefix}_{name}") for prefix in prefixes)]
         return pd.concat([part for part in parts if len(part)] or parts[:1], ignore_index=True)
 
 

@@ -1,4 +1,4 @@
-"""Labels that occur twice in an output dataset: found by hashes of quality records, and marked."""
+"""Labels that occur twice in an output dataset, by hashes of quality records."""
 
 import contextlib
 from collections.abc import Iterable, Mapping, Sequence
@@ -15,6 +15,11 @@ _COLUMN = "same_labels"
 _LISTED_NAMES = 6  # names in a message
 
 
+def _label_files(record: Mapping[str, Any]) -> Sequence[Mapping[str, Any]]:
+    edited = [e for e in record.get("edited") or [] if e.get("what") == "labels"]
+    return edited or record.get("inputs") or []
+
+
 def same_labels(
     records: Iterable[tuple[HemisphereName, Mapping[str, Any]]],
 ) -> list[tuple[HemisphereName, ...]]:
@@ -25,8 +30,7 @@ def same_labels(
     """
     groups: dict[tuple[str, ...], list[tuple[HemisphereName, tuple[str, ...]]]] = {}
     for name, record in records:
-        edited = [e for e in record.get("edited") or [] if e.get("what") == "labels"]
-        entries = edited or record.get("inputs") or []
+        entries = _label_files(record)
         hashes = tuple(str(entry.get("sha256") or "") for entry in entries)
         if hashes and all(hashes):
             addresses = tuple(str(entry.get("file")) for entry in entries)

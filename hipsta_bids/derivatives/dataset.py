@@ -97,7 +97,7 @@ def settle_settings(root: Path, settings: Settings) -> str:
     if path.exists():
         earlier = files.read_json(path)
         is_same_version = earlier.get("version") == __version__
-        if earlier.get("hash") == digest and is_same_version:
+        if (earlier.get("hash"), is_same_version) == (digest, True):
             return digest
         before = earlier.get("settings")
         recorded = flatten(before if isinstance(before, dict) else {})
@@ -313,11 +313,7 @@ def references() -> dict[str, str]:
 def _layer_rule(settings: BodySettings, protocols: Sequence[Protocol]) -> str:
     """Describe the molecular layer, and the protocols with which it was excluded."""
     texts: Mapping[str, str] = TEXTS["methods"]["layer"]
-    separate = [
-        protocol.name
-        for protocol in protocols
-        if Tissue.MOLECULAR_LAYER in protocol.interior and not protocol.layer
-    ]
+    separate = [p.name for p in protocols if Tissue.MOLECULAR_LAYER in p.interior and not p.layer]
     rule = texts[settings.layer_rule]
     if settings.join_every_layer or not separate:
         return rule
@@ -349,7 +345,9 @@ def citation_text(
     PyBIDS and probabilities of labels are in it only if they are used.
     """
     about, body, sheet = TEXTS["methods"], settings.body, settings.sheet
-    titles = "; ".join(f"{one.title} [@seg-{one.name}]" for one in protocols) or "none"
+    titles = (
+        "; ".join(f"{protocol.title} [@seg-{protocol.name}]" for protocol in protocols) or "none"
+    )
     text = about["text"].format(
         version=__version__,
         titles=titles,
@@ -553,7 +551,7 @@ def provenance_of(record: Mapping[str, Any]) -> dict[str, str]:
 
 
 def write_inputs(root: Path, rows: Iterable[Row], *, is_whole: bool = True) -> None:
-    """Write ``inputs.tsv``, an account of what a search found.
+    """Write ``inputs.tsv``, which lists the results of a search.
 
     Rows of earlier searches stay if they are about other participants and this one was not about
     every participant.

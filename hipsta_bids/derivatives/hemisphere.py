@@ -158,7 +158,7 @@ def _write_layers(result: ResultPlace, layers: Sheet) -> None:
 def _numbers(axes: Iterable[str], shape: tuple[int, ...]) -> dict[str, list[str]]:
     """Node numbers of all points of a grid, from 1, last axis fastest."""
     numbers = (index.ravel() + 1 for index in np.indices(shape))
-    return {axis: [str(n) for n in own.tolist()] for axis, own in zip(axes, numbers, strict=True)}
+    return {axis: [str(n) for n in v.tolist()] for axis, v in zip(axes, numbers, strict=True)}
 
 
 def _positions(points: Float) -> dict[str, list[str]]:
@@ -172,17 +172,13 @@ def _truths(values: Bool) -> list[str]:
 
 
 def _formatted(rows: Sequence[Column], values: Mapping[str, Float]) -> dict[str, list[str]]:
-    """Format columns in the catalog's order, each with its own number of decimals."""
+    """Format columns in the catalog's order, each with its number of decimals."""
     return {row.name: format_column(values[row.name], row.digits) for row in rows}
 
 
 def _measure(row: Column, wording: str = "{}") -> dict[str, object]:
     """Define the column of a measure, with where its formula comes from."""
-    return {
-        "Description": wording.format(row.definition),
-        "Units": row.unit,
-        "Source": row.source,
-    }
+    return {"Description": wording.format(row.definition), "Units": row.unit, "Source": row.source}
 
 
 def summary_definition(column: str) -> dict[str, object]:
@@ -295,10 +291,7 @@ def _flag_entry(flag: Flag) -> dict[str, Any]:
 
 
 def write_failure(
-    result: ResultPlace,
-    error: HipstaError,
-    record: Mapping[str, Any],
-    body: BodyMask | None = None,
+    result: ResultPlace, error: HipstaError, record: Mapping[str, Any], body: BodyMask | None = None
 ) -> None:
     """Leave nothing of a failed hemisphere but its quality record, and its body to be corrected."""
     remove_results(result)

@@ -126,7 +126,7 @@ def _name(row: dataset.Row) -> HemisphereName:
 
 
 def _rating(row: dataset.Row, rated: Mapping[tuple[str, ...], dataset.Row]) -> str:
-    """Rating of the same labels, if a person saved one beside the table."""
+    """Rating of the same labels, if a person saved one next to the table."""
     rating = rated.get(_key(row), {})
     is_current = rating.get("input_hash") in {files.MISSING, None, row.get("input_hash")}
     return rating.get("rating", files.MISSING) if is_current else files.MISSING

@@ -1,7 +1,7 @@
 """The table of outputs, the names and paths of results, and what sidecars say of images.
 
 Entities follow the order of BIDS 1.11 (``sub ses hemi space seg label desc``). What the standard
-has no rule for is listed in ``.bidsignore``, with the reason, from the table beside it.
+has no rule for is listed in ``.bidsignore``, with the reason, from the table next to it.
 """
 
 import re
@@ -346,7 +346,7 @@ def ignore_file() -> str:
 
 
 #: The sidecars that images of every hemisphere share, in the root of the dataset, as BIDS inherits
-#: them; what a hemisphere's images come from is said beside them.
+#: them; what a hemisphere's images come from is said next to them.
 SHARED = tuple(row for row in OUTPUTS if row.images)
 
 #: Where coordinates are, by the name of the space: ``orig`` is that of the segmentation.

@@ -205,10 +205,33 @@ def _compare(
     sheets: Sequence[tuple[Mapping[str, NDArray[Any]], Mapping[str, float]]],
 ) -> Iterator[tuple[ResultPlace, Row]]:
     """Compare hemispheres, with maps (Nx, Ny) and summaries, of sheets of one shape."""
-    maps, labels = (np.array([one[key] for one, _ in sheets]) for key in ("thickness", "subfield"))
+    maps, labels = (np.array([m[key] for m, _ in sheets]) for key in ("thickness", "subfield"))
+    sides = np.array([place.name.hemi for place in places])
+    texts = _unusual_numbers(places, sheets, labels, sides)
+    for side in np.unique(sides):
+        rows = np.flatnonzero(sides == side)
+        patches = find_patches(maps[rows])
+        is_outlier = patches.outliers(_PATCH, _SMALLEST_PATCH)
+        for n, row in enumerate(rows.tolist()):
+            size, (x, y) = patches.size[n], (int(axis[n]) for axis in patches.place)
+            if is_outlier[n]:
+                texts[row].append(
+                    f"thickness {abs(size):.2f} mm {'above' if size > 0 else 'below'} its"
+                    f" surroundings, unlike in the others: {_position(sheets[row][0], x, y)}"
+                )
+            text = "; ".join(reversed(texts[row])) or files.MISSING
+            yield places[row], {SIZE: f"{abs(size):.2f}", TEXT: text}
+
+
+def _unusual_numbers(
+    places: Sequence[ResultPlace],
+    sheets: Sequence[tuple[Mapping[str, NDArray[Any]], Mapping[str, float]]],
+    labels: NDArray[Any],
+    sides: NDArray[Any],
+) -> list[list[str]]:
+    """Describe for each hemisphere unusual widths and extents; labels are (N, Nx, Ny)."""
     extents = np.array([[s.get(f"extent_{axis}", 0.0) for axis in "xy"] for _, s in sheets])
     visits = [(place.name.subject, place.name.session) for place in places]
-    sides = np.array([place.name.hemi for place in places])
     row_of = {key: row for row, key in enumerate(zip(visits, sides.tolist(), strict=True))}
     twins = [row_of.get((v, "LR"[h == "L"]), -1) for v, h in zip(visits, sides, strict=True)]
     names = sorted(set(labels.ravel().tolist()) - {""})
@@ -228,19 +251,7 @@ def _compare(
             nodes = np.flatnonzero(labels[row, :, y] == names[name]).tolist() or [0]
             text += f": {_position(sheets[row][0], nodes[len(nodes) // 2], y)}"
         texts[row].append(text)
-    for side in np.unique(sides):
-        rows = np.flatnonzero(sides == side)
-        patches = find_patches(maps[rows])
-        is_outlier = patches.outliers(_PATCH, _SMALLEST_PATCH)
-        for n, row in enumerate(rows.tolist()):
-            size, (x, y) = patches.size[n], (int(axis[n]) for axis in patches.place)
-            if is_outlier[n]:
-                texts[row].append(
-                    f"thickness {abs(size):.2f} mm {'above' if size > 0 else 'below'} its"
-                    f" surroundings, unlike in the others: {_position(sheets[row][0], x, y)}"
-                )
-            text = "; ".join(reversed(texts[row])) or files.MISSING
-            yield places[row], {SIZE: f"{abs(size):.2f}", TEXT: text}
+    return texts
 
 
 def _position(sheet: Mapping[str, NDArray[Any]], x: int, y: int) -> str:

@@ -88,7 +88,7 @@ def read_record(result: ResultPlace) -> dict[str, Any]:
     record = files.read_json(result.path("qc"))
     for name in FILE_LISTS:
         entries = record.get(name) or []
-        if not isinstance(entries, list) or not all(isinstance(one, dict) for one in entries):
+        if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
             raise InputError(f"{result.path('qc')}: bad {name}; {_REDO}", reason="bad-json")
     return record
 

@@ -1,4 +1,4 @@
-"""Files of the sheet that all visits of a participant share, beside the folders of the sessions."""
+"""Files of the sheet that all visits of a participant share, above the folders of sessions."""
 
 from collections.abc import Mapping
 from dataclasses import replace

@@ -253,9 +253,9 @@ def _slopes(
     least = LEAST_SLOPE * max(float(square.max()) for square in squared)
     steep: list[Bool] = [square > least for square in squared]
     channels = (0, *range(2, 2 + len(_GROUPS)))
-    number = np.repeat(channels, [int(where.sum()) for where in steep])
-    points = np.concatenate([flat[where] for where in steep])
-    slope = np.concatenate([part[where] for part, where in zip(parts, steep, strict=True)])
+    number = np.repeat(channels, [int(nodes.sum()) for nodes in steep])
+    points = np.concatenate([flat[nodes] for nodes in steep])
+    slope = np.concatenate([part[nodes] for part, nodes in zip(parts, steep, strict=True)])
     slope *= np.where(number == 0, OUTLINE_WEIGHT, 1.0)[:, None]
     return points, number, np.hstack([slope, np.cross(points, slope) / _REACH])
 

@@ -43,7 +43,7 @@ Cues = dict[str, Float]
 
 
 class FoundEnd(NamedTuple):
-    """An end that was found by the automatic rule."""
+    """An end that was placed by the automatic rule."""
 
     level: float
     """Along the axis, mm."""
@@ -65,7 +65,7 @@ class _Profile(NamedTuple):
 
 _NEEDED = ("sheet", "CA1", "CA2-3")
 _STEP = 0.25  # mm between the levels of a profile
-_BESIDE = 2.0  # mm beyond an end, where it is asked why it is there
+_BEYOND = 2.0  # mm beyond an end, where it is asked why it is there
 
 
 def find_ends(
@@ -297,7 +297,7 @@ def _grazed(depth: Float, area: Float, absence: Float, settings: BodySettings) -
     share = np.interp(fine, depth, area) / max(float(area[inner].mean()), 1e-6)
     length = _below(share, settings.end_fullness)
     blurred = _below(ndtr(fine / END_SMOOTHING), settings.end_fullness)
-    labels_end = np.interp(-_BESIDE, depth, absence)
+    labels_end = np.interp(-_BEYOND, depth, absence)
     return float(labels_end * max(length - blurred, 0.0))
 
 
@@ -309,7 +309,7 @@ def _below(share: Float, fullness: float) -> float:
 def _main_evidence(levels: Float, end: float, sign: float, absence: Cues, odd: Cues) -> str:
     """Name the strongest evidence just beyond an end."""
     depth = sign * (levels - end)
-    beyond = (depth < 0) & (depth > -_BESIDE)
+    beyond = (depth < 0) & (depth > -_BEYOND)
     strength = {name: float(share[beyond].mean()) for name, share in absence.items()}
     fields = max(strength[name] for name in _NEEDED)
     shape = float(np.mean([share[beyond].mean() for share in odd.values()]))

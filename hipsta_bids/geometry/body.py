@@ -1,7 +1,7 @@
 """From subfield labels to the hippocampal body: one ribbon between two end planes.
 
 The sheet's subfields are merged, with the molecular layer where the protocol says so. A mask that a
-person corrected replaces them where there is one, the cortex beside the body is added on request,
+person corrected replaces them where there is one, the cortex next to the body is added on request,
 and what the labels lack or have too much is mended (``completion``).
 """
 
@@ -110,7 +110,7 @@ class Body:
         for end, sign in _SIGNS.items():
             depth = sign * ends.height(points, end)
             last = depth < min(_END_REACH, float(depth.max()))
-            last &= number == np.bincount(number[last]).argmax()  # without an uncus beside it
+            last &= number == np.bincount(number[last]).argmax()  # without an uncus next to it
             # The slope of least squares of position on depth; weights fall to zero at the reach,
             # so that no slice enters or leaves as a whole.
             near, weight = points[last], _END_REACH - depth[last]
@@ -304,8 +304,8 @@ def _merge_layer(volume: LabelVolume, settings: BodySettings) -> tuple[completio
         return tissue, 0
     candidates = tissue.copy()
     if settings.layer_rule == "nearest-label":
-        rivals = [t for t in protocol.interior if t not in kinds]
-        candidates[np.isin(volume.tissue, rivals)] = Tissue.OTHER
+        replaced = [t for t in protocol.interior if t not in kinds]
+        candidates[np.isin(volume.tissue, replaced)] = Tissue.OTHER
     # The nearest voxel always has a face neighbor outside.
     border = (candidates > 0) & ~ndimage.binary_erosion(candidates > 0, structure=digital.FACES)
     nearest = completion.value_of_nearest(

@@ -41,7 +41,7 @@ LEAST_STRIP, LEAST_FADE = 0.25, 0.2
 #: They hold nothing farther than this from the curves, one value per round; width of that change.
 #: Later rounds start from the middle lines of the strips of the round before.
 STRIP_REACH, REACH_FADE = (0.9, 0.75), 0.3
-#: The direction of the sheet is found after one, two and three steps of this length from the edge.
+#: The direction of the sheet is measured at one, two and three steps of this length from the edge.
 STRIP_STEP = 0.5
 #: It is averaged over the volume with a Gaussian of this SD, mm, ...
 FLOW_SD = 0.4
@@ -177,7 +177,7 @@ def _in_order(lines: Pair, curves: Pair) -> Pair:
 def _direction_at_edge(flow: Flow, starts: Float, inward: float) -> Float:
     """Compute the unit direction (N, 3) of the flow at the sheet's edge.
 
-    Three steps are made into the sheet; a line through the directions found there is continued
+    Three steps are made into the sheet; a line through the directions there is continued
     to the edge, since the sheet may bend. The length of ``inward`` is the sheet's thickness, mm;
     it is negative where the flow leads out of the sheet.
     """
@@ -265,7 +265,7 @@ class Boundaries:
     """(N, 3) points of the boundary curve, RAS mm."""
     lateral_curve: Float
     side_rule: str
-    """What tells interior from exterior: ``labels``, or, decided on the sheet, ``bending`` or,
+    """How interior and exterior were decided: ``labels``, or, on the sheet, ``bending`` or,
     where cortex is measured, ``continuity`` with the hippocampus."""
     side_margin: float
     """Difference of the shares of outward probes that hit interior labels; NaN without labels."""
@@ -298,8 +298,7 @@ def find_boundaries(
     for bend, anisotropy in TILTS:
         operator = wall.operator(
             settings.changed(
-                sharp_bend=bend * settings.sharp_bend,
-                anisotropy=anisotropy * settings.anisotropy,
+                sharp_bend=bend * settings.sharp_bend, anisotropy=anisotropy * settings.anisotropy
             )
         )
         if first is None:
@@ -401,7 +400,7 @@ def _sides_between(wall: Wall, medial: Bool, lateral: Bool) -> tuple[Bool, Bool]
 
 def _inseparable(curves: Pair, body: Body) -> GeometryError:
     """Say where the two paths come closest to each other."""
-    gap, nearest = (np.asarray(found) for found in cKDTree(curves[1]).query(curves[0]))
+    gap, nearest = (np.asarray(values) for values in cKDTree(curves[1]).query(curves[0]))
     closest = int(gap.argmin())
     position = name_place(np.stack([curves[0][closest], curves[1][nearest[closest]]]), body)
     return GeometryError(

@@ -1,6 +1,6 @@
 """Bumps and dents of a wall of the sheet, also at its ends.
 
-Each column is compared with a line through the columns round it but not beside it, along either
+Each column is compared with a line through the columns round it but not next to it, along either
 axis of the sheet: folds and subfield borders run along one axis and pass both comparisons. At an
 edge the line is extrapolated. The limit is a multiple of the roughness of the smoother wall.
 """
@@ -67,7 +67,7 @@ def check_bumps(sheet: Sheet, settings: CheckSettings) -> list[Finding]:
                     points=walls[patch, wall],
                 )
             )
-    # Beside a bump, lines through it predict too much: no dents. The same beside a dent.
+    # Next to a bump, lines through it predict too much: no dents. The same next to a dent.
     largest = max(findings, key=lambda finding: finding.margin, default=None)
     return [finding for finding in findings if largest and finding.reason == largest.reason]
 

@@ -1,8 +1,8 @@
 """What must hold before a map is written, and what a person should look at.
 
 Labels with noise or thin gaps, cross-sections that do not resemble their neighbors, and coordinates
-that contradict the labels. What the sheet itself shows is in ``sheet_checks``. What checks found
-becomes flags here, with their place and what they mean for the map.
+that contradict the labels. What the sheet itself shows is in ``sheet_checks``. Findings
+become flags here, with their place and what they mean for the map.
 """
 
 from collections.abc import Callable, Sequence
@@ -29,7 +29,7 @@ from hipsta_bids.protocols.protocol import Part, Tissue, lateral_rank
 from hipsta_bids.settings import CheckSettings
 from hipsta_bids.types import Bool, Finding, Flag, Float, Sheet
 
-#: A flag concerns the columns within this distance of what was found, mm.
+#: A flag concerns the columns within this distance of a finding, mm.
 FLAG_REACH = 1.0
 
 #: A cut this near, mm, to both the subiculum and CA2 or CA3 severs but turns that touch.
@@ -341,12 +341,23 @@ def check_labels(body: Body, settings: CheckSettings) -> list[Finding]:
             reason=reason,
             value=value,
             limit=limit,
-            text=what,
+            text=text,
             remedy=remedy,
             points=digital.to_ras(voxels, body.affine),
         )
-        for reason, (value, limit), what, voxels, remedy in rows
+        for reason, (value, limit), text, voxels, remedy in rows
     ]
+
+
+#: What is wrong with a cross-section, and the remedy, by reason.
+_SECTIONS = {
+    "section-notch": ("lacks a part that its neighbors have", "complete the labels there"),
+    "section-bump": ("has a part that its neighbors lack", "look for leaks and bridges there"),
+    "section-intrusion": (
+        "has the sheet between interior labels of its neighbors",
+        "look for bridges there",
+    ),
+}
 
 
 def check_cross_sections(
@@ -391,36 +402,16 @@ def check_cross_sections(
             share = part.sum(axis=(0, 1)) / area
             usual = contrast * (float(np.median(share)) + least)
             outlier.update(part, share, usual, k + field.beyond)
-    rows = (
-        (
-            "section-notch",
-            notch,
-            "lacks a part that its neighbors have",
-            "complete the labels there",
-        ),
-        (
-            "section-bump",
-            bump,
-            "has a part that its neighbors lack",
-            "look for leaks and bridges there",
-        ),
-        (
-            "section-intrusion",
-            intrusion,
-            "has the sheet between interior labels of its neighbors",
-            "look for bridges there",
-        ),
-    )
     return [
         Finding(
             reason=reason,
             value=outlier.share,
             limit=outlier.limit,
-            text=f"a cross-section {what}, {outlier.share:.0%} of its area",
-            remedy=remedy,
+            text=f"a cross-section {_SECTIONS[reason][0]}, {outlier.share:.0%} of its area",
+            remedy=_SECTIONS[reason][1],
             points=field.grid.to_ras(outlier.nodes),
         )
-        for reason, outlier, what, remedy in rows
+        for reason, outlier in zip(_SECTIONS, (notch, bump, intrusion), strict=True)
     ]
 
 
@@ -452,9 +443,7 @@ def flag_margins(findings: Sequence[Finding]) -> dict[str, float]:
 
 
 def raise_flags(
-    findings: Sequence[Finding],
-    sheet: Sheet,
-    position: Callable[[Float], str],
+    findings: Sequence[Finding], sheet: Sheet, position: Callable[[Float], str]
 ) -> list[Flag]:
     """Turn findings beyond their limits into flags, with place and consequence for the map.
 

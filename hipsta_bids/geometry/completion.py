@@ -1,7 +1,7 @@
 """What labels lack, or have too much, before they make one ribbon.
 
 Cavities between the sheet and the dentate gyrus, slits through the sheet, end labels on the wrong
-side of an end plane, and the uncus beside the front of the body.
+side of an end plane, and the uncus next to the front of the body.
 """
 
 from dataclasses import replace
@@ -23,7 +23,7 @@ from hipsta_bids.types import Bool, Float, LabelVolume
 #: 13 directions; where an edge of the voxels is longer than ``slit_voxel``, in the same share of
 #: those across that edge.
 GAP_DIRECTIONS = 3
-#: A gap goes through the sheet if what is beside it falls into two parts, each of at least this
+#: A gap goes through the sheet if what is next to it falls into two parts, each of at least this
 #: share (in six real bodies: none, and gaps with one opening are up to 4.0 mm2).
 SLIT_OPENINGS = 0.2
 #: A voxel without a label lies in a pit if the sheet is this near, mm, ...
@@ -101,7 +101,7 @@ class Cavities(NamedTuple):
 
 
 def find_uncus(tissue: Tissues, affine: Float, ends: EndPlanes) -> Index:
-    """Find voxels (N, 3) of the uncus, which the head bends back to beside the body.
+    """Find voxels (N, 3) of the uncus, which the head bends back to next to the body.
 
     It shows as a second piece of CA2 or CA3 that reaches the anterior plane far medially of the
     first. The part of CA1 that is nearer to it than to the rest, on the way through the sheet, is
@@ -119,7 +119,7 @@ def find_uncus(tissue: Tissues, affine: Float, ends: EndPlanes) -> Index:
     grid[at] = lateral & (ends.depth(points) > 0)
     pieces = ndimage.label(grid, structure=digital.CUBE)[0][at]
     sizes = np.bincount(pieces)[1:] * abs(np.linalg.det(affine[:3, :3]))
-    if len(sizes) < 2 or not medial.any():  # noqa: PLR2004 -- the body's own is the first
+    if len(sizes) < 2 or not medial.any():  # noqa: PLR2004 -- the body's is the first
         return np.zeros((0, 3), np.intp)
     towards = points[medial].mean(axis=0) - points[lateral].mean(axis=0)
     towards -= (towards @ ends.axis) * ends.axis
@@ -129,16 +129,20 @@ def find_uncus(tissue: Tissues, affine: Float, ends: EndPlanes) -> Index:
     uncus = np.zeros(len(points), dtype=bool)
     for number in np.flatnonzero(sizes > UNCUS_SIZE) + 1:
         piece = pieces == number
-        beside = main & (depth < depth[piece].max() + ends.half_slice)
-        body = points[beside if beside.any() else main]
+        adjacent = main & (depth < depth[piece].max() + ends.half_slice)
+        body = points[adjacent if adjacent.any() else main]
         offset = (points[piece].mean(axis=0) - body.mean(axis=0)) @ towards
         if depth[piece].min() < 3 * ends.half_slice and offset > UNCUS_OFFSET:
             uncus |= piece
     if not uncus.any():
         return np.zeros((0, 3), np.intp)
-    beside = depth < depth[uncus].max() + 1.0
+    adjacent = depth < depth[uncus].max() + 1.0
     uncus_grid, body_grid, free = (np.zeros(grid.shape, dtype=bool) for _ in range(3))
-    uncus_grid[at], body_grid[at], free[at] = uncus, (lateral | medial) & beside & ~uncus, beside
+    uncus_grid[at], body_grid[at], free[at] = (
+        uncus,
+        (lateral | medial) & adjacent & ~uncus,
+        adjacent,
+    )
     return np.asarray(index[_nearer_to(uncus_grid, body_grid, free)[at]])
 
 
@@ -233,10 +237,10 @@ def find_cavities(
         )
         piece = pieces[room] == number
         ring = digital.widened(piece) & ~piece
-        beside = ring & solid[room]
+        adjacent = ring & solid[room]
         index = digital.positions(piece) + digital.low_corner(around) + digital.low_corner(room)
         index = index[ends.depth(digital.to_ras(index, volume.affine)) > 0]
-        if not (len(index) and (beside & sheet[room]).any() and (beside & inner[room]).any()):
+        if not (len(index) and (adjacent & sheet[room]).any() and (adjacent & inner[room]).any()):
             continue
         opened = (ring & ~solid[room] & ~enclosed[room]).sum() / ring.sum() / most_open
         radius = ndimage.distance_transform_edt(np.pad(piece, 1), sampling=edges).max()
@@ -265,7 +269,7 @@ def fill_cavities(
     """Make narrow cavities a part of the layer, where it is labeled, and divide others.
 
     Cavities between the sheet and its interior belong to the layer. Wider ones, and ones without a
-    layer beside them, get the nearest label on either side.
+    layer next to them, get the nearest label on either side.
     """
     donors = _subfields(volume)
     narrow = donors
@@ -314,12 +318,12 @@ def fill_slits(
     around = digital.box_around(digital.positions(inside))
     sheet = np.pad(tissue[around] > 0, 1)
     # Between the end planes: next to voxels that lie there.
-    beside = digital.widened(np.pad(inside[around], 1))
+    adjacent = digital.widened(np.pad(inside[around], 1))
     empty = np.pad(unlabeled[around], 1)
     edges = np.linalg.norm(affine[:3, :3], axis=0)
     coarse = edges > settings.slit_voxel
     enclosed = _enclosed(sheet, GAP_DIRECTIONS, coarse)
-    pieces, _ = ndimage.label(empty & beside & enclosed, structure=digital.CUBE)
+    pieces, _ = ndimage.label(empty & adjacent & enclosed, structure=digital.CUBE)
     sizes = digital.piece_sizes(pieces)
     small = np.sort(edges)[:2]
     least = settings.slit_area / float(small[0] * small[1])
@@ -360,8 +364,8 @@ def fill_pits(
             rolled = (np.roll(sheet, sign * n, axis) for n in range(1, count + 1))
             sides += np.logical_or.reduce(list(rolled))
     # Between the end planes: next to voxels that lie there.
-    beside = digital.widened(np.pad(inside[around], room))
-    empty = np.pad(unlabeled[around], room) & ~sheet & beside
+    adjacent = digital.widened(np.pad(inside[around], room))
+    empty = np.pad(unlabeled[around], room) & ~sheet & adjacent
     pieces, _ = ndimage.label(empty & (sides >= PIT_SIDES), structure=digital.FACES)
     sizes = digital.piece_sizes(pieces) * float(np.prod(edges))
     smallest, largest = PIT_SIZE
@@ -383,7 +387,7 @@ def _enclosed(sheet: Bool, directions: int, coarse: Bool) -> Bool:
 
     Steps along a ``coarse`` axis (3,) do not count, and the same share of the others is asked for:
     from one thick slice to the next, a sheet that moves sideways lies on both sides of what is
-    beside it.
+    next to it.
     """
     steps = [step for step in _DIRECTIONS if not np.any(coarse & (np.array(step) != 0))]
     least = max(round(directions * len(steps) / len(_DIRECTIONS)), 1)

@@ -1,6 +1,6 @@
 """Where the hippocampal body begins and ends along its long axis.
 
-A user's planes come first, then planes fitted to head and tail labels. Other ends are found from
+A user's planes come first, then planes fitted to head and tail labels. Other ends come from
 the cross-sections of the labels (``automatic_ends``).
 """
 
@@ -31,18 +31,18 @@ PLANE_TILT = 10.0
 PLANE_PRIOR = 0.05
 
 _FAR = 10.0
-"""A point of a plane may lie beside the hippocampus, but not farther than this, mm."""
+"""A point of a plane may lie next to the hippocampus, but not farther than this, mm."""
 
 _ELONGATED = 1.6
-"""A body whose extents (standard deviations) differ by this ratio has an axis of its own."""
-_BESIDE = 2.0
+"""A body whose extents (standard deviations) differ by this ratio has a separate axis."""
+_NEAR = 2.0
 """What lies within this distance of a plane is its cross-section, mm."""
 
 
 class EndPlane(NamedTuple):
-    """One end plane, and the rule by which it was found.
+    """One end plane, and the rule that placed it.
 
-    The rule is ``user``, ``labels``, or what the automatic rule found most different beyond the
+    The rule is ``user``, ``labels``, or the largest difference for the automatic rule beyond the
     plane: ``subfields`` (no CA1, CA2 or CA3), ``core`` (no dentate gyrus) or ``cross-section``; or
     ``last-slice``.
     """
@@ -56,7 +56,7 @@ class EndPlane(NamedTuple):
     """Standard error over the cues of the automatic rule, mm."""
 
     def entry(self, points: Float) -> dict[str, list[float]]:
-        """Describe the plane for the quality record, by a place beside one of points (N, 3)."""
+        """Describe the plane for the quality record, by a place next to one of points (N, 3)."""
         place = np.array(self.moved("posterior", 0.0, points).point)
         return {
             "point_ras_mm": place.round(3).tolist(),
@@ -64,7 +64,7 @@ class EndPlane(NamedTuple):
         }
 
     def moved(self, end: End, shift: float, points: Float) -> GivenEnd:
-        """Give the plane that lies ``shift`` mm anterior, by a place beside one of points (N, 3).
+        """Give the plane that lies ``shift`` mm anterior, by a place next to one of points (N, 3).
 
         The point of an automatic plane may lie far from the body.
         """
@@ -119,9 +119,9 @@ class EndPlanes:
 
 def hippocampal_voxels(volume: LabelVolume) -> Bool:
     """Mark the voxels (I, J, K) of the hippocampus that have a place along its long axis."""
-    beside = (Tissue.FIMBRIA, Tissue.FISSURE, Tissue.CYST, Tissue.HATA)
+    excluded = (Tissue.FIMBRIA, Tissue.FISSURE, Tissue.CYST, Tissue.HATA)
     labeled = (volume.tissue > 0) & (volume.tissue <= Tissue.HIPPOCAMPUS)
-    return np.asarray(labeled & ~np.isin(volume.tissue, beside))
+    return np.asarray(labeled & ~np.isin(volume.tissue, excluded))
 
 
 def find_end_planes(
@@ -167,7 +167,7 @@ def find_end_planes(
 
 def _level(plane: EndPlane, points: Float, axis: Float) -> float:
     """Where a plane lies along the axis in the middle of the hippocampus, at points (N, 3), mm."""
-    near = points[np.abs((points - plane.point) @ plane.normal) < _BESIDE]
+    near = points[np.abs((points - plane.point) @ plane.normal) < _NEAR]
     return float((near.mean(axis=0) if len(near) else plane.point) @ axis)
 
 

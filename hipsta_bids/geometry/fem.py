@@ -32,7 +32,7 @@ class Laplace:
     """The Laplace operator on triangles or tetrahedra; the matrices are made once.
 
     LaPy (Reuter et al. 2006, Computer-Aided Design 38:342-366) makes them. With the solver
-    ``lapy`` it also solves its own equations. ``two-level`` takes less time: it iterates where most
+    ``lapy`` it also solves its equations. ``two-level`` takes less time: it iterates where most
     vertices of a large volume are free, uses the symmetry of matrices, and asks ARPACK for no more
     vectors than it needs, which ``Solver.poisson`` and ``Solver.eigs`` have no options for.
     """
@@ -132,7 +132,7 @@ class Laplace:
     def first_near(self, values: Float, similar: "Laplace") -> Float:
         """Compute the first eigenfunction (V,), roughly, from a similar operator's.
 
-        The other one's factors take the place of its own (LOBPCG: Knyazev 2001, SIAM J Sci Comput
+        The factors of the other operator are used (LOBPCG: Knyazev 2001, SIAM J Sci Comput
         23:517-541).
         """
         matrix, mass = self._fem.stiffness, self._fem.mass
@@ -239,10 +239,7 @@ class Directed:
 def _factor(matrix: sparse.csc_array) -> linalg.SuperLU:
     """Factorize a symmetric positive definite matrix."""
     return linalg.splu(
-        matrix,
-        permc_spec="MMD_AT_PLUS_A",
-        diag_pivot_thresh=0.0,
-        options={"SymmetricMode": True},
+        matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
     )
 
 

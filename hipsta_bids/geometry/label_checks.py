@@ -111,7 +111,7 @@ def naming_causes(volume: LabelVolume) -> Iterator[None]:
         yield
     except GeometryError as error:
         whole = _check_volumes(volume)[-1:]
-        causes = [f"{found.text} ({found.remedy}); " for found in whole if found.raised]
+        causes = [f"{finding.text} ({finding.remedy}); " for finding in whole if finding.raised]
         sides = border_sides(hippocampal_voxels(volume), volume.affine)
         if sides and error.reason not in _UNCUT:
             remedy = "if it cuts them, use a larger image"
@@ -139,7 +139,7 @@ def _check_tissues(volume: LabelVolume) -> None:
     needed = [tissue.name for tissue in (Tissue.SUBICULUM, Tissue.CA1) if tissue in absent]
     if lateral and lateral.isdisjoint(present):
         needed.append(" or ".join(tissue.name for tissue in LATERAL_END if tissue in lateral))
-    if needed and len(absent) < len(sheet):  # without any there is a message of its own
+    if needed and len(absent) < len(sheet):  # without any there is a separate message
         raise GeometryError(
             f"no label of {', '.join(needed)}, needed by the protocol "
             f"{volume.protocol.name}; check the labels, or name another protocol (--scheme)",
@@ -155,13 +155,13 @@ def _check_volumes(volume: LabelVolume) -> list[Finding]:
     return [
         Finding(
             reason="volume-implausible",
-            value=max(size / most, least / size),
+            value=max(size / high, low / size),
             limit=1.0,
-            text=f"the {name} labels have {size:.0f} mm3, {least:g} to {most:g} mm3 are possible",
+            text=f"the {name} labels have {size:.0f} mm3, {low:g} to {high:g} mm3 are possible",
             remedy="check the voxel size and its unit, and the protocol",
             share=1.0,
         )
-        for (name, (_, least, most)), size in zip(_VOLUMES.items(), sizes.values(), strict=True)
+        for (name, (_, low, high)), size in zip(_VOLUMES.items(), sizes.values(), strict=True)
         if size
     ]
 

@@ -80,7 +80,7 @@ def mean_curvature(sheet: Sheet, level: int, settings: MeasureSettings) -> Float
 def gaussian_curvature(sheet: Sheet, level: int, settings: MeasureSettings) -> Float:
     """Gaussian curvature of one layer of the sheet, (Nx, Ny), 1/mm2.
 
-    Zero where the layer could be laid flat without stretching; positive where it is a bowl or a
+    Zero where the layer could be flattened without stretching; positive where it is a bowl or a
     dome, negative where it is a saddle. It does not depend on which side is interior.
 
     As in :func:`mean_curvature`, but with longer windows along y: noise in the small curvature
@@ -114,7 +114,7 @@ def layer_area(points: Float) -> Float:
 
 
 def column_area(sheet: Sheet) -> Float:
-    """Area of the mid-surface round each column, (Nx, Ny), mm2; none beside undefined points."""
+    """Area of the mid-surface round each column, (Nx, Ny), mm2; none next to undefined points."""
     return node_shares(np.nan_to_num(layer_area(sheet.points[:, :, sheet.middle])))
 
 
@@ -311,17 +311,17 @@ def labels_at(points: Float, body: Body) -> NDArray[np.uint8]:
     last = np.array(body.inside.shape) - 1
     index = tuple(np.clip(voxel, 0, last).T)
     labels = body.tissue[index]
-    beside = np.flatnonzero(~body.inside[index] | ((voxel < 0) | (voxel > last)).any(axis=1))
-    if len(beside):
+    outside = np.flatnonzero(~body.inside[index] | ((voxel < 0) | (voxel > last)).any(axis=1))
+    if len(outside):
         voxels, _ = body.inside_points()
-        labels[beside] = body.tissue[tuple(voxels[body.nearest(points[beside])].T)]
+        labels[outside] = body.tissue[tuple(voxels[body.nearest(points[outside])].T)]
     return np.asarray(labels, dtype=np.uint8)
 
 
 def subfield_areas(whole: Sheet, body: Body) -> dict[Tissue, float]:
     """Area of the mid-surface in each subfield that it has, mm2."""
     at = (np.arange(_POINTS) + 0.5) / _POINTS
-    inner = whole.points[:, :, 1:-1]  # walls lie beside the voxels as often as in them
+    inner = whole.points[:, :, 1:-1]  # walls lie next to the voxels as often as in them
     along_x = _between(inner[:-1], inner[1:], at)
     points = _between(along_x[:, :, :-1], along_x[:, :, 1:], at)
     shares = layer_area(whole.points[:, :, whole.middle])[..., None] / points[..., 0, 0, :, 0].size

@@ -24,11 +24,11 @@ DEPTH_RANK = 0.05
 #: Membranes cheaper than this are applied together; costlier ones one per round.
 SMALL_COST = 5.0
 #: A membrane of the other kind is as likely if its price is less than this many times as high.
-RIVAL_PRICE = 2.0
+ALTERNATIVE_PRICE = 2.0
 #: Tunnels whose membranes overrule less evidence than this change no map, sum of the field.
-RIVAL_COST = 1.0
+ALTERNATIVE_COST = 1.0
 #: Membranes this near to each other remove the same tunnel, grid nodes.
-RIVAL_REACH = 2
+ALTERNATIVE_REACH = 2
 #: A filled hole becomes as thick as the wall within this distance of it, grid nodes.
 PLUG_REACH = 8
 #: Number of nearest nodes of the wall's middle that a filled hole takes its thickness from.
@@ -78,7 +78,7 @@ class Edit(NamedTuple):
     """Evidence overruled by a membrane, before it was thickened: sum of the field."""
     doubtful: bool = False
     """Whether it contradicts the run of the ribbon along the axis."""
-    rival: Index | None = None
+    alternative: Index | None = None
     """(M, 3) nodes of a membrane of the other kind that removes the same tunnel and costs little
     more; None if there is none."""
 
@@ -107,7 +107,7 @@ def apply_membranes(
 ) -> list[Edit]:
     """Apply the cheapest membranes (in place): all small ones, or one large one.
 
-    Without plates, tunnels of the body itself are found; with plates, pieces of an end's
+    Without plates, tunnels of the body itself are searched; with plates, pieces of an end's
     cross-section that are connected only further inside. ``lifted`` receives the values of filled
     holes. ``contact`` returns whether two turns of the sheet touch at nodes (N, 3).
     """
@@ -133,32 +133,34 @@ def apply_membranes(
             break
         if edits and _gain(solid, nodes, kind) <= 0:
             continue  # another membrane has already removed this tunnel
-        rival = _rival(cost, edit, candidates[number + 1 :], state)
+        alternative = _alternative(cost, edit, candidates[number + 1 :], state)
         solid[tuple(nodes.T)] = kind == "fill"
         state[tuple(nodes.T)] = kind == "fill"
         if kind == "fill":
             nodes = _thicken(state, lifted, nodes)
-        edits.append(edit._replace(nodes=nodes, rival=rival))
+        edits.append(edit._replace(nodes=nodes, alternative=alternative))
         if cost > SMALL_COST:
             break
     return edits
 
 
-def _rival(price: float, edit: Edit, dearer: list[tuple[float, Edit]], state: Bool) -> Index | None:
+def _alternative(
+    price: float, edit: Edit, dearer: list[tuple[float, Edit]], state: Bool
+) -> Index | None:
     """Find the nodes of another kind of membrane for the same tunnel at nearly the same price."""
-    if edit.cost < RIVAL_COST:
+    if edit.cost < ALTERNATIVE_COST:
         return None
     tree = cKDTree(edit.nodes)
-    for dearer_price, rival in dearer:
-        if dearer_price > RIVAL_PRICE * price:
+    for dearer_price, alternative in dearer:
+        if dearer_price > ALTERNATIVE_PRICE * price:
             break
-        near = np.asarray(tree.query(rival.nodes)[0]).min() <= RIVAL_REACH
-        if near and rival.kind == "cut" != edit.kind:
-            return rival.nodes
-        if near and rival.kind == "fill" != edit.kind:
+        near = np.asarray(tree.query(alternative.nodes)[0]).min() <= ALTERNATIVE_REACH
+        if near and alternative.kind == "cut" != edit.kind:
+            return alternative.nodes
+        if near and alternative.kind == "fill" != edit.kind:
             filled = state.copy()
-            filled[tuple(rival.nodes.T)] = True
-            return _thicken(filled, np.zeros(state.shape, dtype=np.float32), rival.nodes)
+            filled[tuple(alternative.nodes.T)] = True
+            return _thicken(filled, np.zeros(state.shape, dtype=np.float32), alternative.nodes)
     return None
 
 
@@ -266,13 +268,12 @@ def _implausibility(kind: Kind, nodes: Index, solid: Bool) -> float:
 
     The ribbon runs along the axis, so what fills a hole in it lies along the axis too, and so does
     what cuts a bridge between two of its turns. A cut whose stumps face each other along the axis
-    severs a strip of the ribbon beside a hole. So does one that lies across the axis with ribbon
+    severs a strip of the ribbon next to a hole. So does one that lies across the axis with ribbon
     before and behind it, unless its stumps face each other across. A fill across the axis spans
     the inside of a bend, unless it is the lid of a tunnel that opens at an end plane.
     """
     areas = np.array(
-        [len(np.unique(np.delete(nodes, axis, axis=1), axis=0)) for axis in range(3)],
-        dtype=float,
+        [len(np.unique(np.delete(nodes, axis, axis=1), axis=0)) for axis in range(3)], dtype=float
     )
     oriented = len(nodes) >= ORIENTED_NODES
     across = areas[2] ** 2 / float(areas @ areas)
@@ -325,11 +326,7 @@ def _continues(nodes: Index, solid: Bool) -> bool:
     return bool(continued.mean() > SEVER_SHARE)
 
 
-def _thicken(
-    state: Bool,
-    lifted: NDArray[np.float32],
-    nodes: Index,
-) -> Index:
+def _thicken(state: Bool, lifted: NDArray[np.float32], nodes: Index) -> Index:
     """Make a filled membrane as thick as the wall around it (in place), if the topology allows.
 
     Half the wall's thickness at a node of the membrane is the mean depth of the nearest nodes along

@@ -19,7 +19,7 @@ TAUBIN_SHRINK = 0.5
 TAUBIN_INFLATE = -0.53
 #: How often a surface that TetGen cannot fill is smoothed more.
 UNTANGLE_TRIES = 2
-#: Passes in which TetGen moves its own vertices to better places (its own default is 7). They
+#: Passes in which TetGen moves its vertices to better places (its default is 7). They
 #: cost time; on phantoms the errors were the same without.
 VOLUME_SMOOTHING_STEPS = 0
 
@@ -204,8 +204,8 @@ def tetrahedralize(
     """Fill a surface with tetrahedra; its vertices are first and stay in place.
 
     TetGen: Si 2015, ACM Trans Math Softw 41:11. ``nobisect`` keeps the surface as it is, so that
-    boundary sets found on the surface are valid in the volume. TetGen makes other meshes of the
-    same surface elsewhere, or of its mirror image: it gets the surface in the body's own ``frame``
+    boundary sets of the surface are valid in the volume. TetGen makes other meshes of the
+    same surface elsewhere, or of its mirror image: it gets the surface in the ``frame`` of the body
     (3, 3), which may be left-handed.
     """
     axes = np.eye(3) if frame is None else frame
@@ -273,7 +273,7 @@ def tetra_volumes(vertices: Float, tetrahedra: Int) -> Float:
 
 
 def cross(a: Float, b: Float) -> Float:
-    """Cross products of the rows of (N, 3) arrays, in half the time of NumPy's own."""
+    """Cross products of the rows of (N, 3) arrays, in half the time of NumPy."""
     return np.column_stack(
         [
             a[:, 1] * b[:, 2] - a[:, 2] * b[:, 1],

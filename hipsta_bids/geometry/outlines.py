@@ -29,33 +29,33 @@ MAX_FRAGMENTS = 8
 MAX_RANK_JUMP = 2
 #: Half width of a bridge between fragments, mm.
 BRIDGE_HALF_WIDTH = 0.45
-#: Longest bridge where a slice beside shows the ribbon, to pieces with a subfield of their own, mm.
+#: Longest bridge where a neighboring slice shows the ribbon, to pieces with another subfield, mm.
 MAX_BREAK = 3.0
 #: Fragments farther away are dropped if they are smaller than this, mm2.
 CRUMB_AREA = 1.5
 #: Rings are cut along the cheapest path: cost of its length, to which depth in the ribbon (mm)
 #: is added.
 RING_LENGTH = 0.02
-#: What lies in the ribbon of the slices beside costs their depth times this as well.
-RING_BESIDE = 2.0
+#: What lies in the ribbon of neighboring slices costs their depth times this as well.
+RING_NEIGHBORS = 2.0
 
 Stack = NDArray[np.float32]
 """Images, on fine pixels or on those of the segmentation."""
 
 _VISIBLE_SHARE = 0.2
-"""Share of the way across a gap that a slice beside shows as ribbon, where it is broken."""
+"""Share of the way across a gap that a neighboring slice shows as ribbon, where it is broken."""
 
 
 def outline_slice(
     tissue: NDArray[np.uint8],
     pixel: float,
     settings: SliceSettings,
-    beside: Sequence[NDArray[np.uint8]] = (),
+    neighbors: Sequence[NDArray[np.uint8]] = (),
     soft: tuple[Stack, Stack] | None = None,
 ) -> Stack:
     """Signed distance, mm, from the ribbon's outline in a slice with pixels of ``pixel`` mm.
 
-    Where the ribbon is broken, the slices ``beside`` it show that. Where the ribbon's
+    Where the ribbon is broken, ``neighbors`` show that. Where the ribbon's
     shares (I, J) in the pixels are known, ``soft`` holds them and the proportion (I, J) in which
     the outline follows their half.
 
@@ -80,14 +80,14 @@ def outline_slice(
         weight = ndimage.map_coordinates(proportion, at, order=1, mode="nearest")
         distance += weight * (_from_share(share, fine, settings) - distance)
     ranks = ranks_of(tissue, settings.upsampling)
-    distance = _join(distance, ranks, beside, fine, settings)
+    distance = _join(distance, ranks, neighbors, fine, settings)
     return np.asarray(np.clip(distance, -DISTANCE_REACH, DISTANCE_REACH), dtype=np.float32)
 
 
 def _from_share(share: Stack, fine: float, settings: SliceSettings) -> Float:
     """Signed distance, mm, from where the share (I, J) in pixels is a half; fine pixels.
 
-    Beside the outline it is the excess over a half by the slope, whatever the width of the ramp: a
+    Next to the outline it is the excess over a half by the slope, whatever the width of the ramp: a
     wall that leans in a thick slice has a wide one.
     """
     at = _fine_pixels(share.shape, settings.upsampling)
@@ -126,7 +126,7 @@ def _signed_distance(mask: Bool, pixel: float) -> Float:
 def _join(
     distance: Float,
     ranks: Float,
-    beside: Sequence[NDArray[np.uint8]],
+    neighbors: Sequence[NDArray[np.uint8]],
     pixel: float,
     settings: SliceSettings,
 ) -> Float:
@@ -134,7 +134,7 @@ def _join(
 
     A large piece farther away is left alone: only three dimensions show whether it belongs to the
     ribbon, which may bend into the uncus. But where it has a subfield that the largest one lacks,
-    and a slice beside shows the ribbon between them, the ribbon is broken here.
+    and a neighboring slice shows the ribbon between them, the ribbon is broken here.
     """
     block = np.ones((settings.upsampling,) * 2)
     for _ in range(MAX_FRAGMENTS):
@@ -160,7 +160,7 @@ def _join(
             start = np.array([axis[position] for axis in nearest])
             way = pixel * _segment_distance(distance.shape, start, np.array(position))
             broken = number in lacked and not jump[position]
-            shares = (np.kron(image > 0, block)[way < pixel].mean() for image in beside)
+            shares = (np.kron(image > 0, block)[way < pixel].mean() for image in neighbors)
             broken = broken and any(share > _VISIBLE_SHARE for share in shares)
             limit = MAX_BREAK if broken else settings.max_gap
             if cost[position] <= limit:
@@ -198,13 +198,13 @@ def cut_rings(outlines: Stack, pixel: float) -> Stack:
     """Open each outline (N, I, J), mm, that closes round a hole; fine pixels of ``pixel`` mm.
 
     The sheet is a ribbon: where it closes to a ring, turns touch. The cut follows the cheapest path
-    from the hole to the outside, through parts that are thin here and lie outside in the slices
-    beside.
+    from the hole to the outside, through parts that are thin here and lie outside in the
+    neighboring slices.
     """
     cut = outlines.copy()
     for number in range(len(outlines)):
-        beside = [outlines[k] for k in (number - 1, number + 1) if 0 <= k < len(outlines)]
-        near = np.mean(beside, axis=0) if beside else np.zeros_like(outlines[0])
+        neighbors = [outlines[k] for k in (number - 1, number + 1) if 0 <= k < len(outlines)]
+        near = np.mean(neighbors, axis=0) if neighbors else np.zeros_like(outlines[0])
         for _ in range(MAX_FRAGMENTS):
             path = _way_out(cut[number], near)
             if path is None:
@@ -214,7 +214,7 @@ def cut_rings(outlines: Stack, pixel: float) -> Stack:
     return cut
 
 
-def _way_out(outline: Stack, beside: Stack) -> Bool | None:
+def _way_out(outline: Stack, neighbors: Stack) -> Bool | None:
     """Pixels of the cheapest path through the ribbon from its largest hole; None without holes."""
     empty, count = ndimage.label(np.pad(outline <= 0, 1, constant_values=True))
     if count == 1:
@@ -222,9 +222,9 @@ def _way_out(outline: Stack, beside: Stack) -> Bool | None:
     sizes = piece_sizes(empty)
     sizes[empty[0, 0]] = 0
     outside, hole = empty == empty[0, 0], empty == sizes.argmax()
-    depth, height = np.pad(outline, 1), np.pad(beside, 1, mode="edge")
+    depth, height = np.pad(outline, 1), np.pad(neighbors, 1, mode="edge")
     cost = RING_LENGTH + np.maximum(depth, 0)
-    cost += RING_BESIDE * np.clip(height + SLIT_HALF_WIDTH, 0, 1.5)
+    cost += RING_NEIGHBORS * np.clip(height + SLIT_HALF_WIDTH, 0, 1.5)
     cost[outside | (empty > 0)] = RING_LENGTH
     nodes = np.arange(cost.size).reshape(cost.shape)
     steps = []
@@ -236,11 +236,7 @@ def _way_out(outline: Stack, beside: Stack) -> Bool | None:
     first, second, length = (np.concatenate(part) for part in zip(*steps, strict=True))
     graph = sparse.csr_array((length, (first, second)), shape=(cost.size,) * 2)
     distance, before, _ = csgraph.dijkstra(
-        graph,
-        directed=False,
-        indices=nodes[hole],
-        return_predecessors=True,
-        min_only=True,
+        graph, directed=False, indices=nodes[hole], return_predecessors=True, min_only=True
     )
     at = int(nodes[outside][np.argmin(distance[nodes[outside]])])
     path = np.zeros(cost.size, dtype=bool)
@@ -253,7 +249,7 @@ def _way_out(outline: Stack, beside: Stack) -> Bool | None:
 def drop_doubles(outline: Stack, rank: Float) -> None:
     """Drop, in place, pieces of a slice (I, J) that have no subfield that the largest one lacks.
 
-    The ribbon has each subfield once: a second piece is the uncus, which passes beside the body.
+    The ribbon has each subfield once: a second piece is the uncus, which passes next to the body.
     """
     pieces, count = ndimage.label(outline > 0)
     if count < 2:  # noqa: PLR2004 -- one piece is the ribbon

@@ -1,8 +1,8 @@
 """The ribbon in single slices: its nodes along and across, aligned from slice to slice.
 
 In each slice, harmonic functions run along and across the ribbon and give it nodes. Where nodes of
-two slices belong together is found by monotone matching of their mid-lines, so that the walls of
-one can be moved to those of the other even where the ribbon moves by more than its own thickness.
+two slices belong together follows from monotone matching of their mid-lines, so that the walls of
+one can be moved to those of the other even where the ribbon moves by more than its thickness.
 """
 
 from typing import NamedTuple

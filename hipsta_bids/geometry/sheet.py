@@ -58,7 +58,7 @@ def sample_sheet(mesh: TetMesh, coordinates: Coordinates, settings: SheetSetting
 def sheet_levels(settings: SheetSettings, region: str = "body") -> tuple[Float, Float, Float]:
     """Coordinates of the grid's nodes along x, y and z.
 
-    The body's rows are the rows of its own sheet. Where the region has a head, as many again, less
+    The rows of the body are as without the rest. Where the region has a head, as many again, less
     one, lie before them, and with a tail half as many behind them.
     """
     tail, head = rows_beyond(region, settings.y_nodes)
@@ -115,7 +115,7 @@ def is_flipped(sheet: Sheet, hemi: str) -> bool:
 
 
 def check_flipped(sheet: Sheet, hemi: str) -> Finding:
-    """Flag a sheet whose interior side, found by labels, does not fit its hemisphere."""
+    """Flag a sheet whose interior side, by labels, does not fit its hemisphere."""
     return Finding(
         reason="side-doubtful",
         value=float(is_flipped(sheet, hemi)),
@@ -284,7 +284,7 @@ def straighten_rows(mesh: TetMesh, coordinates: Coordinates, solver: str) -> Coo
     In a thin sheet the volume's harmonic x obeys div(t grad x) = 0 on the mid-surface, t its
     thickness: steps of x are short where the sheet is thin, so that a thin place moves columns of
     whole rows. The new x is a rising function of that one along each row: columns are numbered
-    anew, and none of them moves. Columns beside a notch are squeezed; the others keep their number.
+    anew, and none of them moves. Columns at a notch are squeezed; the others keep their number.
     """
     x, y = np.linspace(-X_OUTERMOST, X_OUTERMOST, X_LINES), np.linspace(-0.998, 0.998, Y_LINES)
     middle = middle_surface(mesh, coordinates, x, y)

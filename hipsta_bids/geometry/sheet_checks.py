@@ -1,4 +1,4 @@
-"""What of a sheet a person should look at, as it does not resemble the sheet beside it.
+"""What of a sheet a person should look at, as it does not resemble the neighboring sheet.
 
 Rows that are narrower, edges that recede, and maps that a second choice moves.
 """
@@ -56,8 +56,8 @@ def check_edges(whole: Sheet, settings: CheckSettings) -> list[Finding]:
     step, count = node_step(middle, axis=1), middle.shape[1]
     inner = min(max(round(INWARD / node_step(middle, axis=0)), 1), middle.shape[0] - 1)
     findings = []
-    for name, edge, beside in (("medial", 0, inner), ("lateral", -1, -1 - inner)):
-        outline, inward = middle[edge], middle[beside] - middle[edge]
+    for name, edge, inward_row in (("medial", 0, inner), ("lateral", -1, -1 - inner)):
+        outline, inward = middle[edge], middle[inward_row] - middle[edge]
         best = (0.0, 0.0, settings.flag_edge[0], 0, 0)
         for reach, limit in zip(EDGE_REACH, settings.flag_edge, strict=True):
             k = max(round(reach / step), 1)

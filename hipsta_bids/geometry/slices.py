@@ -1,6 +1,6 @@
 """Between thick slices: the shape of each slice is moved into the next one.
 
-Where slices are much thicker than their pixels, the ribbon moves sideways by its own thickness from
+Where slices are much thicker than their pixels, the ribbon moves sideways by its thickness from
 one slice to the next, and blending slices in place would break it. Each slice becomes a signed
 distance from its outline (``outlines``); the ribbons of neighboring slices are aligned
 (``ribbon``), or registered where one is none, and the shapes between them are blends of both, moved
@@ -32,7 +32,7 @@ PATH_SMOOTHING = 1.0
 #: Standard deviation of the window of the registration of slices, mm.
 FLOW_WINDOW = 1.0
 #: Added to the mean squared slope in a window, which is 1 where outlines fill it: keeps
-#: displacements small where the outlines do not tell them.
+#: displacements small where the outlines do not show them.
 FLOW_RIDGE = 0.02
 #: Standard deviation of the Gaussian on displacements after each iteration, mm.
 FLOW_SMOOTHING = 0.5
@@ -216,7 +216,7 @@ def has_thick_slices(affine: Float, settings: SliceSettings) -> bool:
 
 def sample_slices(body: Body, points: Float, settings: SliceSettings) -> Stack:
     """Sample the body's mask between and beyond its thick slices, at points (N, 3), RAS mm."""
-    body = _in_own_order(body)
+    body = _in_slice_order(body)
     pixel = float(np.linalg.norm(body.affine[:3, :3], axis=0)[1:].mean())
     labeled = _labeled_ends(body)
     part = _bounds(body, outlines.DISTANCE_REACH / pixel, labeled)
@@ -235,7 +235,7 @@ def sample_slices(body: Body, points: Float, settings: SliceSettings) -> Stack:
     return np.asarray(np.clip(distance / (2 * RAMP_HALF_WIDTH) + 0.5, 0, 1), dtype=np.float32)
 
 
-def _in_own_order(body: Body) -> Body:
+def _in_slice_order(body: Body) -> Body:
     """Count the body's slices from posterior to anterior, first, and voxels from medial to lateral.
 
     So the order in which an image stores its voxels decides nothing. What refers to voxels by their
@@ -257,6 +257,21 @@ def _in_own_order(body: Body) -> Body:
     if body.soft:
         volumes["soft"] = body.soft._replace(values=body.soft.values.transpose(order)[flips])
     return replace(body, **volumes, affine=affine)
+
+
+def _part_ribbons(
+    images: Stack, tissue: NDArray[np.uint8], fine: float, settings: SliceSettings
+) -> list[Float | None]:
+    """Part doubled outlines and turns of ribbons in place, and return the nodes of ribbons."""
+    ribbons = []
+    for outline, labels in zip(images, tissue, strict=True):
+        rank = outlines.ranks_of(labels, settings.upsampling)
+        outlines.drop_doubles(outline, rank)
+        ribbons.append(nodes := ribbon.ribbon_nodes(outline, rank, fine))
+        if nodes is not None:
+            ribbon.keep_whole(outline, nodes, fine)
+            ribbon.part_turns(outline, nodes, fine)
+    return ribbons
 
 
 def _stacked(
@@ -292,17 +307,7 @@ def _stacked(
     plain = images
     images = np.minimum(images, outlines.keep_apart(ends[0], ends[1]))
     images = outlines.cut_rings(images, fine)
-    ranks = [outlines.ranks_of(image, settings.upsampling) for image in tissue]
-    for outline, rank in zip(images, ranks, strict=True):
-        outlines.drop_doubles(outline, rank)
-    ribbons = [
-        ribbon.ribbon_nodes(outline, rank, fine)
-        for outline, rank in zip(images, ranks, strict=True)
-    ]
-    for outline, nodes in zip(images, ribbons, strict=True):
-        if nodes is not None:
-            ribbon.keep_whole(outline, nodes, fine)
-            ribbon.part_turns(outline, nodes, fine)
+    ribbons = _part_ribbons(images, tissue, fine, settings)
     if any(nodes is None for nodes in ribbons):
         flows = register_slices(images, pixel, settings)
     else:
@@ -341,10 +346,7 @@ def _misfit(stack: _SliceStack, share: Stack, usable: Bool, pixel: float, soft: 
 
 
 def _align(
-    flows: Stack,
-    bends: Stack,
-    ribbons: list[Float | None],
-    settings: SliceSettings,
+    flows: Stack, bends: Stack, ribbons: list[Float | None], settings: SliceSettings
 ) -> None:
     """Replace, in place, displacements between slices with nodes by those of the nodes."""
     up = settings.upsampling

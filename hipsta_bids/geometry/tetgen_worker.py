@@ -1,9 +1,9 @@
-"""TetGen in a process of its own.
+"""TetGen in a separate process.
 
 TetGen aborts the whole process on some self-intersecting surfaces, sometimes without an exception.
 This module is run as a program that meshes one surface after the other, and holds the client that
 starts it, waits, and starts it again after a crash. Messages are pickles with their length in
-front, over the standard streams. The file stands alone, with its own types, because the program
+front, over the standard streams. The file stands alone, with its types, because the program
 must start fast and hold little memory: it loads nothing but NumPy and TetGen.
 """
 
@@ -64,7 +64,7 @@ class TetgenClient:
             environment = dict(os.environ, OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
             # A process that is isolated from the user's Python settings starts an isolated one.
             isolated = ["-I"] if sys.flags.isolated else []
-            self._process = subprocess.Popen(  # noqa: S603 -- our own module
+            self._process = subprocess.Popen(  # noqa: S603 -- our module
                 [sys.executable, *isolated, "-m", __name__],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
@@ -103,7 +103,7 @@ def _write(stream: IO[bytes], message: object) -> None:
 
 def _read(stream: IO[bytes], deadline: float | None = None) -> Any:  # noqa: ANN401 -- any message
     (size,) = _HEADER.unpack(_exactly(stream, _HEADER.size, deadline))
-    return pickle.loads(_exactly(stream, size, deadline))  # noqa: S301 -- our own child or parent
+    return pickle.loads(_exactly(stream, size, deadline))  # noqa: S301 -- our child or parent
 
 
 def _exactly(stream: IO[bytes], size: int, deadline: float | None) -> bytes:

@@ -98,10 +98,7 @@ class SolidField:
 
 
 def repair_topology(
-    field: Field,
-    settings: TopologySettings,
-    locate: Locate,
-    contact: Contact,
+    field: Field, settings: TopologySettings, locate: Locate, contact: Contact
 ) -> SolidField:
     """Make the positive part of a field one solid piece without tunnels.
 
@@ -147,18 +144,14 @@ def repair_topology(
     after = state[membranes.INNER]
     size = int(np.count_nonzero(before))
     changed, touched = _changes(field, after, edits)
+    consistent = _consistent_values(lifted[membranes.INNER], after)
     repairs = tuple(
         _describe(edit, field, size, settings, locate)
         for edit in edits
         if _between_planes(edit, field).mean() > 0.5  # noqa: PLR2004 -- most of it
     )
     return SolidField(
-        field=replace(
-            field,
-            values=_consistent_values(lifted[membranes.INNER], after),
-            separated=None,
-            slits=None,
-        ),
+        field=replace(field, values=consistent, separated=None, slits=None),
         before=field,
         repairs=repairs,
         touched=touched,
@@ -173,8 +166,8 @@ def _second_choices(field: Field, edits: Sequence[membranes.Edit]) -> Field | No
     """Cut where holes were filled, and fill where bridges were cut, if that was as likely."""
     values = field.values.copy()
     for edit in edits:
-        if edit.rival is not None:
-            nodes = edit.rival - membranes.FIRST
+        if edit.alternative is not None:
+            nodes = edit.alternative - membranes.FIRST
             nodes = nodes[((nodes >= 0) & (nodes < values.shape)).all(axis=1)]
             values[tuple(nodes.T)] = -0.1 if edit.kind == "fill" else 0.1
     return None if np.array_equal(values, field.values) else replace(field, values=values)
@@ -350,13 +343,13 @@ def _describe(
         position=(float(center[0]), float(center[1]), float(center[2])),
         subfield=locate(center[None]),
         excess=float("inf")
-        if edit.doubtful or (kind == "fill" and _beside_slit(inside, field))
+        if edit.doubtful or (kind == "fill" and _touches_slit(inside, field))
         else max(cost / max(limit, 1e-9), 0.0 if kind == "uncus" else len(nodes) / (share * size)),
         points=points,
     )
 
 
-def _beside_slit(nodes: digital.Index, field: Field) -> bool:
+def _touches_slit(nodes: digital.Index, field: Field) -> bool:
     """Whether a hole lies next to a slit between turns, which then went through a wall."""
     if field.separated is None:
         return False
@@ -462,7 +455,7 @@ def _changed_nodes(solid: SolidField, points: Float) -> tuple[Float, Float]:
 
 
 def _cells(points: Float, columns: digital.Index, parts: digital.Index) -> Float:
-    """Interpolate round columns, up to halfway to their neighbors; NaN beside undefined ones."""
+    """Interpolate round columns, up to halfway to their neighbors; NaN next to undefined ones."""
     steps = [np.linspace(-0.5, 0.5, int(n) + 1) for n in parts]
     offsets = np.stack(np.meshgrid(*steps, indexing="ij"), axis=-1).reshape(-1, 2)
     last = np.array(points.shape[:2]) - 1

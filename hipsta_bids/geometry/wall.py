@@ -33,8 +33,8 @@ class _Mesh(TriaMesh):  # type: ignore[misc]  # LaPy is untyped
         inner = sparse.triu(self.adj_dir.multiply(self.adj_dir.T), format="csr")
         inner.sort_indices()
         triangle = self.construct_adj_dir_tidx()
-        beside = [inner.multiply(side).tocsr().data for side in (triangle, triangle.T)]
-        return np.stack(inner.nonzero(), axis=1), np.stack(beside, axis=1).astype(np.int32) - 1
+        adjacent = [inner.multiply(side).tocsr().data for side in (triangle, triangle.T)]
+        return np.stack(inner.nonzero(), axis=1), np.stack(adjacent, axis=1).astype(np.int32) - 1
 
     def curvature_tria(self, smoothit: int = 3) -> tuple[Float, Float, Float, Float]:
         """Directions (T, 3) and values (T,) of least and largest curvature, as in LaPy."""
@@ -53,7 +53,7 @@ class _Mesh(TriaMesh):  # type: ignore[misc]  # LaPy is untyped
 
 
 class Wall:
-    """The surface without its caps, in one piece, with vertices of its own numbering."""
+    """The surface without its caps, in one piece, with vertices numbered anew."""
 
     def __init__(self, surface: Surface, settings: BoundarySettings) -> None:
         triangles = _one_piece(surface.triangles[mesh.lateral_triangles(surface)])

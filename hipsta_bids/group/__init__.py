@@ -6,25 +6,22 @@ Called as a function, ``hipsta_bids.group(maps, table, formula)``, it fits a mod
 
 import inspect
 import sys
+from collections.abc import Callable
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from hipsta_bids.api.models import GroupFit
+from hipsta_bids.joints import load
 
 
-def _function() -> "Callable[..., GroupFit]":
-    from hipsta_bids.api.models import group  # noqa: PLC0415  (most imports need no model)
-
-    return group
+def _function() -> Callable[..., Any]:
+    function: Callable[..., Any] = load("hipsta_bids.api.models:group")
+    return function
 
 
 class _Package(ModuleType):
     """A package with the call, signature and text of the function that it hides by its name."""
 
-    def __call__(self, *arguments: Any, **named: Any) -> "GroupFit":  # noqa: ANN401  (of the function)
+    def __call__(self, *arguments: Any, **named: Any) -> Any:  # noqa: ANN401  (of the function)
         """Fit a model to arrays, see :func:`hipsta_bids.api.models.group`."""
         return _function()(*arguments, **named)
 

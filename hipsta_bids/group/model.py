@@ -150,9 +150,9 @@ class Comparison:
     def suffix(self) -> str:
         """The part of names that distinguishes folders of results of one formula."""
         if self.pair:
-            return f"_change-{'-'.join(one.removeprefix('ses-') for one in self.pair)}"
+            return f"_change-{'-'.join(label.removeprefix('ses-') for label in self.pair)}"
         if self.endpoint:
-            return f"_{'-'.join(one.removeprefix('ses-') for one in self.endpoint)}"
+            return f"_{'-'.join(label.removeprefix('ses-') for label in self.endpoint)}"
         return "_longitudinal" if self.longitudinal else ""
 
     @property
@@ -268,6 +268,24 @@ def model_document(
             formula, contrasts, request.name or folder_name(formula)
         )
     comparison = comparison or Comparison()
+    _check_default(table, groups, settings, comparison, visits)
+    covariates = visits.covariates if visits else settings.model.covariates
+    time = visits.column if visits else None
+    formula = default_formula(table, groups, settings, covariates=covariates, time=time)
+    contrasts = list(request.contrasts) or _default_contrasts(
+        formula, groups, settings, comparison, visits
+    )
+    return formulas.model_from_shortcut(formula, contrasts, request.name or folder_name(formula))
+
+
+def _check_default(
+    table: pd.DataFrame,
+    groups: Groups | None,
+    settings: GroupSettings,
+    comparison: Comparison,
+    visits: VisitTime | None,
+) -> None:
+    """Refuse data without the groups or the times that the default model needs."""
     has_changes = comparison.longitudinal and not comparison.endpoint
     within = has_changes or comparison.pair or comparison.asymmetry
     if groups is None and not within:
@@ -281,26 +299,34 @@ def model_document(
             f"no column has two groups ({', '.join(settings.model.group_columns)}); "
             f'{available}; or give --formula "age + sex" --contrast age'
         )
-    time = visits.column if visits else None
     if has_changes and not table[PARTICIPANT].duplicated().any():
         raise ModelError(
             "longitudinal model: no participant has a second session; remove --longitudinal"
         )
-    if has_changes and time is None:
+    if has_changes and (visits is None or visits.column is None):
         raise ModelError(
             "the default longitudinal model needs the time of each session: a column"
             f" {', '.join(settings.longitudinal.time_columns)}, acq_time or age in sessions.tsv"
         )
-    covariates = visits.covariates if visits else settings.model.covariates
-    formula = default_formula(table, groups, settings, covariates=covariates, time=time)
+
+
+def _default_contrasts(
+    formula: str,
+    groups: Groups | None,
+    settings: GroupSettings,
+    comparison: Comparison,
+    visits: VisitTime | None,
+) -> list[str]:
+    """Return the contrasts of the default model."""
+    time = visits.column if visits else None
     bent = [name for name in closed_formula(formula).names if name.casefold() in AGES]
     bent = [] if settings.model.age == "linear" else bent
-    contrasts, endpoint = list(request.contrasts), comparison.endpoint
-    if not contrasts and visits is not None and time == VISIT:
-        contrasts = visit_contrasts(groups.contrasts() if groups else [], visits.labels, endpoint)
+    contrasts = list[str]()
+    if visits is not None and time == VISIT:
+        pairs = groups.contrasts() if groups else []
+        contrasts = visit_contrasts(pairs, visits.labels, comparison.endpoint)
         time, groups = None, None if contrasts else groups
-    contrasts += [] if request.contrasts else default_contrasts(groups, time, bent)
-    return formulas.model_from_shortcut(formula, contrasts, request.name or folder_name(formula))
+    return contrasts + default_contrasts(groups, time, bent)
 
 
 def _formula_contrasts(

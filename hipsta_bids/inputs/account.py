@@ -1,4 +1,4 @@
-"""An account of all that a search came upon: used, failed, not used, or not a segmentation.
+"""A list of all entries of a search: used, failed, not used, or not a segmentation.
 
 A folder that has no row for what is in it stands for all of that. Names that begin with a dot are
 passed over.
@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import filterfalse
 from pathlib import Path
 
 from hipsta_bids.inputs import tree
@@ -33,7 +34,7 @@ _DEPTH, _MOST_ENTRIES = 5, 3000
 
 
 def selection_table(items: Iterable[HemisphereInput]) -> list[dict[str, str]]:
-    """Describe the segmentations found and the reasons, one row per hemisphere and protocol."""
+    """Describe the selected segmentations with reasons, one row per hemisphere and protocol."""
     return [
         {
             "subject": item.subject,
@@ -62,7 +63,7 @@ def ignored_table(ignored: Iterable[tree.Ignored]) -> list[dict[str, str]]:
 def other_entries_table(other_entries: Iterable[tree.Ignored]) -> list[dict[str, str]]:
     """Describe the entries without a segmentation, one row each; inside of subjects, a count.
 
-    All have a row of their own in ``inputs.tsv``.
+    All have a separate row in ``inputs.tsv``.
     """
     entries = [entry for entry in other_entries if entry.template]
     inner = Counter(entry.path.parent for entry in entries if entry.subject)
@@ -74,7 +75,7 @@ def other_entries_table(other_entries: Iterable[tree.Ignored]) -> list[dict[str,
 def input_table(
     items: Iterable[HemisphereInput], unused: Iterable[tree.Ignored], bids_dir: Path
 ) -> list[dict[str, str]]:
-    """Account for all that a search found, one row per hemisphere, file or folder."""
+    """List all that a search read, one row per hemisphere, file or folder."""
 
     def row(path: Path, visit: Owner, status: str, reason: str) -> dict[str, str]:
         labels = {"subject": visit.subject, "session": visit.session, "hemi": visit.hemi}
@@ -94,7 +95,7 @@ def input_table(
         if item.probabilities:
             text = f"probabilities of the same labels, files: {len(item.probabilities.files)}"
             reasons.append((item.probabilities.files[0][0], status, text))
-        reasons += [(item.path_of(name), tree.NOT_USED, why) for name, why in item.passed_over]
+        reasons += [(item.path_of(name), tree.NOT_USED, r) for name, r in item.passed_over]
         of_item = [row(path, item, *reason) for path, *reason in reasons]
         of_item[0] = item.origin | of_item[0]
         rows += [cells | {"seg": item.protocol.name} for cells in of_item]
@@ -142,12 +143,13 @@ def _first_labels(path: Path) -> str | None:
 def unused_of_visit(
     context: Context, items: Sequence[HemisphereInput], *, explain: bool
 ) -> Iterator[tree.Ignored]:
-    """Account for all that was not used in the folders of a visit."""
+    """List all that was not used in the folders of a visit."""
     visit, root = context.visit, context.source.path
     top = root / visit.folders[0].path.relative_to(root).parts[0]
     entry_of = partial(tree.Ignored, subject=visit.subject, session=visit.session, inside=top)
-    used_paths = {path for item in items for path in item.files}
-    used_paths |= {item.path_of(name) for item in items for name, _ in item.passed_over}
+    used_paths = {
+        path for item in items for path in (*item.files, *map(item.path_of, dict(item.passed_over)))
+    }
     n_other = sum(len(folder.names) for folder in visit.folders) - len(used_paths)
     has_labels = bool(items)
     for folder in visit.folders:
@@ -160,11 +162,10 @@ def unused_of_visit(
         for name in folder.inner:
             if text := _inner_reason(folder.path, name):
                 yield entry_of(path=folder.path / name, reason=text)
-    sides = {item.hemi for item in items}
-    for hemi in context.selection.wanted_hemis() if sides else ():
-        if hemi not in sides:
-            reason = "no labels of this hemisphere, but of the other"
-            yield entry_of(path=items[0].files[0].parent, hemi=hemi, reason=reason)
+    present = [item.hemi for item in items] or context.selection.wanted_hemis()
+    for hemi in filterfalse(present.__contains__, context.selection.wanted_hemis()):
+        reason = "no labels of this hemisphere, but of the other"
+        yield entry_of(path=items[0].files[0].parent, hemi=hemi, reason=reason)
     if not has_labels and explain | bool(visit.session):
         yield _without_labels(context, entry_of)
     elif n_other:
@@ -173,7 +174,7 @@ def unused_of_visit(
 
 
 def _inner_reason(folder: Path, name: str) -> str:
-    """Tell why a folder inside of a subject's is not searched, if somebody may miss it."""
+    """Describe why a folder inside of a subject's is not searched, if somebody may miss it."""
     if layout_of(name):
         return "a folder, though it is named as labels are"
     if name in _OTHER_FOLDERS or tree.is_inner(name):
@@ -198,8 +199,8 @@ def _why_not(path: Path, context: Context) -> tuple[str, bool]:
             "labels of unknown meaning; name them with --scheme or in dataset_description.json",
             True,
         )
-    if layout.beside:
-        return f"no {' or '.join(sorted(layout.beside))} beside it", False
+    if layout.companions:
+        return f"no {' or '.join(sorted(layout.companions))} beside it", False
     if find_table(path, context.source.path) is None:
         return "no _dseg.tsv defines the labels; -d NAME=PATH names the dataset", False
     return "its table names no subiculum and CA1", True

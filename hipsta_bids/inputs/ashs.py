@@ -45,7 +45,7 @@ def choose_atlas(request: scan.InputRequest) -> Protocol | None:
 class AtlasFinder:
     """Identifies the atlas of each segmentation of one dataset.
 
-    In this order: the option; a label table beside or above the file; the values, if only one atlas
+    In this order: the option; a label table near or above the file; the values, if only one atlas
     has them; as one dataset is made with one atlas, the values of a sample of the dataset's files,
     if all of them that fit one atlas only fit the same one; and the first of several atlases by
     name, if the body is the same with all of them.
@@ -135,7 +135,7 @@ class AtlasFinder:
         for image in self._sample():
             try:
                 fitting = self._fitting(image)
-            except InputError:  # its own hemisphere will report it
+            except InputError:  # its hemisphere will report it
                 continue
             if _one_body(fitting):
                 proofs.append(fitting)
@@ -188,4 +188,4 @@ def _first(protocols: Sequence[Protocol], text: str) -> tuple[Protocol, str]:
 
 def _one_body(protocols: list[Protocol]) -> bool:
     """Check that there are protocols, and that all give the same body."""
-    return bool(protocols) and all(protocols[0].same_body(other) for other in protocols[1:])
+    return bool(protocols) and all(protocols[0].same_body(protocol) for protocol in protocols[1:])

@@ -1,7 +1,7 @@
 """What a person corrected or placed: labels, masks, and the end planes of the body.
 
-``*_desc-edited_dseg`` and ``*_desc-edited_mask`` lie beside the labels that they correct, in the
-output dataset, or in a folder of their own (``--edited-dir``), laid out like a BIDS derivative:
+``*_desc-edited_dseg`` and ``*_desc-edited_mask`` lie next to the labels that they correct, in the
+output dataset, or in a separate folder (``--edited-dir``), arranged like a BIDS derivative:
 ``sub-X[/ses-Y]/anat/sub-X[_ses-Y]_hemi-H[_seg-P]_desc-edited_dseg``.
 
 The table of ``--ends`` has one row per end: ``participant_id``, ``session`` where there are
@@ -43,8 +43,8 @@ class EditedFile(Visit):
     """An edited file, and whose it is."""
 
     edit: scan.Edit
-    beside: bool
-    """Found in a dataset of segmentations, not in the folder of edits."""
+    in_dataset: bool
+    """Whether it is in a dataset of segmentations, not in the folder of edits."""
 
     @property
     def names(self) -> dict[str, str]:
@@ -53,14 +53,16 @@ class EditedFile(Visit):
 
 
 def edits_of_visit(
-    visit: tree.VisitFolders, root: Path, source: str, *, beside: bool
+    visit: tree.VisitFolders, root: Path, source: str, *, in_dataset: bool
 ) -> Iterator[EditedFile]:
     """List the edited files in the folders of one visit."""
     for folder in visit.folders:
         for name in filter(is_edited, folder.names):
             kind = _KINDS[entities(name)["suffix"]]
             edit = scan.Edit(kind=kind, path=folder.path / name, source=source, source_path=root)
-            yield EditedFile(edit=edit, subject=visit.subject, session=visit.session, beside=beside)
+            yield EditedFile(
+                edit=edit, subject=visit.subject, session=visit.session, in_dataset=in_dataset
+            )
 
 
 def list_edits(
@@ -86,7 +88,7 @@ def _edits_of_dataset(
     return [
         file
         for visit in filter(selection.wants_visit, tree.list_visits(selected_folders, ignored))
-        for file in edits_of_visit(visit, root, name, beside=False)
+        for file in edits_of_visit(visit, root, name, in_dataset=False)
     ]
 
 
@@ -133,7 +135,7 @@ def _corrects(file: EditedFile, item: scan.HemisphereInput) -> bool:
         _misnamed(file) is None
         and (file.subject, file.session, names["hemi"]) == (item.subject, item.session, item.hemi)
         and names.get("seg", item.protocol.name) == item.protocol.name
-        and (not file.beside or file.edit.path.parent in {path.parent for path in item.files})
+        and (not file.in_dataset or file.edit.path.parent in {path.parent for path in item.files})
     )
 
 
@@ -155,32 +157,32 @@ def _why_not(file: EditedFile, items: list[scan.HemisphereInput]) -> str:
         return misnamed
     hemi = file.names["hemi"]
     hemisphere = f"sub-{file.subject}{f' ses-{file.session}' if file.session else ''} hemi-{hemi}"
-    rivals = [
+    candidates = [
         item
         for item in items
         if (item.subject, item.session, item.hemi) == (file.subject, file.session, hemi)
     ]
-    if not rivals:
+    if not candidates:
         return f"no labels of {hemisphere} are processed"
-    protocols = {item.protocol.name for item in rivals}
-    if file.names.get("seg", rivals[0].protocol.name) not in protocols:
+    protocols = {item.protocol.name for item in candidates}
+    if file.names.get("seg", candidates[0].protocol.name) not in protocols:
         return (
             f"its name has seg-{file.names['seg']}, but {hemisphere} has "
             f"seg-{', seg-'.join(protocols)}"
         )
     return (
-        f"it does not lie beside the labels of {hemisphere} ({rivals[0].files[0].parent}); move it "
-        "there, or name its folder with --edited-dir"
+        f"it does not lie beside the labels of {hemisphere} ({candidates[0].files[0].parent}); move"
+        " it there, or name its folder with --edited-dir"
     )
 
 
 def _corrected(item: scan.HemisphereInput, edits: list[scan.Edit]) -> scan.HemisphereInput:
     """Attach the edits of one hemisphere, if there is one of each kind at most."""
     for kind in _KINDS.values():
-        rivals = [edit.path for edit in edits if edit.kind == kind]
-        if len(rivals) > 1:
+        candidates = [edit.path for edit in edits if edit.kind == kind]
+        if len(candidates) > 1:
             problem = InputError(
-                f"{' and '.join(map(str, rivals))}: two edited files with the {kind} of one "
+                f"{' and '.join(map(str, candidates))}: two edited files with the {kind} of one "
                 "hemisphere; keep one",
                 reason="edit-ambiguous",
             )
@@ -301,6 +303,21 @@ def _vector(cells: dict[str, str], names: Sequence[str]) -> tuple[float, float, 
     return numbers[0], numbers[1], numbers[2]
 
 
+def _with_labels_of(
+    items: Sequence[scan.HemisphereInput], path: Path
+) -> tuple[list[EndRow], list[str]]:
+    """Read a table of ends, and spell subjects and sessions as the hemispheres do."""
+    rows, notes = read_ends(path), list[str]()
+    for name in ("subject", "session"):
+        labels = [getattr(row, name) or "" for row in rows]
+        data = [label for item in items if (label := getattr(item, name))]
+        matches, lines = match_labels(filter(None, labels), data, str(path))
+        changes: list[dict[str, Any]] = [{name: matches.get(x, x) or None} for x in labels]
+        rows = [replace(row, **change) for row, change in zip(rows, changes, strict=True)]
+        notes += lines
+    return rows, notes
+
+
 def attach_ends(
     items: Sequence[scan.HemisphereInput], path: Path | None
 ) -> tuple[tuple[scan.HemisphereInput, ...], tuple[str, ...]]:
@@ -310,14 +327,7 @@ def attach_ends(
     """
     if path is None:
         return tuple(items), ()
-    rows, notes = read_ends(path), list[str]()
-    for name in ("subject", "session"):
-        labels = [getattr(row, name) or "" for row in rows]
-        data = [label for item in items if (label := getattr(item, name))]
-        matches, lines = match_labels(filter(None, labels), data, str(path))
-        changes: list[dict[str, Any]] = [{name: matches.get(x, x) or None} for x in labels]
-        rows = [replace(row, **change) for row, change in zip(rows, changes, strict=True)]
-        notes += lines
+    rows, notes = _with_labels_of(items, path)
     attached = tuple(_attached(item, [r for r in rows if r.is_of(item)], items) for item in items)
     unused_rows = [row for row in rows if not any(row.is_of(item) for item in items)]
     if not unused_rows:
@@ -337,7 +347,7 @@ def _attached(
 ) -> scan.HemisphereInput:
     problem: HipstaError | None = item.problem
     ends: dict[End, GivenEnd] = {}
-    sessions = {other.session for other in items if other.subject == item.subject}
+    sessions = {hemisphere.session for hemisphere in items if hemisphere.subject == item.subject}
     for row in rows:
         if isinstance(row.end, HipstaError):
             problem = problem or row.end

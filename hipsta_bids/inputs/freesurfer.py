@@ -70,8 +70,10 @@ class Run:
         have = self.files.keys()
         return next((way for way in _WAYS if {way[0], way[1] or way[0]} <= have), None)
 
-    def answers(self, request: "Run") -> bool:
+    def answers(self, request: "Run | None", *, longitudinal: bool) -> bool:
         """Check whether this is the wanted analysis (of any version, if none is wanted)."""
+        if request is None:
+            return self.longitudinal == longitudinal
         is_version = request.version in (None, self.version)
         key = (self.scans, self.longitudinal)
         return is_version and key == (request.scans, request.longitudinal)
@@ -111,15 +113,12 @@ def choose_run(
     analysis = context.selection.fs_analysis
     request = parse_analysis(analysis) if analysis else None
     runs = _runs(files)
-    matching = [
-        run
-        for run in runs
-        if (run.answers(request) if request else run.longitudinal == context.longitudinal)
-    ]
+    matching = [run for run in runs if run.answers(request, longitudinal=context.longitudinal)]
     best = next((run for run in matching if run.way), None)
     run = best or runs[0]
     subfields, parts, protocol = run.way or (next(iter(run.files)), None, "freesurfer")
-    paths = [run.files[name] for name in (subfields, parts) if name]
+    names = list(filter(None, (subfields, parts)))
+    paths = [run.files[name] for name in names]
     coarse = "only .FSvoxelSpace exists: labels resampled to 1 mm lose thin layers"
     verdict = Verdict(
         protocol=load_protocol("freesurferFS60" if run.old and run.way else protocol),
@@ -127,16 +126,20 @@ def choose_run(
         explanation=_why(run, subfields, parts, analysis),
         problem=None if best else _problem(runs, matching, analysis),
         notes=(coarse,) if best and run.coarse else (),
-        provenance={
-            "tool": "freesurfer",
-            "version": _version(run),
-            "analysis": "-".join(run.scans) or _UNNAMED,
-            "hierarchy": "+".join(name for name in (subfields, parts) if name),
-            "space": "FSvoxelSpace" if run.coarse else None,
-            "design": DESIGNS[run.longitudinal],
-        },
+        provenance=_provenance(run, names),
     )
     yield context.input(hemi, verdict, paths, _passed_over(runs, run, paths))
+
+
+def _provenance(run: Run, hierarchies: Iterable[str]) -> dict[str, str | None]:
+    return {
+        "tool": "freesurfer",
+        "version": _version(run),
+        "analysis": "-".join(run.scans) or _UNNAMED,
+        "hierarchy": "+".join(hierarchies),
+        "space": "FSvoxelSpace" if run.coarse else None,
+        "design": DESIGNS[run.longitudinal],
+    }
 
 
 def _version(run: Run) -> str | None:

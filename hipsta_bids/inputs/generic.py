@@ -15,7 +15,7 @@ from hipsta_bids.io.files import entities
 from hipsta_bids.protocols.load import NamedCode, protocol_from_names
 from hipsta_bids.protocols.protocol import Protocol
 
-# Label tables beside the images: ITK-SNAP's ``snaplabels.txt`` and BIDS's ``_dseg.tsv``.
+# Label tables next to the images: ITK-SNAP's ``snaplabels.txt`` and BIDS's ``_dseg.tsv``.
 
 
 #: IDX R G B A VIS MSH "LABEL" (the header of ITK-SNAP's label description files).
@@ -27,7 +27,7 @@ _SNAP_NAME = "snaplabels.txt"
 
 
 def find_table(image: Path, root: Path) -> Path | None:
-    """Find the label table that applies to an image, beside it or above it in the dataset."""
+    """Find the label table that applies to an image, next to it or above it in the dataset."""
     image_entities = entities(image.name)
     for folder in (image.parent, *image.parent.parents):
         specific = [
@@ -127,8 +127,8 @@ def _tables_in(folder: Path) -> tuple[dict[str, dict[str, str]], bool]:
 
 _IMAGES = {".nii.gz", ".nii", ".mgz", ".mgh"}
 
-#: Spaces of the subject's own anatomy; the others are templates of another size.
-_OWN_SPACE = re.compile(r"|T1w|T2w|orig|scanner|individual|crop\w*")
+#: Spaces of the subject's anatomy; the others are templates of another size.
+_NATIVE_SPACE = re.compile(r"|T1w|T2w|orig|scanner|individual|crop\w*")
 
 
 def is_edited(name: str) -> bool:
@@ -168,7 +168,7 @@ def _rank(file: LabelFile, verdict: Verdict) -> tuple[bool, bool, bool, int]:
     space, name = file.traits.get("space") or "", file.path.name
     coarse = bool(space) and not space.startswith("crop")
     problem = verdict.problem is not None
-    return problem, not _OWN_SPACE.fullmatch(space), coarse, name.count("_")
+    return problem, not _NATIVE_SPACE.fullmatch(space), coarse, name.count("_")
 
 
 def without_side(visit: tree.VisitFolders) -> Iterator[tree.Ignored]:
@@ -194,7 +194,7 @@ def _choose(
     """Take the first of several files of one protocol."""
     (best, verdict), visit = group[0], context.visit
     problem, space = verdict.problem, best.traits.get("space") or ""
-    if problem is None and not _OWN_SPACE.fullmatch(space):
+    if problem is None and not _NATIVE_SPACE.fullmatch(space):
         problem = InputError(
             f"{best.path}: space {space} is a template's, which changes thickness; "
             "use labels in the subject's own space",

@@ -42,9 +42,9 @@ def read_label_volume(item: HemisphereInput, region: str = "body") -> LabelVolum
 
     The volume is cropped to the hippocampal labels, and the cortical ones of the region, plus 5 mm
     on each side, as far as the image extends; with the shares of voxels, if it has probabilities.
-    The affine is the image's own, moved by the crop:
+    The affine of the image is moved by the crop:
     scanner RAS for MGZ, sform before qform for NIfTI. A NIfTI without either has no known left and
-    right, and is refused. Labels and mask edited by hand have their own files, on any grid.
+    right, and is refused. Labels and masks edited by hand are separate files, on any grid.
 
     Parameters
     ----------
@@ -82,7 +82,7 @@ def read_label_volume(item: HemisphereInput, region: str = "body") -> LabelVolum
         codes = _one_hemisphere(codes, item.protocol, item.hemi, path)
     tissue, part = _translate(codes, item.protocol, path)
     for added_path in item.files[1:]:
-        added_image = _beside(added_path, path, image, edited=labels is not None)
+        added_image = _added_labels(added_path, path, image, edited=labels is not None)
         _, parts = _translate(
             _integers(added_image, added_path), item.parts_protocol or item.protocol, added_path
         )
@@ -163,20 +163,20 @@ def _notes(image: LabelImage, path: Path) -> tuple[str, ...]:
     return tuple(f"{path.name}: {note}" for note in (*image.notes, *nan))
 
 
-def _beside(added_path: Path, path: Path, image: LabelImage, *, edited: bool) -> NDArray[Any]:
+def _added_labels(added_path: Path, path: Path, image: LabelImage, *, edited: bool) -> NDArray[Any]:
     """Read a second file where the first has labels, at nearest voxels if that one was edited."""
-    beside = read_labels(added_path, part=image.box)
-    if beside.shape == image.shape and np.allclose(
-        beside.affine, image.affine, rtol=0, atol=_SAME_GRID
+    added = read_labels(added_path, part=image.box)
+    if added.shape == image.shape and np.allclose(
+        added.affine, image.affine, rtol=0, atol=_SAME_GRID
     ):
-        return beside.data
+        return added.data
     if edited:
         added_image = read_labels(added_path, MARGIN)
-        to_own = np.linalg.inv(added_image.own_affine) @ image.own_affine
+        to_file = np.linalg.inv(added_image.file_affine) @ image.file_affine
         sampled: NDArray[Any] = ndimage.affine_transform(
             _integers(added_image.data, added_path),
-            to_own[:3, :3],
-            to_own[:3, 3],
+            to_file[:3, :3],
+            to_file[:3, 3],
             output_shape=image.data.shape,
             order=0,
         )
@@ -195,8 +195,8 @@ def _check_same_place(hippocampal: Bool, affine: Float, item: HemisphereInput, p
         image = read_labels(original, MARGIN)
     except InputError:  # that may be why a person made others
         return
-    to_own = np.linalg.inv(image.own_affine) @ affine
-    index = np.argwhere(hippocampal) @ to_own[:3, :3].T + to_own[:3, 3]
+    to_file = np.linalg.inv(image.file_affine) @ affine
+    index = np.argwhere(hippocampal) @ to_file[:3, :3].T + to_file[:3, 3]
     share = float(((index >= 0) & (index < image.data.shape)).all(axis=1).mean())
     if image.data.size and share < _SAME_PLACE:
         raise InputError(
@@ -217,8 +217,7 @@ def label_values(path: Path) -> frozenset[int]:
 
 def _empty(path: Path) -> InputError:
     return InputError(
-        f"{path}: all labels are zero; check that the segmentation finished",
-        reason="empty-labels",
+        f"{path}: all labels are zero; check that the segmentation finished", reason="empty-labels"
     )
 
 
@@ -269,7 +268,7 @@ def _translate(
 
 
 def _sample_mask(mask: LabelImage, affine: Float, shape: tuple[int, ...], path: Path) -> EditedMask:
-    """Bring an edited mask from its own affine to the grid of the labels."""
+    """Bring an edited mask from its affine to the grid of the labels."""
     values = np.unique(mask.data)
     if mask.data.shape != mask.shape:  # around it everything is zero
         values = np.unique(np.append(values, 0))
@@ -286,9 +285,9 @@ def _sample_mask(mask: LabelImage, affine: Float, shape: tuple[int, ...], path: 
             f"{path}: the edited mask is empty; delete it, or save it again",
             reason="edited-mask-empty",
         )
-    # A border of zeros, so that interpolation ends beside the mask.
+    # A border of zeros, so that interpolation ends next to the mask.
     inside = np.pad((mask.data != 0).astype(np.float32), 1)
-    to_mask = np.linalg.inv(mask.own_affine) @ affine
+    to_mask = np.linalg.inv(mask.file_affine) @ affine
     sampled = ndimage.affine_transform(
         inside, to_mask[:3, :3], to_mask[:3, 3] + 1, output_shape=shape, order=1, mode="constant"
     )

@@ -20,14 +20,14 @@ _SIDES = {"left": "L", "right": "R", "l": "L", "r": "R"}
 def _named_protocol(layout: "Layout", file: LabelFile, context: Context, _: str) -> Verdict:
     """Find the protocol of a program's file."""
     users, names = context.selection.protocol, protocol_names()
-    fitting = [each for each in map(load_protocol, names) if each.tool == layout.name]
+    fitting = [protocol for protocol in map(load_protocol, names) if protocol.tool == layout.name]
     if users is not None and users.tool == layout.name:
         fitting = [users]
     if len(fitting) == 1:
         origin = " from --scheme" if users in fitting else ""
         explanation = f"{layout.title}{file.remark}, protocol {fitting[0].name}{origin}"
         return Verdict(protocol=fitting[0], explanation=explanation)
-    choices = " or ".join(f"--scheme {each.name} ({each.title})" for each in fitting)
+    choices = " or ".join(f"--scheme {protocol.name} ({protocol.title})" for protocol in fitting)
     return Verdict(
         protocol=scan.unknown_protocol(layout.name, f"{layout.title}, mode not given"),
         explanation=f"{layout.title}{file.remark}, mode not given",
@@ -69,8 +69,8 @@ class Layout:
     """Which protocol the best file has."""
     choose: Callable[[list[LabelFile], Context, str], Iterable[scan.HemisphereInput]] | None = None
     """Where more than one file matters: which, and how."""
-    beside: Sequence[str] = ()
-    """Files of which one lies beside those of the program; none are needed if empty."""
+    companions: Sequence[str] = ()
+    """Files of which one lies next to those of the program; none are needed if empty."""
     distinct: bool = True
     """No other program uses such names; else the user or the dataset has to name this one."""
     generators: bool = False
@@ -80,7 +80,7 @@ class Layout:
     choice: str = ""
     """What the user has to know where there are several protocols."""
     volumes: str = ""
-    """Name of the table of volumes beside a file."""
+    """Name of the table of volumes next to a file."""
     probabilities: str = ""
     """Pattern of names of probabilities. It takes groups of the name of labels, ``side``, and
     FreeSurfer's ``run``; a group ``label`` is the label's code or name."""
@@ -114,7 +114,7 @@ class Layout:
         named = (users is not None and users.tool == self.name) or self.made(source)
         files = []
         for folder in freesurfer.each_once(context.visit.folders):
-            marked = not self.beside or any(name in folder.names for name in self.beside)
+            marked = not self.companions or any(name in folder.names for name in self.companions)
             if not (named or (self.distinct and marked)):
                 continue
             for name in [name for name in folder.names if self.mark in name]:
@@ -122,10 +122,7 @@ class Layout:
                 if traits is None or (self.bids and not context.selection.wants_file(path)):
                     continue
                 file = LabelFile(
-                    path=path,
-                    hemi=self.side(name),
-                    traits=traits,
-                    longitudinal=folder.longitudinal,
+                    path=path, hemi=self.side(name), traits=traits, longitudinal=folder.longitudinal
                 )
                 files.append(replace(file, rank=self.rank(file, context)))
         return sorted(files, key=lambda file: (file.rank, str(file.path)))
@@ -169,13 +166,13 @@ def _cropped(file: LabelFile) -> bool:
 
 
 def _scaled(file: LabelFile) -> bool:
-    """Check for a space that differs from the subject's own by more than rotation and shift."""
+    """Check for a space that differs from the subject's by more than rotation and shift."""
     # corobl is reached by an affine registration to a template unless asked otherwise.
     return _space(file) not in {"", "T1w", "T2w"} and not _cropped(file)
 
 
 def _unfold_rank(file: LabelFile, _: Context) -> tuple[Any, ...]:
-    """Rank the finest grid in the subject's own space (``space-crop*``), then the image's own."""
+    """Rank the finest grid in the subject's space (``space-crop*``), then that of the image."""
     atlas = file.traits.get("atlas")
     index = _ATLASES.index(atlas) if atlas in _ATLASES else len(_ATLASES)
     return _scaled(file), index, not _cropped(file)
@@ -219,7 +216,7 @@ def _unfold_protocol(layout: Layout, file: LabelFile, context: Context, _: str) 
     )
 
 
-# What ASHS writes differs by step, and its atlas is told by table or values.
+# What ASHS writes differs by step, and its atlas is identified by table or values.
 
 #: ASHS's last step comes first.
 _KINDS = ("corr_usegray", "corr_nogray", "heur")
@@ -244,7 +241,7 @@ def _ashs_reason(file: LabelFile, best: LabelFile) -> str:
 
 def _ashs_protocol(_: Layout, file: LabelFile, context: Context, hemi: str) -> Verdict:
     """Identify the atlas."""
-    return (context.atlases or atlas_finder(context)).identify(file, hemi)
+    return (context.identify_atlas or atlas_finder(context).identify)(file, hemi)
 
 
 #: Subjects whose files are opened to find out a dataset's atlas, spread over the dataset.
@@ -267,7 +264,7 @@ def atlas_finder(context: Context) -> ashs.AtlasFinder:
     return ashs.AtlasFinder(context.source.path, context.atlas, sample)
 
 
-#: What programs do in ways of their own.
+#: Steps that differ between programs.
 _SPECIAL: dict[str, dict[str, Any]] = {
     "freesurfer": {"choose": freesurfer.choose_run},
     "ashs": {"rank": _ashs_rank, "reason": _ashs_reason, "protocol": _ashs_protocol},

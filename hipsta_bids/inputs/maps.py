@@ -7,7 +7,7 @@ import glob
 import re
 import string
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -42,17 +42,21 @@ _WILDCARDS = {"**/": "(?:[^/]+/)*", "**": ".*", "*": "[^/]*", "?": "[^/]"}
 _WILDCARD = re.compile(r"(\*\*/|\*\*|\*|\?|\[[^\]]+\])")
 
 
-def read_regions(path: Path, shape: tuple[int, int]) -> Regions:
-    """Read regions drawn on the sheet, one row per point and region."""
-    rows = files.read_tsv(path)
-    columns = tuple(rows[0]) if rows else ()
+def _check_columns(path: Path, columns: Collection[str]) -> None:
     lacking = [name for name in COLUMNS if name not in columns]
     unknown = [name for name in columns if name not in {*COLUMNS, *SHEET_COLUMNS}]
-    if rows and (lacking or unknown):
+    if lacking or unknown:
         fault = f"lacks {', '.join(lacking)}" if lacking else f"has unknown {', '.join(unknown)}"
         raise InputError(
             f"{path}: {fault}; its columns are {', '.join(COLUMNS)} (and any of the sheet table)"
         )
+
+
+def read_regions(path: Path, shape: tuple[int, int]) -> Regions:
+    """Read regions drawn on the sheet, one row per point and region."""
+    rows = files.read_tsv(path)
+    if rows:
+        _check_columns(path, rows[0])
     drawn = [row for row in rows if not files.is_missing(row["region"])]
     if not drawn:
         raise InputError(f"{path}: no point belongs to a region; draw one")
@@ -169,6 +173,17 @@ def _expression(pattern: str) -> str:
     return expression
 
 
+def _check_names(names: Sequence[str]) -> None:
+    reserved = {"x", "y", *(row.desc for row in (*OUTPUTS, *EXTRA_OUTPUTS))}
+    reserved |= {m.name for m in MAPS}
+    for name in names:
+        if not name.isalnum() or not name.isascii():
+            raise UsageError(f"--map: {name!r} is not a name of letters and digits")
+        if name in reserved or names.count(name) > 1:
+            fault = "belongs to other outputs" if name in reserved else "occurs twice"
+            raise UsageError(f"--map: the name {name} {fault}; choose another one")
+
+
 def map_requests(
     patterns: Sequence[tuple[str, str]],
     samplings: Sequence[tuple[str | None, str]],
@@ -178,17 +193,8 @@ def map_requests(
 ) -> tuple[MapSource, ...]:
     """Combine and check the options about maps; choices without a name are for all other maps."""
     names = [name for name, _ in patterns]
-    reserved = {row.desc for row in (*OUTPUTS, *EXTRA_OUTPUTS)} | {
-        "x",
-        "y",
-        *(m.name for m in MAPS),
-    }
+    _check_names(names)
     for name, pattern in patterns:
-        if not name.isalnum() or not name.isascii():
-            raise UsageError(f"--map: {name!r} is not a name of letters and digits")
-        if name in reserved or names.count(name) > 1:
-            fault = "belongs to other outputs" if name in reserved else "occurs twice"
-            raise UsageError(f"--map: the name {name} {fault}; choose another one")
         check_pattern("--map", name, pattern)
     if transforms:
         check_installed("--map-transform")
@@ -202,8 +208,7 @@ def map_requests(
         "reference": references,
     }
     for option, choices in options.items():
-        unknown_names = [name for name, _ in choices if name is not None and name not in names]
-        if unknown_names:
+        if unknown_names := [name for name, _ in choices if name not in {None, *names}]:
             raise UsageError(f"--map-{option}: there is no --map {unknown_names[0]}=...")
     sampling_of = {None: "depth", **dict(samplings)}
     interpolation_of = {None: "linear", **dict(interpolations)}

@@ -1,6 +1,6 @@
 """Probabilities of labels: which files have them, and whether no label of the sheet lacks one.
 
-They are searched for where a program writes them (``layouts.toml``), and beside the labels as BIDS
+They are searched for where a program writes them (``layouts.toml``), and next to the labels as BIDS
 names them: ``*_hemi-H_*label-LABEL_probseg``, where LABEL is a name, an abbreviation or a code of
 the protocol, or one ``*_hemi-H_*_probseg`` with a volume per label, in the order of ``LabelMap`` in
 its sidecar or of the label table.
@@ -12,6 +12,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 
 from hipsta_bids.derivatives.dataset import counts_text
@@ -61,14 +62,11 @@ def attach_probabilities(
 
 def _attached(item: scan.HemisphereInput, folder: Path | None) -> scan.HemisphereInput:
     """Attach the files of one hemisphere, or note why they are not used."""
-    beside = item.files[0].parent
-    places = [beside]
-    if folder is not None:
-        visit = f"sub-{item.subject}" + (f"/ses-{item.session}" if item.session else "")
-        inside = beside.is_relative_to(item.source_path)
-        places = [folder / beside.relative_to(item.source_path)] if inside else []
-        places.append(folder / visit / "anat")
-    kinds = (entry for place in places for entry in _kinds(item, place))
+    kinds = (
+        entry
+        for place in _places(item, folder)
+        for entry in chain(_bids_files(item, place), _posteriors(item, place))
+    )
     kind, weights, files = "", False, Files()
     try:
         kind, weights, files = next((entry for entry in kinds if entry[2]), (kind, weights, files))
@@ -92,8 +90,19 @@ def _attached(item: scan.HemisphereInput, folder: Path | None) -> scan.Hemispher
     return replace(item, probabilities=probabilities)
 
 
-def _kinds(item: scan.HemisphereInput, place: Path) -> Iterator[tuple[str, bool, Files]]:
-    """List the files of BIDS, and of the program whose labels these are, for a folder."""
+def _places(item: scan.HemisphereInput, folder: Path | None) -> Iterator[Path]:
+    """List the folders that may hold the probabilities of a hemisphere."""
+    labels_folder = item.files[0].parent
+    if folder is None:
+        yield labels_folder
+        return
+    if labels_folder.is_relative_to(item.source_path):
+        yield folder / labels_folder.relative_to(item.source_path)
+    yield folder / f"sub-{item.subject}" / (f"ses-{item.session}" if item.session else "") / "anat"
+
+
+def _bids_files(item: scan.HemisphereInput, place: Path) -> Iterator[tuple[str, bool, Files]]:
+    """List the probabilities of BIDS in a folder."""
     name = item.files[0].name
     labels = entities(name) | {"hemi": item.hemi, "sub": item.subject, "ses": item.session or ""}
     files: Files = {}
@@ -104,6 +113,11 @@ def _kinds(item: scan.HemisphereInput, place: Path) -> Iterator[tuple[str, bool,
             texts = [pairs["label"]] if "label" in pairs else _label_map(path, item)
             files[path] = [_volume(text, item) for text in texts]
     yield "probseg", False, files
+
+
+def _posteriors(item: scan.HemisphereInput, place: Path) -> Iterator[tuple[str, bool, Files]]:
+    """List the posteriors of the program whose labels these are, for a folder."""
+    name = item.files[0].name
     layout = layout_of(name)
     match = layout and layout.pattern.fullmatch(name)
     groups = match.groupdict("") if match else {}

@@ -6,7 +6,7 @@ is not understood, hides nothing but itself, and is named.
 
 import os
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -17,7 +17,7 @@ from hipsta_bids.io.files import MISSING
 from hipsta_bids.protocols.protocol import Protocol, Tissue
 from hipsta_bids.types import GivenEnd, Hemisphere
 
-# What is asked for, and what was found: the values that the search for inputs works with.
+# Values of the search for inputs: requests and results.
 
 
 #: Hemispheres as BIDS spells them.
@@ -57,7 +57,7 @@ class InputRequest:
     participants_map: Path | None = None
     """Table with the participant and session of each folder."""
     probabilities: str | Path = "never"
-    """``auto`` (beside the labels), ``never``, or the folder that has all probabilities."""
+    """``auto`` (next to the labels), ``never``, or the folder that has all probabilities."""
 
     @property
     def uses_pybids(self) -> bool:
@@ -155,11 +155,11 @@ class HemisphereInput(Hemisphere):
     passed_over: tuple[tuple[str, str], ...] = ()
     """Other files of this hemisphere and why they were not taken."""
     problem: HipstaError | None = None
-    """Found, but not usable: this hemisphere fails, the others go on."""
+    """Why it is not usable: this hemisphere fails, the others go on."""
     notes: tuple[str, ...] = ()
     """What a reader should know about this choice."""
     provenance: Mapping[str, str] = field(default_factory=dict, hash=False)
-    """Tool, version and so on, as far as names tell (``PROVENANCE`` of ``derivatives``)."""
+    """Tool, version and so on, as far as names show (``PROVENANCE`` of ``derivatives``)."""
     edits: tuple[Edit, ...] = ()
     """Corrections by a person that take the place of what the files say."""
     ends: tuple[GivenEnd, ...] = ()
@@ -181,7 +181,7 @@ class HemisphereInput(Hemisphere):
         return self.subject, self.hemi, self.protocol.name
 
     def path_of(self, name: str) -> Path:
-        """Return the path of a file that was passed over: beside the labels, or as written."""
+        """Return the path of a file that was passed over: next to the labels, or as written."""
         return self.files[0].parent / name if Path(name).name == name else Path(name)
 
     @property
@@ -221,7 +221,7 @@ _IGNORED = tuple(
 
 
 LAYOUTS = ("freesurfer", "ashs", "hippunfold", "tools", "named")
-"""Kinds of folders that can be searched; ``tools`` are those without an option of their own, and
+"""Kinds of folders that can be searched; ``tools`` are those without a separate option, and
 ``named`` is any ``_hemi-?_..._dseg`` file with names."""
 
 
@@ -232,9 +232,9 @@ class Source:
     name: str
     path: Path
     explicit: bool
-    """Given by the user, not found by default."""
+    """Given by the user, not by default."""
     origin: str = ""
-    """Where it was found by default: ``derivatives`` or ``sourcedata``."""
+    """Its folder if searched by default: ``derivatives`` or ``sourcedata``."""
     layouts: tuple[str, ...] = LAYOUTS
     """Kinds of segmentation to look for here."""
     generators: Mapping[str, str] = field(default_factory=dict)
@@ -262,7 +262,7 @@ def list_sources(
     ``--hippunfold-dir``), then ``BIDS_DIR/derivatives``, ``BIDS_DIR/sourcedata``, and ``BIDS_DIR``
     itself where it is a derivative dataset. Folders of these that hold no ``sub-*`` are searched
     two levels down, and ``sourcedata`` inside of derivatives too (fMRIPrep keeps FreeSurfer's
-    folder there). Our own outputs are excluded. What cannot be listed, unless the user named it,
+    folder there). Outputs are excluded. What cannot be listed, unless the user named it,
     and what looks like a subject outside of these datasets is added to ``ignored``.
     """
     sources: dict[Path, Source] = {}
@@ -288,12 +288,11 @@ def _candidates(request: InputRequest, ignored: list[tree.Ignored]) -> Iterator[
         roots = [] if tree.people_in(path, people) else _datasets(source, 1, ignored)
         for root in roots or [path]:
             yield replace(source, path=root)
-    for folder in ("derivatives", "sourcedata"):
-        if folder in top:
-            path = request.bids_dir / folder
-            source = Source(name=folder, path=path, explicit=False, origin=folder, people=people)
-            for root in _datasets(source, 2, ignored):
-                yield replace(source, name=root.name, path=root)
+    for folder in filter(top.__contains__, ("derivatives", "sourcedata")):
+        path = request.bids_dir / folder
+        source = Source(name=folder, path=path, explicit=False, origin=folder, people=people)
+        for root in _datasets(source, 2, ignored):
+            yield replace(source, name=root.name, path=root)
     # A dataset without a description may be a bare folder of subjects.
     description = read_description(request.bids_dir)
     derived = description is None or description.get("DatasetType") == "derivative"
@@ -313,8 +312,41 @@ def _datasets(source: Source, depth: int, ignored: list[tree.Ignored]) -> list[P
     well as datasets, so these are not used.
     """
     datasets: list[Path] = []
-    unsure: dict[Path, list[tree.Ignored]] = {}
+    unsure: dict[Path, list[tree.SubjectFolder]] = {}
     unused: list[tree.Ignored] = []
+    for path, folders, unclaimed in _walk(source, depth, ignored):
+        if unclaimed is not None:
+            unused += [entry for entry in unclaimed if entry.path.name != "sourcedata"]
+            continue
+        datasets.append(path)
+        if path != source.path and all(folder.renamed for folder in folders):
+            unsure[path] = folders
+    if len(unsure) > 1:
+        datasets = [path for path in datasets if path not in unsure]
+        unused += [
+            tree.Ignored(path=folder.path, reason=tree.UNSURE, subject=folder.subject)
+            for folders in unsure.values()
+            for folder in folders
+        ]
+    ignored += _with_row(unused, source.path, datasets)
+    return datasets
+
+
+def _with_row(
+    unused: Sequence[tree.Ignored], root: Path, datasets: Sequence[Path]
+) -> list[tree.Ignored]:
+    """Select entries that have a row; a folder's row stands for its content."""
+    # A folder of datasets may hold one that is called mri.
+    claims = (*datasets, *(entry.path for entry in unused if not entry.template))
+    inside = {root, *(parent for path in claims for parent in path.parents)}
+    rows = (entry for entry in unused if entry.path not in inside.union(datasets))
+    return [entry for entry in rows if entry.path.parent in inside or not entry.template]
+
+
+def _walk(
+    source: Source, depth: int, ignored: list[tree.Ignored]
+) -> Iterator[tuple[Path, list[tree.SubjectFolder], list[tree.Ignored] | None]]:
+    """Walk down to the datasets: folders of subjects or, in a folder that is none, its entries."""
     visited: set[str] = set()
     waiting = [(source.path, depth)]
     while waiting:
@@ -327,41 +359,21 @@ def _datasets(source: Source, depth: int, ignored: list[tree.Ignored]) -> list[P
         entries = tree.read_names(path, listed[0], any_name=source.any_name)
         folders = [entry for entry in entries.values() if isinstance(entry, tree.SubjectFolder)]
         unclaimed = [entry for entry in entries.values() if isinstance(entry, tree.Ignored)]
-        inner = [entry.path.name for entry in unclaimed if entry.reason == tree.NO_SUBJECT]
-        if (
-            folders
-            or any(name.startswith("sub-") for name in entries)
-            or (tree.people_in(path, source.people))
-        ):
-            datasets.append(path)
-            inner, below = [name for name in inner if name == "sourcedata"], 0
-            if path != source.path and all(folder.renamed for folder in folders):
-                unsure[path] = [
-                    tree.Ignored(path=f.path, reason=tree.UNSURE, subject=f.subject)
-                    for f in folders
-                ]
+        is_named = any(name.startswith("sub-") for name in entries)
+        if folders or is_named or tree.people_in(path, source.people):
+            yield path, folders, None
+            inner = [e.path.name for e in unclaimed if e.reason == tree.NO_SUBJECT]
+            waiting += _next_folders(path, inner, 0)
         else:
-            unclaimed += [tree.no_segmentation(path / name, tree.NO_SUBJECT) for name in listed[1]]
-            unused += [entry for entry in unclaimed if entry.path.name != "sourcedata"]
-            inner = list(entries)
-        for name in reversed(inner):
-            if name == "sourcedata":
-                waiting.append((path / name, 1))
-            elif below:
-                waiting.append((path / name, below - 1))
-    if len(unsure) > 1:
-        datasets = [path for path in datasets if path not in unsure]
-        unused += [entry for entries in unsure.values() for entry in entries]
-    # A folder of datasets may hold one that is called mri; a folder's row stands for its content.
-    claims = (*datasets, *(entry.path for entry in unused if not entry.template))
-    inside = {source.path, *(parent for path in claims for parent in path.parents)}
-    ignored += [
-        entry
-        for entry in unused
-        if entry.path not in inside.union(datasets)
-        and (entry.path.parent in inside or not entry.template)
-    ]
-    return datasets
+            files = [tree.no_segmentation(path / name, tree.NO_SUBJECT) for name in listed[1]]
+            yield path, [], unclaimed + files
+            waiting += _next_folders(path, list(entries), below)
+
+
+def _next_folders(path: Path, names: Sequence[str], depth: int) -> list[tuple[Path, int]]:
+    """List the folders to search, last first, and their depths; ``sourcedata`` has one level."""
+    depths = {name: 1 if name == "sourcedata" else depth - 1 for name in reversed(names)}
+    return [(path / name, n) for name, n in depths.items() if n >= 0]
 
 
 def list_participants(request: InputRequest) -> frozenset[str]:

@@ -3,14 +3,14 @@
 The flow: which datasets to search, and which subjects and sessions they hold (``scan``), which
 files are segmentations (``layouts``; ``freesurfer``, ``ashs`` and ``generic`` have what is
 special), and which of several to take. No image is opened, except where ASHS's atlas
-can only be told from the labels.
+can only be identified from the labels.
 
 A picture of labels on an image from another space misleads, so pages show only these images:
 
 - FreeSurfer: ``norm.mgz``, else ``brain.mgz``, of the same ``mri`` folder;
-- ASHS: the T2-weighted image that it segmented, ``tse.nii.gz`` or one with that ending, beside the
+- ASHS: the T2-weighted image that it segmented, ``tse.nii.gz`` or one with that ending, next to the
   segmentation or in the folder above ``final``;
-- any other: a T1w or T2w image beside the labels or of the same visit in the BIDS dataset, if its
+- any other: a T1w or T2w image next to the labels or of the same visit in the BIDS dataset, if its
   space is that in the name of the labels (HippUnfold's ``space-cropT1w``), or if it has the same
   grid of voxels.
 """
@@ -18,7 +18,7 @@ A picture of labels on an image from another space misleads, so pages show only 
 import os
 import re
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -63,7 +63,7 @@ _LISTED_NAMES = 6
 
 @dataclass(frozen=True, kw_only=True)
 class Findings:
-    """What a search found."""
+    """Results of a search."""
 
     items: tuple[HemisphereInput, ...]
     """Sorted by subject, session, hemisphere, protocol. Some may have a ``problem``."""
@@ -105,32 +105,16 @@ def find_inputs(request: InputRequest) -> Findings:
     selection = make_selection(request)
     option = choose_atlas(request)
     forget_tables()
-    results = _Found()
+    results = _Search()
     sources = scan.list_sources(request, results.unused)
     results.edited = list_edits(request, selection, results.unused)
     for source in sources:
         _search(source, selection, option, results)
-    lacking = [
-        folder
-        for folder in tree.read_people(request.participants_map)
-        if not any((source.path / folder).is_dir() for source in sources)
-    ]
-    present = [name for s in sources if lacking for name in tree.list_folder(s.path)[0]]
-    refuse_alike(lacking, present, f"{request.participants_map}: column folder")
-    results.unused += [
-        tree.Ignored(path=Path(folder), reason="named in --participants-map, but no dataset has it")
-        for folder in lacking
-    ]
+    results.unused += _without_dataset(request, sources)
     entries = [entry for entry in results.entries(sources) if selection.misses(entry)]
     ignored = tuple(entry for entry in entries if not entry.quiet)
     accounted = {item.subject for item in results.items} | {entry.subject for entry in ignored}
-    missing = {
-        f.path: tree.Ignored(
-            path=f.path, subject=f.subject, reason="no dataset has labels of it", quiet=True
-        )
-        for f in (() if request.bids_database_dir else tree.sort_folders(request.bids_dir)[0])
-        if f.subject not in accounted and selection.wants_folder(f)
-    }
+    missing = {e.path: e for e in _unlabeled(request, selection) if e.subject not in accounted}
     unmissed = [entry for entry in entries if entry.quiet and entry.path not in missing]
     if not results.items:
         error = _nothing(request, sources, ignored)
@@ -142,26 +126,55 @@ def find_inputs(request: InputRequest) -> Findings:
         _without_clashes(results.items, sources), request.probabilities
     )
     items, notes = attach_edits(unedited, each_once(results.edited), selection)
-    notes += used_notes
-    subjects = {item.subject for item in items}
-    renamed = [
-        f"{f.path.name} as sub-{f.subject}{f'_ses-{f.session}' if f.session else ''}"
-        for f in results.renamed
-        if f.subject in subjects
-    ]
-    if renamed:
-        notes += (f"renamed: {_count(renamed, 'folder')}",)
-    if sides := [f"{e.inside.name} {e.hemi}" for e in ignored if e.hemi and e.inside]:
-        notes += (f"no labels of one hemisphere: {_count(sides, 'visit')}",)
-    if text := _unused(ignored):
-        notes += (f"not used: {text}; see --dry-run and the log for the reasons",)
+    notes = (*notes, *used_notes, *_search_notes(items, results.renamed, ignored))
     unmissed += missing.values()
     return Findings(items=items, notes=notes, ignored=ignored, other_entries=tuple(unmissed))
 
 
+def _unlabeled(request: InputRequest, selection: Selection) -> Iterator[tree.Ignored]:
+    """List the subjects' folders of the BIDS dataset, as without labels."""
+    folders = [] if request.bids_database_dir else tree.sort_folders(request.bids_dir)[0]
+    for folder in filter(selection.wants_folder, folders):
+        reason = "no dataset has labels of it"
+        yield tree.Ignored(path=folder.path, subject=folder.subject, reason=reason, quiet=True)
+
+
+def _without_dataset(request: InputRequest, sources: Sequence[Source]) -> list[tree.Ignored]:
+    """List the folders of ``--participants-map`` that no dataset has."""
+    lacking = [
+        folder
+        for folder in tree.read_people(request.participants_map)
+        if not any((source.path / folder).is_dir() for source in sources)
+    ]
+    present = [name for s in sources if lacking for name in tree.list_folder(s.path)[0]]
+    refuse_alike(lacking, present, f"{request.participants_map}: column folder")
+    reason = "named in --participants-map, but no dataset has it"
+    return [tree.Ignored(path=Path(folder), reason=reason) for folder in lacking]
+
+
+def _search_notes(
+    items: Iterable[HemisphereInput],
+    renamed: Iterable[tree.SubjectFolder],
+    ignored: Sequence[tree.Ignored],
+) -> Iterator[str]:
+    """Note renamed folders, visits with one hemisphere, and entries that are not used."""
+    subjects = {item.subject for item in items}
+    names = [
+        f"{f.path.name} as sub-{f.subject}{f'_ses-{f.session}' if f.session else ''}"
+        for f in renamed
+        if f.subject in subjects
+    ]
+    if names:
+        yield f"renamed: {_count(names, 'folder')}"
+    if sides := [f"{e.inside.name} {e.hemi}" for e in ignored if e.hemi and e.inside]:
+        yield f"no labels of one hemisphere: {_count(sides, 'visit')}"
+    if text := _unused(ignored):
+        yield f"not used: {text}; see --dry-run and the log for the reasons"
+
+
 @dataclass(kw_only=True)
-class _Found:
-    """What the search has found so far."""
+class _Search:
+    """Results of the search so far."""
 
     items: list[HemisphereInput] = field(default_factory=list)
     edited: list[EditedFile] = field(default_factory=list)
@@ -172,7 +185,7 @@ class _Found:
     def entries(self, sources: Sequence[Source]) -> list[tree.Ignored]:
         """List each entry that was not used once, sorted by path."""
         # What is known about an entry inside of a subject's folder comes first.
-        beside = [entry for entry in self.unused if entry.inside and entry.template]
+        templates = [entry for entry in self.unused if entry.inside and entry.template]
         strays = [entry for entry in self.unused if entry.inside is None]
         missed = [entry for entry in self.unused if entry.inside and not entry.template]
         searched = {os.path.realpath(source.path) for source in sources}
@@ -180,16 +193,19 @@ class _Found:
         entry_of: dict[tuple[str, str | None], tree.Ignored] = {}
         for entry in (*missed, *strays):
             entry_of.setdefault((_place(entry.path), entry.hemi), entry)
-        claims = [place for (place, _), entry in entry_of.items() if not entry.quiet]
-        above = {str(parent) for path in (*searched, *claims) for parent in Path(path).parents}
-        listed = [
-            looked_into(entry)
-            for (place, _), entry in entry_of.items()
-            # What holds other entries, or is used by an option, has no row of its own.
-            if not (entry.quiet and place in above)
-            and not (entry.inside is None and place in searched)
-        ]
-        return sorted(listed, key=lambda entry: (entry.path, entry.hemi or "")) + beside
+        listed = map(looked_into, _with_row(entry_of, searched))
+        return sorted(listed, key=lambda entry: (entry.path, entry.hemi or "")) + templates
+
+
+def _with_row(
+    entry_of: Mapping[tuple[str, str | None], tree.Ignored], searched: Collection[str]
+) -> Iterator[tree.Ignored]:
+    """Select entries that have a row: not what holds other entries, or is used by an option."""
+    claims = [place for (place, _), entry in entry_of.items() if not entry.quiet]
+    above = {str(parent) for path in (*searched, *claims) for parent in Path(path).parents}
+    for (place, _), entry in entry_of.items():
+        if place not in (above if entry.quiet else ()) and (entry.inside or place not in searched):
+            yield entry
 
 
 def _renaming(folders: Iterable[tree.SubjectFolder]) -> dict[VisitKey, list[str]]:
@@ -233,9 +249,9 @@ def dataset_notes(
     selection = make_selection(request)
     expected = selection.subjects or scan.list_participants(request)
     expected &= expected if part is None else set(part)
-    without = sorted(expected - selection.excluded - {item.subject for item in items})
-    if without:
-        hint = did_you_mean(selection.subjects.intersection(without), {i.subject for i in items})
+    present = {item.subject for item in items}
+    if without := sorted(expected - selection.excluded - present):
+        hint = did_you_mean(selection.subjects.intersection(without), present)
         notes.append(f"no segmentation found for {_count(without, 'participant')}{hint}")
     usable = [item for item in items if item.problem is None]
     segmentations = Counter(item.protocol.name for item in usable)
@@ -272,8 +288,10 @@ def sheet_notes(items: Iterable[HemisphereInput]) -> list[str]:
     return notes
 
 
-def _search(source: Source, selection: Selection, option: Protocol | None, results: _Found) -> None:
-    """Search one dataset for all kinds of segmentations, and add the edited files beside them."""
+def _search(
+    source: Source, selection: Selection, option: Protocol | None, results: _Search
+) -> None:
+    """Search one dataset for all kinds of segmentations, and add the edited files next to them."""
     all_folders, strays = source.folders()
     refused = tree.same_labels(all_folders)
     folders = list(filter(selection.wants_folder, all_folders))
@@ -281,17 +299,17 @@ def _search(source: Source, selection: Selection, option: Protocol | None, resul
     results.renamed += [folder for folder in folders if folder.renamed]
     renaming = _renaming(folders)
     context = Context(source=source, selection=selection, atlas=option)
-    context = replace(context, atlases=atlas_finder(context))
+    context = replace(context, identify_atlas=atlas_finder(context).identify)
     searched = [layout for layout in LAYOUTS if layout.kind in source.layouts]
     closed: list[tree.Ignored] = []
     visits = list(filter(selection.wants_visit, tree.list_visits(folders, closed)))
     results.unused += closed
-    # Folders that cannot be listed have rows of their own, and the parents of sessions need none.
+    # Folders that cannot be listed have separate rows, and the parents of sessions need none.
     explained = {entry.subject for entry in closed} | {
         visit.subject for visit in visits if visit.session
     }
     for visit in visits:
-        results.edited += edits_of_visit(visit, source.path, source.name, beside=True)
+        results.edited += edits_of_visit(visit, source.path, source.name, in_dataset=True)
         visit_context = replace(context, visit=visit)
         items = [item for layout in searched for item in find(layout, visit_context)]
         results.unused += without_side(visit) if "named" in source.layouts else ()
@@ -309,7 +327,7 @@ def _search(source: Source, selection: Selection, option: Protocol | None, resul
 
 
 def _not_fetched(paths: Sequence[Path]) -> InputError | None:
-    """Tell that the content of a file is elsewhere."""
+    """Describe that the content of a file is elsewhere."""
     for path in paths:
         if message := not_fetched(path):
             return InputError(f"{path}: {message}", reason="not-fetched")
@@ -381,18 +399,7 @@ def _nothing(
             f"name the dataset with the segmentations: -d NAME=PATH{unused}"
         )
     if restricted:
-        folders = [folder for source in sources for folder in source.folders()[0]]
-        subjects = {folder.subject for folder in folders}
-        unmatched = {label.removeprefix("sub-") for label in request.participant_labels} - subjects
-        hint, contents = (
-            did_you_mean(sorted(unmatched), subjects),
-            _count(sorted(subjects), "subject"),
-        )
-        if request.session_labels:
-            sessions = {visit.session for visit in tree.list_visits(folders) if visit.session}
-            absent = {label.removeprefix("ses-") for label in request.session_labels} - sessions
-            hint = hint or did_you_mean(sorted(absent), sessions)
-            contents += f" and {_count(sorted(sessions), 'session')}"
+        hint, contents = _labels_hint(request, sources)
         return NothingToDoError(
             f"no hippocampal segmentation matches {' '.join(restricted)} in {searched} (which hold"
             f" {contents}; looked for {_LOOKED_FOR}){hint}{unused}"
@@ -401,6 +408,20 @@ def _nothing(
         f"no hippocampal segmentation in {searched} (looked for {_LOOKED_FOR}); "
         f"name another dataset: -d NAME=PATH{unused}"
     )
+
+
+def _labels_hint(request: InputRequest, sources: Sequence[Source]) -> tuple[str, str]:
+    """Return labels like unmatched ones, and the subjects and sessions that datasets hold."""
+    folders = [folder for source in sources for folder in source.folders()[0]]
+    subjects = {folder.subject for folder in folders}
+    unmatched = {label.removeprefix("sub-") for label in request.participant_labels} - subjects
+    hint, contents = did_you_mean(sorted(unmatched), subjects), _count(sorted(subjects), "subject")
+    if request.session_labels:
+        sessions = {visit.session for visit in tree.list_visits(folders) if visit.session}
+        absent = {label.removeprefix("ses-") for label in request.session_labels} - sessions
+        hint = hint or did_you_mean(sorted(absent), sessions)
+        contents += f" and {_count(sorted(sessions), 'session')}"
+    return hint, contents
 
 
 def _unused(ignored: Iterable[tree.Ignored]) -> str:
@@ -471,7 +492,7 @@ def _named(labels: Path, hemisphere: Hemisphere, folders: tuple[Path, ...]) -> I
                 and pairs.get("sub", hemisphere.subject) == hemisphere.subject
                 and pairs.get("ses", hemisphere.session) == hemisphere.session
             ):
-                # An image whose name has no space is in its own.
+                # An image whose name has no space defines one.
                 image_space = pairs.get("space", pairs["suffix"])
                 images.append((folder / name, image_space, pairs["suffix"]))
     counts = Counter((path.parent, image_space) for path, image_space, _ in images)

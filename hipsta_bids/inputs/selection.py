@@ -1,4 +1,4 @@
-"""Which of what is found is wanted, by options and the filter file, and which of several files."""
+"""Selection of inputs by options and the filter file, and choice among several files."""
 
 import difflib
 import json
@@ -8,16 +8,13 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from hipsta_bids import opening
 from hipsta_bids.errors import HipstaError, InputError, ProtocolError, UsageError
 from hipsta_bids.inputs import scan, tree
 from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.protocols.protocol import Protocol
-
-if TYPE_CHECKING:
-    from hipsta_bids.inputs.ashs import AtlasFinder
 
 #: The entry of the filter file that applies to segmentations.
 _QUERY = "dseg"
@@ -120,7 +117,7 @@ class Verdict:
     problem: HipstaError | None = None
     notes: tuple[str, ...] = ()
     provenance: dict[str, str | None] = field(default_factory=dict)
-    """What the file's name does not tell."""
+    """What the file's name does not show."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -132,7 +129,8 @@ class Context:
     atlas: Protocol | None
     """Of ``--ashs-atlas``."""
     visit: tree.VisitFolders = tree.NO_VISIT
-    atlases: "AtlasFinder | None" = None
+    identify_atlas: Callable[[LabelFile, str], Verdict] | None = None
+    """Finds the atlas of a file of ASHS, and of one side."""
     longitudinal: bool = False
     """Which of FreeSurfer's runs the visit is represented by."""
 
@@ -179,7 +177,7 @@ class Context:
         best = files[0]
         verdict = replace(
             verdict,
-            problem=verdict.problem or rivals_problem(files),
+            problem=verdict.problem or ambiguity(files),
             provenance=self.provenance(tool, best) | verdict.provenance,
         )
         return self.input(hemi, verdict, [best.path], passed_over, bilateral=best.hemi is None)
@@ -205,22 +203,19 @@ class Context:
 DESIGNS = ("cross-sectional", "longitudinal")
 
 
-def rivals_problem(files: Sequence[LabelFile]) -> InputError | None:
+def ambiguity(files: Sequence[LabelFile]) -> InputError | None:
     """Refuse to choose between files of which none is better."""
-    rivals = [file.path for file in files if file.rank == files[0].rank]
-    if len(rivals) == 1:
+    equal_files = [file.path for file in files if file.rank == files[0].rank]
+    if len(equal_files) == 1:
         return None
-    folder = Path(os.path.commonpath([path.parent for path in rivals]))
-    names = " and ".join(str(path.relative_to(folder)) for path in rivals)
+    folder = Path(os.path.commonpath([path.parent for path in equal_files]))
+    names = " and ".join(str(path.relative_to(folder)) for path in equal_files)
     remedy = "keep one of them in the subject's folder"
-    if len({path.name for path in rivals}) < len(rivals):
+    if len({path.name for path in equal_files}) < len(equal_files):
         remedy = "name the folder to use with --participants-map"
     elif files[0].traits.get("suffix") == "dseg":
         remedy = "choose by entities with --bids-filter-file"
-    return InputError(
-        f"{folder}: {names} are equally good; {remedy}",
-        reason="several-files",
-    )
+    return InputError(f"{folder}: {names} are equally good; {remedy}", reason="several-files")
 
 
 def make_selection(request: scan.InputRequest) -> Selection:

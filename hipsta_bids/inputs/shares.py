@@ -107,14 +107,14 @@ def _likely_sheet(volume: LabelVolume, shares: dict[int, NDArray[np.float32]]) -
     """
     sheet, remainder = np.zeros((2, *volume.tissue.shape), dtype=np.float32)
     remainder += 1
-    rival = np.zeros_like(sheet)
+    largest = np.zeros_like(sheet)
     for kind, share in shares.items():
         remainder -= share
         if kind in (*volume.protocol.sheet, *volume.protocol.layer):
             sheet += share
         else:
-            rival = np.maximum(rival, share)
-    return np.asarray(sheet >= np.maximum(rival, remainder))
+            largest = np.maximum(largest, share)
+    return np.asarray(sheet >= np.maximum(largest, remainder))
 
 
 def _check_values(layer: Layer, *, weights: bool) -> None:

@@ -8,7 +8,7 @@ import os
 import re
 import unicodedata
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -32,6 +32,7 @@ _BASE_END = re.compile(r"[-_.]*(?:base|template)$", re.IGNORECASE)
 _TEMPLATE = re.compile(r"fsaverage.*|cvs_avg35.*|[lr]h\.EC_average|V1_average")
 
 _SESSION = re.compile(r"ses-(?P<session>[A-Za-z0-9+]+)")
+_NO_SESSION = ("its name is not ses-LABEL, of letters and digits", "a session inside of a session")
 
 #: Folders below a subject or a session that can hold segmentations.
 _INNER = re.compile(r"anat|mri|final|seg\w*")
@@ -83,7 +84,7 @@ class Ignored:
     status: str = NOT_USED
     """Or ``NO_SEGMENTATION``, which nobody misses."""
     quiet: bool = False
-    """For the full account only."""
+    """For the full list only."""
     inside: Path | None = None
     """The subject's folder that it is in, if it is not that itself."""
 
@@ -103,7 +104,7 @@ NO_SUBJECT = "no subject's folder"
 
 
 def no_segmentation(path: Path, reason: str) -> Ignored:
-    """Account for an entry that holds no participant."""
+    """Describe an entry that holds no participant."""
     return Ignored(path=path, reason=reason, status=NO_SEGMENTATION, quiet=True)
 
 
@@ -188,30 +189,16 @@ def sort_folders(
     """
     names, files = list_folder(root)
     entries = read_names(root, names, any_name=any_name).values()
-    named = people_in(root, people)
-    folders = [] if named else [entry for entry in entries if isinstance(entry, SubjectFolder)]
-    other_entries = [
-        entry
-        if isinstance(entry, Ignored)
-        else Ignored(path=entry.path, reason=_NOT_NAMED, subject=entry.subject)
-        for entry in entries
-        if named or isinstance(entry, Ignored)
-    ]
-    paths = {root / folder for folder in named}
-    above = {parent for path in paths for parent in path.parents if root in parent.parents}
-    other_entries = [entry for entry in other_entries if entry.path not in paths | above]
-    other_entries += [
-        Ignored(path=parent / name, reason=_NOT_NAMED)
-        for parent in above
-        for name in list_folder(parent)[0]
-        if parent / name not in paths | above and _tools_inside(parent / name, if_closed="any")
-    ]
-    folders += [
-        SubjectFolder(
-            subject=subject, session=session, path=root / folder, spelling=subject, renamed=True
-        )
-        for folder, (subject, session) in named.items()
-    ]
+    folders = [entry for entry in entries if isinstance(entry, SubjectFolder)]
+    other_entries = [entry for entry in entries if isinstance(entry, Ignored)]
+    if named := people_in(root, people):
+        other_entries = _not_named(root, entries, named)
+        folders = [
+            SubjectFolder(
+                subject=subject, session=session, path=root / folder, spelling=subject, renamed=True
+            )
+            for folder, (subject, session) in named.items()
+        ]
     for name in files:
         entry = no_segmentation(root / name, NO_SUBJECT)
         if match := _SUBJECT.fullmatch(name):
@@ -221,53 +208,91 @@ def sort_folders(
     return folders, sorted(other_entries, key=lambda entry: entry.path)
 
 
+def _not_named(
+    root: Path, entries: Iterable[SubjectFolder | Ignored], named: Iterable[str]
+) -> list[Ignored]:
+    """List the entries of a dataset, and folders of subjects, that a table does not name."""
+    paths = {root / folder for folder in named}
+    above = {parent for path in paths for parent in path.parents if root in parent.parents}
+    others = [
+        entry
+        if isinstance(entry, Ignored)
+        else Ignored(path=entry.path, reason=_NOT_NAMED, subject=entry.subject)
+        for entry in entries
+        if entry.path not in paths | above
+    ]
+    return others + [
+        Ignored(path=parent / name, reason=_NOT_NAMED)
+        for parent in above
+        for name in list_folder(parent)[0]
+        if parent / name not in paths | above and _tools_inside(parent / name, if_closed="any")
+    ]
+
+
 def read_names(
     root: Path, names: Sequence[str], *, any_name: str
 ) -> dict[str, SubjectFolder | Ignored]:
     """Determine the participants of folders by their names, or why they have none."""
-    stems = {name: name.partition(".long.")[0] for name in names}
-    base_of = {stem: name.partition(".long.")[2] for name, stem in stems.items() if stem != name}
-    inside = {
-        name: _tools_inside(root / name, if_closed=any_name)
-        for name, stem in stems.items()
-        if not _SUBJECT.fullmatch(stem)
-    }
+    stems, base_of = _long_runs(names)
+    inside = _tools_of_unmatched(root, stems, any_name)
     visits_of = Counter(base_of.values())
     bases = {*visits_of, *(name for name, tools in inside.items() if "base" in tools)}
     entries: dict[str, SubjectFolder | Ignored] = {}
     for name, stem in stems.items():
-        path, match = root / name, _SUBJECT.fullmatch(stem) if name not in inside else None
-        # A time point begins with the name of its base, and goes on with no letter or digit.
-        heads = (stem[:n] for n, letter in enumerate(stem) if not letter.isalnum())
-        before = "" if match else max((h for h in heads if h in bases), key=len, default="")
-        base = base_of.get(stem) or before
+        path, match = root / name, _SUBJECT.fullmatch(stem)
+        base = base_of.get(stem) or ("" if match else _base_before(stem, bases))
+        tools = inside.get(name, frozenset())
         if name in bases and name not in base_of:
             entries[name] = no_segmentation(path, "the base of longitudinal runs, no visit")
         elif match and (match["session"] or visits_of[base] < 2):  # noqa: PLR2004 (two visits)
+            spelling = stem.partition("_ses-")[0]
+            subject, session = match["subject"], match["session"]
             entries[name] = SubjectFolder(
-                subject=match["subject"],
-                session=match["session"],
-                path=path,
-                spelling=stem.partition("_ses-")[0],
+                subject=subject, session=session, path=path, spelling=spelling
             )
-        elif name.startswith("sub-") or inside.get(name):
-            allowed = match is not None or any_name in inside.get(name, ())
-            tools = inside.get(name, frozenset())
+        elif name.startswith("sub-") or tools:
+            allowed = match is not None or any_name in tools
             entries[name] = _renamed(path, stem, base, tools=tools, allowed=allowed)
         else:
             entries[name] = no_segmentation(path, NO_SUBJECT)
     return entries
 
 
+def _long_runs(names: Iterable[str]) -> tuple[dict[str, str], dict[str, str]]:
+    """Return the parts of names before ``.long.``, and for these parts the bases after it."""
+    stems = {name: name.partition(".long.")[0] for name in names}
+    bases = {stem: name.partition(".long.")[2] for name, stem in stems.items() if stem != name}
+    return stems, bases
+
+
+def _tools_of_unmatched(
+    root: Path, stems: Mapping[str, str], any_name: str
+) -> dict[str, frozenset[str]]:
+    """Find the programs of folders whose stems are not of the form ``sub-X``."""
+    unmatched = [name for name, stem in stems.items() if not _SUBJECT.fullmatch(stem)]
+    return {name: _tools_inside(root / name, if_closed=any_name) for name in unmatched}
+
+
+def _base_before(stem: str, bases: Collection[str]) -> str:
+    """Return the base with which a time point begins, followed by no letter or digit."""
+    heads = (stem[:n] for n, letter in enumerate(stem) if not letter.isalnum())
+    return max((head for head in heads if head in bases), key=len, default="")
+
+
+def _spelled(stem: str, base: str) -> tuple[str, str | None]:
+    """Return what stands for the participant and for the session in a folder's name."""
+    if not base:
+        match = _ANY_NAME.fullmatch(stem)
+        return (match["subject"], match["session"]) if match else (stem, None)
+    spelling = _BASE_END.sub("", base) or base
+    return spelling, stem.removeprefix(spelling).strip("-_.").removeprefix("ses-") or None
+
+
 def _renamed(
     path: Path, stem: str, base: str, *, tools: frozenset[str], allowed: bool
 ) -> SubjectFolder | Ignored:
     """Make labels of a folder's name, if the option of its program is given."""
-    match = _ANY_NAME.fullmatch(stem)
-    spelling, session = (match["subject"], match["session"]) if match else (stem, None)
-    if base:  # names the person; the rest is the visit
-        spelling = _BASE_END.sub("", base) or base
-        session = stem.removeprefix(spelling).strip("-_.").removeprefix("ses-") or None
+    spelling, session = _spelled(stem, base)
     label, visit = plain_label(spelling), plain_label(session or "") or None
     if _TEMPLATE.fullmatch(path.name):
         reason = "part of FreeSurfer, and no subject"
@@ -294,7 +319,7 @@ def _renamed(
 
 
 def _tools_inside(path: Path, *, if_closed: str) -> frozenset[str]:
-    """Tell whose subject's folder it looks like: programs, and ``base`` of longitudinal runs."""
+    """Return programs whose subject's folder it may be, and ``base`` of longitudinal runs."""
     try:
         with os.scandir(path) as entries:
             names = {entry.name for entry in entries}
@@ -400,9 +425,7 @@ def _inner_folders(
             elif outer and _INNER.fullmatch(name):
                 waiting.append((session, path / name, False))
             elif outer and name.startswith("ses-"):
-                reason = "its name is not ses-LABEL, of letters and digits"
-                reason = "a session inside of a session" if match else reason
-                ignored.append(_inside(folder, path / name, reason))
+                ignored.append(_inside(folder, path / name, _NO_SESSION[bool(match)]))
             elif connectome and (_HCP.fullmatch(name) or name == folder.path.name):
                 # Below T1w are FreeSurfer's folder of this name, and HippUnfold's dataset.
                 waiting.append((session, path / name, name not in {"T1w", "T2w", "T1wT2w"}))

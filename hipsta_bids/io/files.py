@@ -249,8 +249,7 @@ def read_json(path: Path, limit: float = opening.TABLE) -> dict[str, Any]:
         ) from error
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(
-            f"{path}: not readable as JSON ({error}); correct or restore it",
-            reason="bad-json",
+            f"{path}: not readable as JSON ({error}); correct or restore it", reason="bad-json"
         ) from error
     if not isinstance(value, dict):
         raise InputError(f"{path}: not a JSON object; correct or restore it", reason="bad-json")
@@ -281,21 +280,7 @@ def write_tsv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[str]])
 
 def read_tsv(path: Path) -> list[dict[str, str]]:
     """Read a BIDS table as text cells."""
-    try:
-        text = opening.read_text(path, encoding="utf-8-sig")
-    except FileNotFoundError as error:
-        raise MissingFileError(f"{path}: file not found; check its name") from error
-    except UnicodeDecodeError as error:
-        raise InputError(
-            f"{path}: not readable as a table: no UTF-8 text; save it as that (not as Excel's"
-            " Unicode text)",
-            reason="unreadable-table",
-        ) from error
-    except (OSError, ValueError) as error:
-        raise InputError(
-            f"{path}: not readable as a table ({error}); save it as UTF-8 text with tabs",
-            reason="unreadable-table",
-        ) from error
+    text = _read_table_text(path)
     lines = [
         [(match[1] if (match := _QUOTED.fullmatch(cell)) else cell) for cell in line.split("\t")]
         for line in re.split(r"\r\n?|\n", text)
@@ -316,6 +301,24 @@ def read_tsv(path: Path) -> list[dict[str, str]]:
             f"{path}: column {repeated[0]!r} occurs more than once; keep one", reason="bad-table"
         )
     return [dict(zip(header, cells, strict=True)) for _, cells in table]
+
+
+def _read_table_text(path: Path) -> str:
+    try:
+        return opening.read_text(path, encoding="utf-8-sig")
+    except FileNotFoundError as error:
+        raise MissingFileError(f"{path}: file not found; check its name") from error
+    except UnicodeDecodeError as error:
+        raise InputError(
+            f"{path}: not readable as a table: no UTF-8 text; save it as that (not as Excel's"
+            " Unicode text)",
+            reason="unreadable-table",
+        ) from error
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"{path}: not readable as a table ({error}); save it as UTF-8 text with tabs",
+            reason="unreadable-table",
+        ) from error
 
 
 def _shortened(cells: Sequence[str], size: int) -> list[str]:
@@ -420,7 +423,7 @@ def checked_foreign(content: object, kind: type[Table]) -> Table:
 def rounded(value: Any) -> Any:  # noqa: ANN401  (nested lists of numbers)
     """Round numbers to nine digits, in lists and arrays too; null where one is missing."""
     if isinstance(value, (list, np.ndarray)):
-        return [rounded(one) for one in (value if isinstance(value, list) else value.tolist())]
+        return [rounded(entry) for entry in (value if isinstance(value, list) else value.tolist())]
     if isinstance(value, int):
         return value
     return float(f"{value:.9g}") if math.isfinite(value) else None

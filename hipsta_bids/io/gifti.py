@@ -3,7 +3,7 @@
 Structure names are those of Connectome Workbench's ``StructureEnum``, which knows
 ``HippocampusLeft`` and ``HippocampusRight``; the metadata keys are those of the GIFTI 1.0
 specification (Harwell et al. 2011) and of Workbench. CIFTI-2 calls them
-``CIFTI_STRUCTURE_HIPPOCAMPUS_LEFT`` and ``_RIGHT``. HippUnfold's own CIFTI files are made by
+``CIFTI_STRUCTURE_HIPPOCAMPUS_LEFT`` and ``_RIGHT``. HippUnfold's CIFTI files are made by
 Workbench from a left and a right map, which makes their structures those of the cortex; both are
 read.
 
@@ -72,7 +72,7 @@ _DAMAGE = (
     *(OSError, ValueError, TypeError, LookupError, AttributeError, AssertionError, MemoryError),
     *(ImageFileError, HeaderDataError, Cifti2HeaderError, ExpatError, zlib.error, struct.error),
 )
-#: Structure of Workbench 2 beside the hippocampus in files of the HCP, which nibabel does not know.
+#: Another structure of Workbench 2 in files of the HCP, which nibabel does not know.
 _DENTATE = "HIPPOCAMPUS_DENTATE"
 CIFTI_BRAIN_STRUCTURES.add_codes(
     [
@@ -109,10 +109,7 @@ def surface_bytes(
     points: Float, triangles: Int, *, hemi: str, secondary: str | None, unfolded: bool
 ) -> bytes:
     """Encode a surface, (N, 3) vertices in mm: scanner RAS, or the plane of the unfolded sheet."""
-    meta = {
-        _PRIMARY: _STRUCTURE[hemi],
-        "GeometricType": "Flat" if unfolded else "Anatomical",
-    }
+    meta = {_PRIMARY: _STRUCTURE[hemi], "GeometricType": "Flat" if unfolded else "Anatomical"}
     if secondary:
         meta["AnatomicalStructureSecondary"] = secondary
     vertices = _array(points, "POINTSET", meta)
@@ -138,8 +135,8 @@ def maps_bytes(values: Float, *, hemi: str, names: Sequence[str], series: bool =
 def cifti_bytes(values: Mapping[str, Float], names: Sequence[str], note: str = "") -> bytes:
     """Encode maps of both sides as CIFTI-2; ``values`` are (maps, vertices) by hemisphere."""
     models = [
-        BrainModelAxis.from_surface(np.arange(one.shape[1]), one.shape[1], _STRUCTURE[hemi])
-        for hemi, one in values.items()
+        BrainModelAxis.from_surface(np.arange(rows.shape[1]), rows.shape[1], _STRUCTURE[hemi])
+        for hemi, rows in values.items()
     ]
     data = np.concatenate(list(values.values()), axis=1).astype(np.float32)
     meta = [{"Description": note} if note else {} for _ in names]
@@ -331,7 +328,7 @@ def checked_mesh(path: Path, points: ArrayLike, triangles: ArrayLike) -> Mesh:
 def structure_side(path: Path) -> str | None:
     """Determine the side of a GIFTI file by the structure that it or one of its arrays names."""
     image = _load(path, GiftiImage)
-    named = [str(one.meta.get(_PRIMARY, "")) for one in (image, *image.darrays)]
+    named = [str(element.meta.get(_PRIMARY, "")) for element in (image, *image.darrays)]
     sides = {side[0] for name in named for side in ("Left", "Right") if name.endswith(side)}
     return sides.pop() if len(sides) == 1 else None
 

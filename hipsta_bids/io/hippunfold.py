@@ -68,7 +68,7 @@ def suffix(path: Path) -> str:
 
 
 def surfaces_beside(path: Path, hemi: str, *, flat: bool = True) -> list[Path]:
-    """List unfolded surfaces of a map, or others: beside it, or in version 2 in ``surf/``."""
+    """List unfolded surfaces of a map, or others: next to it, or in version 2 in ``surf/``."""
     if match := _HCP.fullmatch(path.name):
         label = match["label"].removesuffix("ocampus") if match["hemi"] is None else match["label"]
         kind = "flat" if flat else "midthickness"

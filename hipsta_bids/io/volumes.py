@@ -38,11 +38,11 @@ _SAME_SIZE = 0.01
 #: Displacement of labels by the qform against the sform that a note names, mm, ...
 _SAME_POSITION = 0.1
 
-#: ... beside the rounding of quaternions, rad: up to 0.0013 where programs compute in single
+#: ... besides the rounding of quaternions, rad: up to 0.0013 where programs compute in single
 #: precision, since a half turn loses half of the digits.
 _ROUNDED_QFORM = 0.002
 
-#: Units of headers that are not millimeters, in mm; and voxel edges that tell them, mm.
+#: Units of headers that are not millimeters, in mm; and voxel edges that identify them, mm.
 _UNITS = {"meters": 1000.0, "centimeters": 10.0, "micrometers": 0.001}
 _USUAL_SIZES = (0.1, 4.0)
 
@@ -79,12 +79,12 @@ _SLAB = 8_000_000
 #: rest is for libraries and for what comes later. A slab of slices takes a quarter of this share.
 READ_SHARE = 0.5
 
-#: Bytes per voxel that reading and translating labels takes beside the voxel itself: measured, 16
+#: Bytes per voxel that reading and translating labels takes in addition to the voxel: measured, 16
 #: for integers of 1 and 4 bytes, 20 for floats of 4.
-_BESIDE = 20
+_EXTRA_BYTES = 20
 
 #: The same of a map: its values in double precision.
-_BESIDE_MAP = 8
+_EXTRA_BYTES_MAP = 8
 
 _memory: ContextVar[float] = ContextVar("memory", default=math.inf)
 
@@ -100,11 +100,11 @@ def _check_fits(
     voxels: int,
     content: str,
     *,
-    beside: int = _BESIDE,
+    extra_bytes: int = _EXTRA_BYTES,
     remedy: str = "crop it to the hippocampus",
 ) -> None:
     """Refuse to read so many voxels at once if they need more than their share of memory."""
-    need, share = voxels * _voxel_bytes(image, beside), READ_SHARE * _memory.get()
+    need, share = voxels * _voxel_bytes(image, extra_bytes), READ_SHARE * _memory.get()
     if need > share:
         raise InputError(
             f"{path}: {content} ({voxels / 1e6:.1f} million voxels) needs {need / 1e6:.0f} "
@@ -113,11 +113,11 @@ def _check_fits(
         )
 
 
-def _voxel_bytes(image: Any, beside: int) -> int:  # noqa: ANN401 (untyped)
+def _voxel_bytes(image: Any, extra_bytes: int) -> int:  # noqa: ANN401 (untyped)
     """Bytes of memory that reading takes per voxel; scaled numbers become double precision."""
     kind = image.get_data_dtype().itemsize
     scaled = (image.dataobj.slope, image.dataobj.inter) != (1, 0)
-    return beside + (max(kind, 8) if scaled else int(kind))
+    return extra_bytes + (max(kind, 8) if scaled else int(kind))
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,7 +143,7 @@ class LabelImage:
         return box(self.start, np.add(self.start, self.data.shape))
 
     @property
-    def own_affine(self) -> Float:
+    def file_affine(self) -> Float:
         """(4, 4), voxel index in the part to RAS mm."""
         return moved(self.affine, self.start)
 
@@ -255,7 +255,7 @@ def _voxels(image: Any, shape: tuple[int, int, int], box: tuple[slice, ...]) -> 
 
 def _slabs(image: Any, shape: tuple[int, int, int]) -> Iterator[tuple[int, NDArray[Any]]]:  # noqa: ANN401 (untyped)
     """Read slab by slab along the last axis; yields where each begins."""
-    slab_voxels = min(_SLAB, READ_SHARE / 4 * _memory.get() / _voxel_bytes(image, _BESIDE))
+    slab_voxels = min(_SLAB, READ_SHARE / 4 * _memory.get() / _voxel_bytes(image, _EXTRA_BYTES))
     step = max(int(slab_voxels // max(shape[0] * shape[1], 1)), 1)
     for start in range(0, shape[2], step):
         stop = min(start + step, shape[2])
@@ -314,7 +314,7 @@ def read_scalars(path: Path, points: Float) -> ScalarVolume:
             path,
             math.prod(side.stop - side.start for side in part) * math.prod(shape[_SPACE:]),
             "the part round the sheet",
-            beside=_BESIDE_MAP,
+            extra_bytes=_EXTRA_BYTES_MAP,
             remedy="give fewer volumes at once",
         )
         data = np.asarray(image.dataobj[part], dtype=np.float64)
@@ -367,7 +367,7 @@ def _format(path: Path, start: bytes) -> type[Any]:
     """Choose the format by the file's name and, between the versions of NIfTI, its first bytes."""
     if path.suffix in {".mgz", ".mgh"}:
         return _MGHImage
-    # NIfTI begins with the size of its header, which tells the versions apart.
+    # NIfTI begins with the size of its header, which distinguishes the versions.
     sizes = {int.from_bytes(start, order) for order in ("little", "big")}
     newer = nib.Nifti2Header.template_dtype.itemsize in sizes
     return nib.Nifti2Image if newer else nib.Nifti1Image
@@ -408,10 +408,9 @@ def _checked_affine(image: Any, path: Path, limits: tuple[float, float]) -> Floa
     """Return the affine, voxel index to RAS mm; refuse one that cannot be right."""
     affine: Float = np.asarray(image.affine, dtype=np.float64)
     linear = affine[:3, :3]
-    no_orientation = isinstance(image, nib.Nifti1Pair) and not (
+    if isinstance(image, nib.Nifti1Pair) and not (
         int(image.header["sform_code"]) or int(image.header["qform_code"])
-    )
-    if no_orientation:
+    ):
         raise InputError(
             f"{path}: no sform and no qform, left and right are unknown; copy the "
             "orientation of the segmented image",
@@ -419,8 +418,7 @@ def _checked_affine(image: Any, path: Path, limits: tuple[float, float]) -> Floa
         )
     if not np.isfinite(affine).all():
         raise InputError(
-            f"{path}: the affine contains NaN or infinity; repair the header",
-            reason="bad-affine",
+            f"{path}: the affine contains NaN or infinity; repair the header", reason="bad-affine"
         )
     sizes = np.linalg.norm(linear, axis=0)
     volume = abs(np.linalg.det(linear))
@@ -442,23 +440,29 @@ def _checked_affine(image: Any, path: Path, limits: tuple[float, float]) -> Floa
             reason="bad-voxel-size",
         )
     if isinstance(image, nib.Nifti1Pair):
-        qform = _qform(image)
-        if qform is not None and np.linalg.det(qform[:3, :3]) * np.linalg.det(linear) < 0:
-            raise InputError(
-                f"{path}: sform and qform are mirror images of each other, left and right are "
-                "unknown; correct the wrong one",
-                reason="bad-affine",
-            )
-        spacing = np.asarray(image.header.get_zooms()[:_SPACE], dtype=np.float64)
-        # Some programs without a qform leave it as it was.
-        stated = spacing.min() > 0 and (qform is not None or np.any(spacing != 1))
-        if stated and np.abs(sizes / spacing - 1).max() > _SAME_SIZE:
-            raise InputError(
-                f"{path}: voxels are {_times(sizes)} mm by the sform, but {_times(spacing)} "
-                "mm by pixdim; correct the wrong one",
-                reason="bad-affine",
-            )
+        _check_header(image, path, linear)
     return affine
+
+
+def _check_header(image: Any, path: Path, linear: Float) -> None:  # noqa: ANN401  (as above)
+    """Refuse a NIfTI header that contradicts the linear part of the affine."""
+    sizes = np.linalg.norm(linear, axis=0)
+    qform = _qform(image)
+    if qform is not None and np.linalg.det(qform[:3, :3]) * np.linalg.det(linear) < 0:
+        raise InputError(
+            f"{path}: sform and qform are mirror images of each other, left and right are "
+            "unknown; correct the wrong one",
+            reason="bad-affine",
+        )
+    spacing = np.asarray(image.header.get_zooms()[:_SPACE], dtype=np.float64)
+    # Some programs without a qform leave it as it was.
+    stated = spacing.min() > 0 and (qform is not None or np.any(spacing != 1))
+    if stated and np.abs(sizes / spacing - 1).max() > _SAME_SIZE:
+        raise InputError(
+            f"{path}: voxels are {_times(sizes)} mm by the sform, but {_times(spacing)} "
+            "mm by pixdim; correct the wrong one",
+            reason="bad-affine",
+        )
 
 
 def _qform(image: Any) -> Float | None:  # noqa: ANN401 (untyped)

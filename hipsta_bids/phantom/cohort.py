@@ -1,5 +1,6 @@
 """Synthetic cohorts: groups with a planted effect, covariates and known truth."""
 
+import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -54,7 +55,7 @@ EFFECT_TABLE = "phantom_effect.tsv"
 NODES = (41, 21)
 
 #: Of a phantom with a head: digitations at most, and mm of a mean subject: radius of the spiral,
-#: tail, body, and what lies between the body and the hook beside the digitations.
+#: tail, body, and what lies between the body and the hook next to the digitations.
 _MOST_DIGITATIONS, _RADIUS, _TAIL, _BODY, _BEFORE_HOOK = 4, 5.0, 8.0, 15.0, 10.0
 _MOST_SUBJECTS = 10_000
 
@@ -80,7 +81,7 @@ class CohortPlan:
     """One of ``REGIONS``, or ``head`` of a phantom with a head."""
     shift: float = 0.0
     """mm, by which the pattern of the wall and the subfields' borders lie more lateral in the
-    other groups; a method has to tell this from thinning."""
+    other groups; a method has to distinguish this from thinning."""
     seed: int = 0
     kind: str = "spiral"
     """Shape of the cross-section."""
@@ -93,7 +94,7 @@ class CohortPlan:
     hemisphere_sd: float = 0.03
     """mm"""
     offset_sd: float = 0.3
-    """mm, of each subject's own shift along x."""
+    """mm, of each subject's shift along x."""
     age_slope: float = -0.004
     """mm per year."""
     sites: tuple[float, ...] = (0.0, 0.03)
@@ -115,23 +116,27 @@ class CohortPlan:
                     f"phantom: {name} {value!r} is unknown; choose from {', '.join(choices)}"
                     f"{did_you_mean([value], choices)}"
                 )
-        problem = None
+        if problem := self._problem():
+            raise UsageError(f"phantom: {problem}")
+
+    def _problem(self) -> str:
+        """Return what cannot be made, or nothing."""
+        problem = ""
         if self.cortex and KINDS[self.kind].power != 1:
             problem = f"the shape {self.kind} cannot extend into cortex; choose another kind"
-        bodies = self.shift or self.cortex or self.probabilities or self.kind != CohortPlan.kind
-        if self.head is not None and bodies:
-            problem = "a head has a shape of its own; remove shift, cortex, kind, probabilities"
-        if self.head is not None and not 0 <= self.head <= _MOST_DIGITATIONS:
-            problem = f"a head has 0 to {_MOST_DIGITATIONS} digitations, not {self.head}"
+        if self.head is not None:
+            if self.shift or self.cortex or self.probabilities or self.kind != CohortPlan.kind:
+                problem = "a head has a shape of its own; remove shift, cortex, kind, probabilities"
+            if not 0 <= self.head <= _MOST_DIGITATIONS:
+                problem = f"a head has 0 to {_MOST_DIGITATIONS} digitations, not {self.head}"
         if not (1 <= self.n_subjects <= _MOST_SUBJECTS and self.seed >= 0):
             problem = f"{self.n_subjects} subjects; give 1 to {_MOST_SUBJECTS:,}"
             problem += f", and a seed of 0 or more, not {self.seed}"
         if not self.groups or len(set(self.groups)) < len(self.groups):
             problem = "give at least one group, and groups with different names"
-        if self.site and not (self.site.isascii() and self.site.isalnum()):
+        if not re.fullmatch("[A-Za-z0-9]*", self.site):
             problem = f"site {self.site!r}: labels have letters and digits only"
-        if problem is not None:
-            raise UsageError(f"phantom: {problem}")
+        return problem
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -150,7 +155,7 @@ class Subject:
 
 
 def make_cohort(plan: CohortPlan) -> list[Subject]:
-    """Draw subjects, each with its own random generator: more subjects do not change the first."""
+    """Draw subjects, each with its random generator: more subjects do not change the first."""
     return [_make_subject(plan, number) for number in range(plan.n_subjects)]
 
 
@@ -270,10 +275,7 @@ def write_cohort(
         voxel_size=voxel_size,
         probabilities=plan.probabilities,
         columns=_columns(plan),
-        rows={
-            one.label: (one.group, f"{one.age:.1f}", one.sex, f"{one.icv:.1f}", one.site)
-            for one in subjects
-        },
+        rows={s.label: (s.group, f"{s.age:.1f}", s.sex, f"{s.icv:.1f}", s.site) for s in subjects},
     )
     for item in hemispheres:
         if isinstance(item.spec, PhantomSpec):
@@ -352,7 +354,7 @@ def _write_head_effect(out: Path, plan: CohortPlan) -> None:
     )
     rows = []
     for part in ("tail", "body", "head"):
-        a, b = (one.region_summary(part)["thickness_mean"] for one in (without, planted))
+        a, b = (phantom.region_summary(part)["thickness_mean"] for phantom in (without, planted))
         rows.append([part, str(int(part == "head")), f"{b - a:.5f}"])
     files.write_tsv(out / EFFECT_TABLE, ["part", "in_region", "difference"], rows)
     columns = {

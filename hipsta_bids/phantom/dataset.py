@@ -1,8 +1,9 @@
-"""Synthetic BIDS datasets: segmentations of phantoms, laid out as other tools do, and the truth."""
+"""Synthetic BIDS datasets: segmentations of phantoms, arranged as other tools do, and the truth."""
 
 import gzip
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from itertools import filterfalse
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -112,13 +113,12 @@ def write_dataset(
 ) -> None:
     """Write phantoms as a BIDS dataset with derivatives and a table of the truth.
 
-    ``probabilities`` writes the share of each voxel that a tissue fills beside the labels.
-    ``columns`` describes the columns of ``participants.tsv`` beside the labels, as a BIDS sidecar
+    ``probabilities`` writes the share of each voxel that a tissue fills next to the labels.
+    ``columns`` describes the columns of ``participants.tsv`` next to the labels, as a BIDS sidecar
     does; ``rows`` has their values in this order, by subject label without ``sub-``. The same input
     gives the same bytes. Existing files of the same name are replaced.
     """
-    unknown = [name for name in layouts if name not in LAYOUTS]
-    if unknown:
+    if unknown := list(filterfalse(LAYOUTS.__contains__, layouts)):
         raise bad(
             f"layout {unknown[0]!r} is unknown; choose from {', '.join(LAYOUTS)}"
             f"{did_you_mean(unknown, LAYOUTS)}"
@@ -224,7 +224,7 @@ def _truth_rows(item: Hemisphere, phantom: Phantom | HeadPhantom) -> list[dict[s
 
 
 def _write_labels(path: Path, item: Hemisphere, volume: LabelVolume) -> None:
-    """Write labels, and the shares of tissues beside them if the volume has some."""
+    """Write labels, and the shares of tissues next to them if the volume has some."""
     _write_image(path, encode(volume), volume.affine)
     names = {int(row.tissue): plain_name(row.abbreviation) for row in volume.protocol.labels}
     for tissue in names.keys() & volume.shares.keys():
@@ -258,7 +258,7 @@ def _write_truth(
 def write_sidecar(
     table: Path, columns: Mapping[str, tuple[str, str | None]], **extras: Mapping[str, Any]
 ) -> None:
-    """Write definitions and units of a table's columns beside it."""
+    """Write definitions and units of a table's columns next to it."""
     described = {
         name: {"Description": text} | ({"Units": unit} if unit else {})
         for name, (text, unit) in columns.items()
@@ -297,7 +297,7 @@ def _write_descriptions(out: Path, layouts: Sequence[str]) -> None:
         },
     )
     for name in layouts:
-        # Not made by us as far as finding inputs goes, which passes over its own outputs.
+        # Not made by us as far as finding inputs goes, which passes over its outputs.
         folder = out / "derivatives" / name
         maker = {
             "Name": f"phantom ({name})",

@@ -42,7 +42,7 @@ _STEP = 0.04
 """Between points of the folded surface along the axis, mm."""
 _CORE, _LAYER, _LEAVES = 2.0, 0.5, 1.2
 """Radius of the dentate gyrus and thickness of the molecular layer, mm; the share of the spiral up
-to which the gyrus lies beside CA3."""
+to which the gyrus lies next to CA3."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,7 +76,7 @@ class HeadSpec:
 
     def __post_init__(self) -> None:
         low, high = _WALLS
-        if not all(low <= self.thickness - less <= high for less in (0.0, self.thinning)):
+        if not all(low <= self.thickness - thinning <= high for thinning in (0.0, self.thinning)):
             raise SettingsError(
                 f"phantom: a wall of {self.thickness:g} mm, {self.thinning:g} mm thinner in the "
                 f"head, exceeds {low:g} to {high:g} mm; choose others"

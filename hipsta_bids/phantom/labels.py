@@ -191,7 +191,7 @@ def label_for(protocol: Protocol, tissue: Tissue, part: Part) -> Label | None:
 
 
 def encode(volume: LabelVolume) -> NDArray[np.int32]:
-    """Codes (I, J, K) of a label volume in its own protocol, to write it as that tool would.
+    """Codes (I, J, K) of a label volume in its protocol, to write it as that tool would.
 
     Where several labels mean the same tissue of the same part, the first one is written.
     """
@@ -230,7 +230,7 @@ def _label_table(protocol: Protocol) -> NDArray[np.intp]:
                 "choose another protocol"
             )
         cortex = [label_for(protocol, tissue, part) for tissue in CORTEX]
-        layers = [None if own is None else layer or own for own in sheet]
+        layers = [None if tissue is None else layer or tissue for tissue in sheet]
         table += [
             position[id(x)] if x is not None else 0 for x in (*sheet, *layers, *inner, *cortex)
         ]

@@ -167,7 +167,7 @@ def _surface_jet(body: Body, u: Float, v: Float, at: float) -> _Jet:
     s = u * body.spec.width
     bend = body.spec.bend
     wall = body.thickness_jet(u, v)
-    n, n_s, n_w, n_ss, n_sw, n_ww = (at * own for own in wall)
+    n, n_s, n_w, n_ss, n_sw, n_ww = (at * sign for sign in wall)
     k, k_s = body.curve.curvature(s), body.curve.curvature_slope(s)
     mid_stretch, by_n = _axis_stretch(body, u)
     stretch = mid_stretch + n * by_n

@@ -93,7 +93,7 @@ class PhantomSpec:
     kind: str = "spiral"
     """One of ``KINDS``: how the cross-section bends."""
     curvature: tuple[float, float] | None = None
-    """1/mm at the medial and the lateral end, in place of the kind's own."""
+    """1/mm at the medial and the lateral end, in place of those of the kind."""
     thickness: Annotated[float, (0.1, 10.0)] = 2.0
     """mm, mean over the sheet."""
     variation: Annotated[float, (0.0, 0.9)] = 0.0
@@ -163,7 +163,7 @@ class PhantomSpec:
 
     @property
     def section_bend(self) -> Bend:
-        """Curvature of the mid-curve, with the user's own end values if there are any."""
+        """Curvature of the mid-curve, with the user's end values if there are any."""
         preset = KINDS[self.kind]
         if self.curvature is None:
             return preset
@@ -397,12 +397,7 @@ class Body:
         return np.asarray(self._sweep(section, w) @ rotation.T + shift)
 
     def locate(
-        self,
-        points: Float,
-        *,
-        hemi: str = "L",
-        pose: Float | None = None,
-        reach: float = np.inf,
+        self, points: Float, *, hemi: str = "L", pose: Float | None = None, reach: float = np.inf
     ) -> Float:
         """Sheet coordinates (N, 3) of scanner points (N, 3): the inverse of :meth:`place`.
 
@@ -439,7 +434,7 @@ class Body:
         return np.column_stack([-medial, superior]), w
 
     def _refuse_folds(self) -> None:
-        """Refuse a wall or an axis that is bent more sharply than its own extent allows."""
+        """Refuse a wall or an axis that is bent more sharply than its extent allows."""
         spec = self.spec
         s = np.linspace(0.0, spec.width, 1001)
         sharpest = np.abs(self.curve.curvature(s)).max()
@@ -460,7 +455,7 @@ class Body:
         """Refuse a wall of which one turn runs into another.
 
         Two turns overlap exactly if, from a boundary point of one, some other point of the
-        mid-curve is nearer than its own, or as near where they coincide.
+        mid-curve is nearer than the one it belongs to, or as near where they coincide.
         """
         u, v = np.meshgrid(np.linspace(0.0, 1.0, 801), np.linspace(0.0, 1.0, 5), indexing="ij")
         half = self.thickness(u, v).ravel() / 2.0

@@ -164,8 +164,8 @@ def _check_agreement(protocol: Protocol, *, origin: str) -> None:
     named = (*protocol.sheet, *protocol.layer, *protocol.interior, *protocol.neighbors)
     named += protocol.recognized_by
     absent = [tissue.name for tissue in dict.fromkeys(named) if tissue not in labeled]
-    order = tuple(tissue for tissue in MEDIAL_TO_LATERAL if tissue in protocol.sheet)
-    beside = tuple(tissue for tissue in FAR_TO_NEAR if tissue in protocol.neighbors)
+    sheet_order = tuple(filter(protocol.sheet.__contains__, MEDIAL_TO_LATERAL))
+    neighbors_order = tuple(filter(protocol.neighbors.__contains__, FAR_TO_NEAR))
     sheet = set(protocol.sheet)
     problems = {
         f"name {protocol.name!r} has to consist of letters and digits": not re.fullmatch(
@@ -179,9 +179,9 @@ def _check_agreement(protocol: Protocol, *, origin: str) -> None:
         and protocol.right_offset,
         f"no label has tissue {', '.join(absent)}": absent,
         "sheet has to list each tissue once, medial to lateral, out of "
-        + ", ".join(t.name for t in MEDIAL_TO_LATERAL): protocol.sheet != order,
+        + ", ".join(t.name for t in MEDIAL_TO_LATERAL): protocol.sheet != sheet_order,
         "neighbors has to list each tissue once, far to near, out of "
-        + ", ".join(t.name for t in FAR_TO_NEAR): protocol.neighbors != beside,
+        + ", ".join(t.name for t in FAR_TO_NEAR): protocol.neighbors != neighbors_order,
         "a tissue is in both sheet and layer": not sheet.isdisjoint(protocol.layer),
         "a tissue is in both sheet and interior": not sheet.isdisjoint(protocol.interior),
         "layer, interior, neighbors or recognized_by is given without a sheet": named and not sheet,

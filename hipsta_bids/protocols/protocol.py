@@ -57,7 +57,7 @@ CORE: tuple[Tissue, ...] = (Tissue.DENTATE_GYRUS, Tissue.CA4)
 MEDIAL_TO_LATERAL: tuple[Tissue, ...] = (*MEDIAL_END, Tissue.CA1, *LATERAL_END)
 
 #: Cortex that the sheet goes on into beyond its medial end, from far to near. The entorhinal cortex
-#: lies before the parahippocampal cortex rather than beside it.
+#: lies before the parahippocampal cortex rather than next to it.
 FAR_TO_NEAR: tuple[Tissue, ...] = (
     Tissue.BA36,
     Tissue.BA35,
@@ -235,5 +235,5 @@ def _some(values: NDArray[np.integer]) -> str:
 
 
 def lateral_rank(tissue: NDArray[np.uint8]) -> NDArray[np.int8]:
-    """Rank from medial to lateral of the tissues of a sheet and of the cortex beside it."""
+    """Rank from medial to lateral of the tissues of a sheet and of the cortex next to it."""
     return np.asarray(_RANKS[tissue])

@@ -4,7 +4,7 @@ import os
 import re
 import shlex
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -110,7 +110,7 @@ class Cohort:
 
     def values(self, name: HemisphereName, measure: str) -> Float:
         """Collect a number of all hemispheres of the same kind, without NaN."""
-        values = [other.summary.get(measure, np.nan) for other in self.like(name)]
+        values = [hemisphere.summary.get(measure, np.nan) for hemisphere in self.like(name)]
         array = np.array(values, dtype=np.float64)
         return array[np.isfinite(array)]
 
@@ -290,7 +290,7 @@ _NIFTI = (".nii", ".nii.gz")
 def card_of(hemisphere: Hemisphere, cohort: Cohort, views: Views | None) -> Mapping[str, Any]:
     """Collect the head of a hemisphere's page, and its links."""
     key, record = hemisphere.result.name.title, hemisphere.record
-    order = [other.result.name.title for other in cohort.ranking]
+    order = [hemisphere.result.name.title for hemisphere in cohort.ranking]
     n = order.index(key) if key in order else None
     before = cohort.ranking[n - 1] if n else None
     after = cohort.ranking[n + 1] if n is not None and n + 1 < len(order) else None
@@ -302,10 +302,7 @@ def card_of(hemisphere: Hemisphere, cohort: Cohort, views: Views | None) -> Mapp
         "findings": hemisphere.findings,
         "notes": record.get("notes") or [],
         "edited": [str(e.get("what")) for e in record.get("edited") or []],
-        "neighbors": [
-            ("previous", _link(before, cohort)),
-            ("next", _link(after, cohort)),
-        ],
+        "neighbors": [("previous", _link(before, cohort)), ("next", _link(after, cohort))],
         "commands": open_commands(
             hemisphere, views.anatomy.path if views and views.anatomy else None
         ),
@@ -320,7 +317,7 @@ def _link(hemisphere: Hemisphere | None, cohort: Cohort) -> tuple[str, str] | No
     title = name.title
     verdict = cohort.verdicts[title].title.lower()
     words = f"sub-{name.subject}{f' ses-{name.session}' if name.session else ''} {hemisphere.side}"
-    if len({other.result.name.protocol for other in cohort.hemispheres}) > 1:
+    if len({hemisphere.result.name.protocol for hemisphere in cohort.hemispheres}) > 1:
         words += " " + " ".join(filter(None, (name.seg, name.region_title)))
     return f"{participant_report(name.subject, name.session)}#{title}", f"{words}: {verdict}"
 
@@ -334,7 +331,7 @@ def open_commands(hemisphere: Hemisphere, anatomy: Path | None = None) -> list[t
     labels, mask = input_path(hemisphere), result.path("body_mask")
     volumes, behind = [], []
     if labels is not None and labels.exists():
-        # Docker's own paths mean nothing outside; Apptainer's are those of the machine.
+        # Docker's paths mean nothing outside; Apptainer's are those of the machine.
         hidden = container_of_process().get("Type") == "docker"
         address = f"LABELS_DIR/{labels.name}" if hidden else _from(result.root, labels)
         volumes.append((address, ":colormap=lut:opacity=0.5"))
@@ -344,6 +341,16 @@ def open_commands(hemisphere: Hemisphere, anatomy: Path | None = None) -> list[t
         volumes.append((_from(result.root, mask), ":colormap=heat:opacity=0.3"))
     if not volumes:
         return []
+    return [
+        ("FreeView", _freeview_command(hemisphere, volumes, behind)),
+        ("ITK-SNAP", _itksnap_command([path for path, _ in volumes], behind)),
+    ]
+
+
+def _freeview_command(
+    hemisphere: Hemisphere, volumes: Iterable[tuple[str, str]], behind: Iterable[str]
+) -> str:
+    result = hemisphere.result
     freeview = ["freeview", "-v", *behind, *(path + look for path, look in volumes)]
     surfaces = {name: result.path(f"{name}_surface") for name in SURFACES}
     if all(path.exists() for path in surfaces.values()):
@@ -355,14 +362,18 @@ def open_commands(hemisphere: Hemisphere, anatomy: Path | None = None) -> list[t
     point = next((f.point for f in hemisphere.findings if f.point is not None), None)
     if point is not None:
         freeview += ["-ras", *(f"{value:g}" for value in point)]
-    first, before = volumes[0][0], ""
+    return shlex.join(freeview)
+
+
+def _itksnap_command(volumes: Sequence[str], behind: Iterable[str]) -> str:
+    first, before = volumes[0], ""
     if not first.endswith(_NIFTI):
         before, first = f"mri_convert {shlex.quote(first)} labels.nii.gz && ", "labels.nii.gz"
     snap = ["itksnap", "-g", first]
     if len(volumes) > 1:
-        snap += ["-s", volumes[1][0]]
+        snap += ["-s", volumes[1]]
     snap += [word for path in behind if path.endswith(_NIFTI) for word in ("-o", path)]
-    return [("FreeView", shlex.join(freeview)), ("ITK-SNAP", before + shlex.join(snap))]
+    return before + shlex.join(snap)
 
 
 def _from(root: Path, path: Path) -> str:

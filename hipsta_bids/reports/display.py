@@ -20,7 +20,7 @@ HATCHING = f"near a flag, or a repair (no filled gap) {HATCHED_FROM:g} mm off it
 #: Both ends of the axes of unfolded maps: of x to the right, and of y upward.
 X_ENDS, Y_ENDS = ("medial", "lateral"), ("posterior", "anterior")
 
-#: Colors that color-blind readers can tell apart (Okabe and Ito 2008): of groups, and of labels
+#: Colors that color-blind readers can distinguish (Okabe and Ito 2008): of groups, and of labels
 #: whose protocol is not available.
 COLORS = (
     *("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#F0E442"),
@@ -74,7 +74,7 @@ THICKNESS = MapKind(
     digits=2,
     limits=(0.5, 3.0),
 )
-#: Zero is flat; the sign tells which way the sheet curls. In the same brains 98 % of the points of
+#: Zero is flat; the sign is the direction of the curl. In the same brains 98 % of the points of
 #: the mid-surface lie within 0.4 1/mm; the walls, which share the limits, reach farther.
 CURVATURE = MapKind(
     column="curvature",
@@ -231,7 +231,7 @@ def subfield_title(name: str) -> str:
 
 
 def palette(protocol: Protocol | None, names: Sequence[str]) -> dict[str, str]:
-    """Choose the colors of subfields: the protocol's own, of the body where parts differ."""
+    """Choose the colors of subfields by the protocol, of the body where parts differ."""
     labels = protocol.labels if protocol is not None else ()
     colors = {
         label.abbreviation or label.name: label.color

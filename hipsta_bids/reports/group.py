@@ -1,4 +1,4 @@
-"""The page about one analysis: what it found and where, in whom, and how."""
+"""The page about one analysis: results, places, participants and methods."""
 
 import base64
 import contextlib
@@ -151,7 +151,7 @@ def group_page(folder: Path) -> str:
 
 
 def _classification(results: GroupResults) -> Mapping[str, Any] | None:
-    """List how well groups are told apart, with the curves of the first added measures."""
+    """List how well groups are discriminated, with the curves of the first added measures."""
     rows = records(results.table("classification"))
     if not rows:
         return None

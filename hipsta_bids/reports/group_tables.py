@@ -43,19 +43,30 @@ def direction(results: GroupResults, contrast: str, hemi: str, sign: float) -> s
     return "positive" if sign > 0 else "negative"
 
 
+def _cards(results: GroupResults, maps: pd.DataFrame) -> dict[str, Any]:
+    """Sort maps by the share of their points that survived."""
+    cards = []
+    groups = maps.groupby(["measure", "contrast"], sort=False) if len(maps) else ()
+    for (measure, contrast), rows in groups:
+        sides = [_side(results, row) for row in records(rows)]
+        title = f"{cells.measure_title(measure)}, {contrast}"
+        share = max(side["share"] for side in sides)
+        cards.append({"title": title, "sides": sides, "share": share})
+    cards.sort(key=lambda card: -card["share"])
+    return {
+        "n": len(cards),
+        "cards": [card for card in cards if card["share"] >= _LEAST_SHARE],
+        "few": [card for card in cards if 0 < card["share"] < _LEAST_SHARE],
+        "none": [card for card in cards if not card["share"]],
+        "least": _LEAST_SHARE,
+    }
+
+
 def findings(results: GroupResults) -> Mapping[str, Any] | None:
     """Describe what survived, by measure and contrast, the largest part of a map first."""
     maps = results.table("maps")
     if "contrasts" not in results.record:
         return None  # nothing was compared
-    cards = []
-    if len(maps):
-        for (measure, contrast), rows in maps.groupby(["measure", "contrast"], sort=False):
-            sides = [_side(results, row) for row in records(rows)]
-            title = f"{cells.measure_title(measure)}, {contrast}"
-            share = max(side["share"] for side in sides)
-            cards.append({"title": title, "sides": sides, "share": share})
-    cards.sort(key=lambda card: -card["share"])
     settings = results.record.get("settings") or {}
     multiplicity = settings.get("multiplicity") or {}
     scope = multiplicity.get("scope", "map")
@@ -65,12 +76,7 @@ def findings(results: GroupResults) -> Mapping[str, Any] | None:
     if len(measures):
         tests, unknown = estimated(measures), records(measures[measures["statistic"].isna()])
     sided = results.record.get("one_sided") or {}
-    return {
-        "n": len(cards),
-        "cards": [card for card in cards if card["share"] >= _LEAST_SHARE],
-        "few": [card for card in cards if 0 < card["share"] < _LEAST_SHARE],
-        "none": [card for card in cards if not card["share"]],
-        "least": _LEAST_SHARE,
+    return _cards(results, maps) | {
         "families": maps[family].drop_duplicates().shape[0] if len(maps) else 0,
         "scope": scope,
         "tested": len(tests),

@@ -70,15 +70,15 @@ def new_figure(
     size: tuple[float, float], layout: Literal["constrained", "compressed"] | None
 ) -> "Figure":
     """Return an empty figure; it needs no screen and no home folder."""
-    with contextlib.nullcontext() if "matplotlib" in sys.modules else _own_settings():
+    with contextlib.nullcontext() if "matplotlib" in sys.modules else _empty_settings():
         from matplotlib.figure import Figure  # noqa: PLC0415  (slow to load)
 
     return Figure(figsize=size, layout=layout)
 
 
 @contextlib.contextmanager
-def _own_settings() -> Iterator[None]:
-    """Let matplotlib load with its own folder, which is removed when this process ends.
+def _empty_settings() -> Iterator[None]:
+    """Let matplotlib load with a temporary folder, which is removed when this process ends.
 
     It keeps a list of fonts in the user's home, which may be missing or read-only in containers
     and on clusters, and would read that user's preferences there.
@@ -107,7 +107,7 @@ class Picture:
     pins: tuple[tuple[float, float], ...] = ()
     """Places in it, percent from its left and upper edge."""
     maps: tuple[tuple[float, float], ...] = ()
-    """Left and right end of each map with the numbers beside it, percent from its left edge."""
+    """Left and right end of each map with the numbers next to it, percent from its left edge."""
 
     @property
     def address(self) -> str:
@@ -198,7 +198,7 @@ def draw_profiles(
                 axis.plot(x, line, **style)
     _mark_subfields(axis, hemispheres[0])
     axis.set_xlim(0, 100)
-    # Columns beside the edges of the sheet may be far off; they must not squeeze the rest.
+    # Columns next to the edges of the sheet may be far off; they must not squeeze the rest.
     bottom, top = np.nanpercentile(np.concatenate(bands), [3, 97])
     axis.set_ylim(bottom - 0.15 * (top - bottom), top + 0.2 * (top - bottom))
     axis.set_xlabel("  ←  % of the width  →  ".join(X_ENDS))
@@ -223,7 +223,7 @@ def picture_of_file(path: Path, *, alt: str, caption: str) -> Picture:
 
 
 def _new_figure(rows: int, columns: int, size: tuple[float, float]) -> tuple["Figure", Any]:
-    new_figure((1.0, 1.0), "constrained")  # loads the library with settings of its own
+    new_figure((1.0, 1.0), "constrained")  # loads the library with separate settings
     from matplotlib import rc_context  # noqa: PLC0415  (slow to load)
 
     with rc_context(_STYLE):
@@ -278,7 +278,7 @@ def draw_sheet(
 
 
 def _row_positions(sheet: SheetTable) -> Float:
-    """Mean distance of rows from the first, mm: tail, body and head have steps of their own."""
+    """Mean distance of rows from the first, mm: tail, body and head have separate steps."""
     middle, valid = sheet.points["midthickness"], sheet.valid[:, 1:] & sheet.valid[:, :-1]
     steps = np.linalg.norm(np.diff(middle, axis=1), axis=2)
     measured, rows = valid.any(axis=0), np.arange(valid.shape[1])
@@ -390,13 +390,9 @@ def make_sprites(
 
     Returns the pictures, how many tiles lie side by side, and the tile of each row that has one.
     """
-    shapes = [found[MAP_KINDS[0].column].shape for found in maps if found]
+    shapes = [maps_of_side[MAP_KINDS[0].column].shape for maps_of_side in maps if maps_of_side]
     usual = max(set(shapes), key=shapes.count) if shapes else (0, 0)
-    drawn = [
-        row
-        for row, found in enumerate(maps)
-        if found and next(iter(found.values())).shape[0] == usual[0]
-    ]
+    drawn = [row for row, c in enumerate(maps) if c and next(iter(c.values())).shape[0] == usual[0]]
     longest = max((shape[1] for shape in shapes if shape[0] == usual[0]), default=0)
     columns = min(_COLUMNS, max(1, len(drawn)))
     step = 1 if len(drawn) <= _FULL_SIZE else 2

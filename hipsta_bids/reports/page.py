@@ -75,7 +75,7 @@ def _environment() -> "Environment":
         loader=ChoiceLoader(
             [
                 PackageLoader("hipsta_bids.reports"),
-                *(PackageLoader(one.package) for one in find_extensions() if one.has_templates),
+                *(PackageLoader(e.package) for e in find_extensions() if e.has_templates),
             ]
         ),
         autoescape=True,
@@ -85,7 +85,7 @@ def _environment() -> "Environment":
     )
 
     def asset(name: str) -> Markup:
-        """Return one of the package's own files as it is."""
+        """Return one of the package's files as it is."""
         source = files("hipsta_bids.reports") / "assets" / name
         return Markup(source.read_text(encoding="utf-8"))  # noqa: S704  (no user's text in it)
 

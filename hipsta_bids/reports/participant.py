@@ -11,13 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hipsta_bids.protocols import EXPERIMENTAL
-from hipsta_bids.reports.cohort import (
-    MEASURES,
-    SMALLEST_COHORT,
-    Cohort,
-    card_of,
-    correction_of,
-)
+from hipsta_bids.reports.cohort import MEASURES, SMALLEST_COHORT, Cohort, card_of, correction_of
 from hipsta_bids.reports.display import (
     MAP_KINDS,
     THICKNESS,
@@ -54,12 +48,12 @@ def scene_of(hemisphere: Hemisphere, views: Views | None, names: Sequence[str]) 
         "hemi": hemisphere.result.name.hemi,
         "findings": [
             {
-                "kind": min(f.kind for f in found),  # failure, flag, repair
-                "message": "; ".join(f.message for f in found),
+                "kind": min(f.kind for f in group),  # failure, flag, repair
+                "message": "; ".join(f.message for f in group),
                 "point": point,
                 "number": number,
             }
-            for number, (point, found) in enumerate(_points_of(hemisphere).items(), start=1)
+            for number, (point, group) in enumerate(_points_of(hemisphere).items(), start=1)
         ],
     }
     if hemisphere.measured:
@@ -205,7 +199,7 @@ class Series:
 
 
 def _key_numbers(series: Series) -> Mapping[str, Any] | None:
-    """Set the numbers of both hemispheres beside those of the cohort."""
+    """Compare the numbers of both hemispheres with those of the cohort."""
     measured = series.measured
     if not measured:
         return None
@@ -264,7 +258,7 @@ def _strip(value: float, values: Float, digits: int) -> Mapping[str, Any]:
 
 
 def _quality_numbers(series: Series) -> Mapping[str, Any] | None:
-    """Set the quality numbers of both hemispheres beside their usual ranges."""
+    """Compare the quality numbers of both hemispheres with their usual ranges."""
     measured = series.measured
     if not measured:
         return None
@@ -279,12 +273,14 @@ def _quality_numbers(series: Series) -> Mapping[str, Any] | None:
             values = (lengths - opposite).tolist()
         if not np.isnan(values).all():
             rows.append((usual, values))
-    facts = [
-        (title, [", ".join(str(h.metrics.get(key, "n/a")) for key in keys) for h in measured])
-        for title, *keys in _FACTS
-        if not series.whole or any(key in h.metrics for key in keys for h in measured)
-    ]
-    return {"sides": [h.side for h in measured], "rows": rows, "facts": facts}
+    return {"sides": [h.side for h in measured], "rows": rows, "facts": list(_facts(series))}
+
+
+def _facts(series: Series) -> Iterator[tuple[str, list[str]]]:
+    for title, *keys in _FACTS:
+        if not series.whole or any(key in h.metrics for key in keys for h in series.measured):
+            values = ([str(h.metrics.get(key, "n/a")) for key in keys] for h in series.measured)
+            yield title, [", ".join(texts) for texts in values]
 
 
 def participant_page(
@@ -303,25 +299,25 @@ def participant_page(
         kinds.setdefault((name.seg, name.region), []).append(hemisphere)
     if not kinds:
         return None
-    series = [Series(tuple(found), cohort, bids_dir, anatomy) for found in kinds.values()]
+    series = [Series(tuple(group), cohort, bids_dir, anatomy) for group in kinds.values()]
     parts = [
         {
-            "title": one.title,
-            "protocol": one.hemispheres[0].record.get("scheme_title") or one.title,
+            "title": part.title,
+            "protocol": part.hemispheres[0].record.get("scheme_title") or part.title,
             "prefix": f"p{n}",
-            "sections": build_sections(SECTIONS, one, f"p{n}"),
+            "sections": build_sections(SECTIONS, part, f"p{n}"),
         }
-        for n, one in enumerate(series, start=1)
+        for n, part in enumerate(series, start=1)
     ]
     visit = f"sub-{subject}" + (f", ses-{session}" if session else "")
-    hemispheres = [hemisphere for one in series for hemisphere in one.hemispheres]
+    hemispheres = [hemisphere for part in series for hemisphere in part.hemispheres]
     versions = sorted({str(h.record.get("version")) for h in hemispheres})
     hashes = sorted({str(h.record.get("settings_hash")) for h in hemispheres})
     return render(
         "participant.html",
         title=visit,
         parts=parts,
-        anatomy=any(view and view.anatomy for one in series for view in one.views.values()),
+        anatomy=any(view and view.anatomy for part in series for view in part.views.values()),
         versions=versions,
         hashes=hashes,
         measured=max(_origin_of(h, cohort)[1] for h in hemispheres),
@@ -349,8 +345,8 @@ def _sides(series: Series) -> Mapping[str, Any]:
             {
                 **card,
                 "points": [
-                    (min(f.kind for f in found), "; ".join(_message(f, hemisphere) for f in found))
-                    for found in points.values()
+                    (min(f.kind for f in group), "; ".join(_message(f, hemisphere) for f in group))
+                    for group in points.values()
                 ],
                 "rest": [(f.kind, _message(f, hemisphere)) for f in placeless],
                 "map": draw_map(THICKNESS, [hemisphere], pins=list(points))

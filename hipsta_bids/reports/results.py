@@ -39,7 +39,7 @@ SIDES = {"L": "left", "R": "right"}
 _NUMBER = r"(-?\d+(?:\.\d+)?)"
 #: How messages name a point.
 _PLACE = re.compile(rf"RAS {_NUMBER} {_NUMBER} {_NUMBER} mm")
-#: Folders before a file's name, which may tell more about a person than BIDS labels do.
+#: Folders before a file's name, which may reveal more about a person than BIDS labels do.
 _FOLDERS = re.compile(r"(?:[^\s:;,()/]*/){2,}(?=[^\s:;,()/])")
 
 #: mm of the image that are kept round the body, and more of the anatomical image.
@@ -151,7 +151,7 @@ class Hemisphere:
 
     @property
     def protocol(self) -> Protocol | None:
-        """Its protocol; ``None`` if that is not one of the package's own."""
+        """Its protocol; ``None`` if the package does not have it."""
         name = str(self.record.get("scheme", ""))
         try:
             return load_protocol(name) if name in protocol_names() else None
@@ -304,7 +304,7 @@ class Views:
     labels: NDArray[np.int32] | None
     """(I, J, K) codes; ``None`` if the input is no longer available."""
     mask: Bool | None
-    """(I, J, K) the body; ``None`` if it could not be found."""
+    """(I, J, K) the body; ``None`` if its file is missing."""
     affine: Float
     """(4, 4), voxel index to RAS mm; the axes run to the right, anterior and superior."""
     names: Mapping[int, tuple[str, str]]
@@ -342,6 +342,13 @@ class Views:
         return index
 
 
+def _box(interest: Bool, affine: Float) -> tuple[slice, ...]:
+    if not interest.any():
+        return tuple(slice(0, n) for n in interest.shape)
+    hits = [np.asarray(interest.any(axis=axes)) for axes in ((1, 2), (0, 2), (0, 1))]
+    return volumes.box_with_margin(hits, _MARGIN, affine)
+
+
 def read_views(hemisphere: Hemisphere, bids_dir: Path | None = None) -> Views | None:
     """Read what slices are drawn from; without ``bids_dir`` no anatomical images."""
     mask = _read_mask(hemisphere)
@@ -351,15 +358,12 @@ def read_views(hemisphere: Hemisphere, bids_dir: Path | None = None) -> Views | 
     first = mask if mask is not None else labels
     if first is None:
         return None
-    affine = _reoriented(first.data, first.own_affine)[1]
-    data = None if labels is None else _reoriented(labels.data, labels.own_affine)[0]
-    inside = None if mask is None else _reoriented(mask.data, mask.own_affine)[0] != 0
+    affine = _reoriented(first.data, first.file_affine)[1]
+    data = None if labels is None else _reoriented(labels.data, labels.file_affine)[0]
+    inside = None if mask is None else _reoriented(mask.data, mask.file_affine)[0] != 0
     names = _names(hemisphere, data)
     interest = inside if inside is not None else np.isin(data, list(names))  # type: ignore[arg-type]  # one is there
-    box: tuple[slice, ...] = tuple(slice(0, n) for n in interest.shape)
-    if interest.any():
-        hits = [np.asarray(interest.any(axis=axes)) for axes in ((1, 2), (0, 2), (0, 1))]
-        box = volumes.box_with_margin(hits, _MARGIN, affine)
+    box = _box(interest, affine)
     anatomy, unused = None, None
     if bids_dir is not None and interest.any():
         points = apply_affine(affine, np.argwhere(interest)[::7])

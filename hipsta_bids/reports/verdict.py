@@ -1,4 +1,4 @@
-"""What a person is told about a hemisphere first: the decision of its record, and what it rests on.
+"""The headline about a hemisphere: the decision of its record, and the reason.
 
 A hemisphere with a flag is one to look at, whatever was repaired. Its headline is the flag with the
 largest consequence: by how much the mean thickness could be off, then the share of the map. Without
@@ -31,11 +31,7 @@ _SOUND = "No check raised a flag, and no label was repaired."
 _ROUNDING = 0.005
 """mm; means that differ by less read the same."""
 
-_TITLES = {
-    Decision.USE: "Use",
-    Decision.LOOK: "Look before use",
-    Decision.FAILED: "Do not use",
-}
+_TITLES = {Decision.USE: "Use", Decision.LOOK: "Look before use", Decision.FAILED: "Do not use"}
 #: By which pages sort.
 _ORDER = (Decision.FAILED, Decision.LOOK, Decision.USE)
 

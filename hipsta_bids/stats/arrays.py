@@ -19,7 +19,7 @@ Key = tuple[str, str]
 #: More sheets of a side are kept in single precision, whose rounding is less than a hundredth of
 #: that of the tables, and registered whenever they are asked for, to save memory.
 MOST_KEPT = 10_000
-#: Sheets in memory at once, where each counts on its own.
+#: Sheets in memory at once, where each is processed alone.
 SHEETS = 4000
 
 
@@ -72,9 +72,9 @@ def sheets_of(maps: Mapping[str, Float], name: str, rows: Bool | Int) -> Float:
     return maps[name][rows]
 
 
-def parts_of_sheets(maps: Mapping[str, Float], name: str, own: Bool | Int) -> Iterator[Float]:
+def parts_of_sheets(maps: Mapping[str, Float], name: str, selected: Bool | Int) -> Iterator[Float]:
     """Take sheets of one map, some at a time; the order is kept."""
-    rows = np.flatnonzero(own) if own.dtype == np.bool_ else own
+    rows = np.flatnonzero(selected) if selected.dtype == np.bool_ else selected
     return (sheets_of(maps, name, rows[part]) for part in blocks(len(rows), SHEETS))
 
 

@@ -1,4 +1,4 @@
-"""How well measures tell two groups apart, beyond a base model: classifiers and their curves."""
+"""How well measures discriminate two groups, beyond a base model: classifiers and their curves."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -135,8 +135,8 @@ def compare_models(
     separated = not logistic.overlaps(full, case) and logistic.is_separated(full, case)
     free = np.arange(full.shape[1]) < base.shape[1]
     models = [
-        _classified(one.tobytes(), one.shape[1], case.tobytes(), settings, firth=separated)
-        for one in (full[:, free], full)
+        _classified(matrix.tobytes(), matrix.shape[1], case.tobytes(), settings, firth=separated)
+        for matrix in (full[:, free], full)
     ]
     fits = [model.fit for model in models]
     if separated:
@@ -170,7 +170,7 @@ def _areas(name: str, result: ClassifierResult) -> dict[str, float]:
 def _classified(
     values: bytes, columns: int, cases: bytes, settings: ClassificationSettings, *, firth: bool
 ) -> ClassifierResult:
-    """Fit one model and tell how well it classifies; the base is the same for each measure."""
+    """Fit one model and describe how well it classifies; the base is the same for each measure."""
     matrix, case = np.frombuffer(values).reshape(-1, columns), np.frombuffer(cases, dtype=bool)
     fit = logistic.fit_logistic(matrix, case, firth=firth)
     score = matrix @ fit.coefficients
@@ -223,15 +223,15 @@ def cross_validate(
     for folds_here in np.array_split(fold_of, parts):
         train = folds_here[:, None] != np.arange(folds)[:, None]
         beta = _coefficients(basis, case, train.reshape(-1, len(case)), start)
-        for own, by_fold, coefficients in zip(
+        for fold_numbers, by_fold, coefficients in zip(
             folds_here, train, beta.reshape(len(folds_here), folds, -1), strict=True
         ):
-            score = np.einsum("sj,sj->s", basis, coefficients[own])
+            score = np.einsum("sj,sj->s", basis, coefficients[fold_numbers])
             for fold in np.flatnonzero(np.isnan(coefficients[:, 0])):
                 test = ~by_fold[fold]
                 score[test] = _predict(matrix[~test], case[~test], matrix[test])
             total += score
-            areas = [_area(score[~one & case], score[~one & ~case]) for one in by_fold]
+            areas = [_area(score[~is_test & case], score[~is_test & ~case]) for is_test in by_fold]
             means.append(np.mean(areas))
     spread = float(np.std(means, ddof=1)) if settings.repeats > 1 else float("nan")
     return float(np.mean(means)), spread, total / settings.repeats

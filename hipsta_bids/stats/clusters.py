@@ -23,7 +23,7 @@ def sheet_edges(nx: int, ny: int, neighbors: int = 8) -> Int:
     pairs = [(node[:-1], node[1:]), (node[:, :-1], node[:, 1:])]
     if neighbors == 8:  # noqa: PLR2004 -- of the setting
         pairs += [(node[:-1, :-1], node[1:, 1:]), (node[:-1, 1:], node[1:, :-1])]
-    return np.concatenate([np.column_stack([one.ravel(), two.ravel()]) for one, two in pairs])
+    return np.concatenate([np.column_stack([first.ravel(), two.ravel()]) for first, two in pairs])
 
 
 def mesh_edges(triangles: Int) -> Int:

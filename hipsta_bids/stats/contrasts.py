@@ -8,7 +8,7 @@ terms such as ``group:age``, and products of these. Parentheses are multiplied o
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from itertools import product
+from itertools import chain, product
 from typing import Any, NoReturn
 
 import numpy as np
@@ -114,13 +114,14 @@ def contrast_json(text: str) -> dict[str, Any]:
         {name + ending: weight for name, weight in parse_expression(row).items()}
         for row in _COMMA.split(body)
     ]
-    combined = list(dict.fromkeys(name for row in rows for name in row))
+    combined = list(dict.fromkeys(chain.from_iterable(rows)))
     weights = [[row.get(name, 0.0) for name in combined] for row in rows]
+    test, listed = ("t", weights[0]) if len(rows) == 1 else ("F", weights)
     return {
         "Name": "=".join(names).strip() or f"{body.strip()}{ending_side}{ending}",
         "ConditionList": combined,
-        "Weights": weights[0] if len(rows) == 1 else weights,
-        "Test": "t" if len(rows) == 1 else "F",
+        "Weights": listed,
+        "Test": test,
         **({"Alternative": _SIDES[sided["sign"]], "Margin": margin} if sided else {}),
     }
 
@@ -146,14 +147,19 @@ def parse_contrast(contrast: Mapping[str, Any]) -> ContrastSpec:
         raise refusal(f"has contrast {name!r} with {len(conditions)} conditions and other weights")
     if test == "t" and len(weights) > 1:
         raise refusal(f"has contrast {name!r} with several rows; its test must be F")
+    side, margin = _alternative(contrast)
+    return ContrastSpec(name, conditions, weights, test, side, margin)
+
+
+def _alternative(contrast: Mapping[str, Any]) -> tuple[str, float]:
     side, margin = str(contrast.get("Alternative", "")), contrast.get("Margin", 0.0)
     is_number = isinstance(margin, int | float) and abs(margin) < _WEIGHTS[1]
     if side not in {"", *_SIDES.values()} or not is_number:
         raise refusal(
-            f"has contrast {name!r} with alternative {side!r} and margin {margin!r}; use greater"
-            " or less, and a number"
+            f"has contrast {str(contrast['Name'])!r} with alternative {side!r} and margin"
+            f" {margin!r}; use greater or less, and a number"
         )
-    return ContrastSpec(name, conditions, weights, test, side, float(margin))
+    return side, float(margin)
 
 
 def refusal(problem: str) -> ModelError:

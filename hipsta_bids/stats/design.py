@@ -2,12 +2,12 @@
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 import pandas as pd
-from formulaic import Formula
+from formulaic import Formula, ModelMatrix
 from numpy.typing import NDArray
 
 from hipsta_bids.errors import ModelError
@@ -20,7 +20,7 @@ from hipsta_bids.stats.references import references_note
 from hipsta_bids.stats.settings import DefaultModelSettings, DesignSettings
 from hipsta_bids.types import PARTICIPANT, Float, Int64
 
-#: A column is a combination of other columns if less than this fraction of its length is its own.
+#: A column is a combination of other columns if a smaller share is orthogonal to these.
 DEPENDENCE = 1e-9
 #: Age at the first visit, where that of each visit is known.
 FIRST_AGE = "age_first"
@@ -57,6 +57,39 @@ class Design:
     min_level: int = 0
 
 
+def _parsed(text: str) -> Formula:
+    try:
+        return Formula(text)
+    except Exception as error:  # formulaic raises all kinds where a formula makes no sense
+        raise ModelError(
+            f"formula {text!r} cannot be read; write it as group + age, and names with"
+            " blanks in backticks"
+        ) from error
+
+
+def _typed(table: pd.DataFrame, factors: Collection[str]) -> pd.DataFrame:
+    variables = table.copy()
+    for name in map(str, table.columns):
+        column = formulas.as_factor(table[name]) if name in factors else table[name]
+        variables[name] = formulas.typed(column)
+    return variables
+
+
+def _model_matrix(formula: Formula, variables: pd.DataFrame, text: str) -> ModelMatrix:
+    try:
+        with np.errstate(invalid="ignore", divide="ignore"):  # _check_matrix names missing values
+            return formula.get_model_matrix(variables, na_action="ignore", context=dict(CONTEXT))
+    except Exception as error:  # as above
+        raise ModelError(f"formula {text!r}: {str(error).partition(chr(10))[0]}") from error
+
+
+def _least_columns(formula: Formula, levels: Mapping[str, Sequence[str]]) -> int:
+    """Return the number of columns, if functions of numbers give one each."""
+    products = [closed_formula(term_text(term)).names for term in formula]
+    sizes = {name: len(names) - 1 for name, names in levels.items()}
+    return sum(math.prod(sizes.get(name, 1) for name in names) for names in products)
+
+
 def build_design(
     table: pd.DataFrame,
     model: formulas.ModelSpec,
@@ -65,19 +98,10 @@ def build_design(
 ) -> Design:
     """Make the design matrix of a model, or raise the reason why it cannot be fitted."""
     closed = closed_formula(model.formula)
-    try:
-        formula = Formula(closed.text)
-    except Exception as error:  # formulaic raises all kinds where a formula makes no sense
-        raise ModelError(
-            f"formula {closed.text!r} cannot be read; write it as group + age, and names with"
-            " blanks in backticks"
-        ) from error
+    formula = _parsed(closed.text)
     names = sorted(closed.names)
     formulas.check_names(names, table.columns)
-    variables = table[names].copy()
-    for name in names:
-        column = formulas.as_factor(variables[name]) if name in closed.factors else variables[name]
-        variables[name] = formulas.typed(column)
+    variables = _typed(table[names], closed.factors)
     complete = variables.notna().all(axis=1).to_numpy()
     dropped = formulas.rows_by_lack(variables, complete)
     variables = variables.loc[complete].copy()
@@ -96,19 +120,8 @@ def build_design(
             f"formula {model.formula!r}: functions take numbers, but {formulas.listed(words)} holds"
             " names; write it without a function"
         )
-    products = [closed_formula(term_text(term)).names for term in formula]
-    sizes = {name: len(levels) - 1 for name, levels in levels_used.items()}
-    least = sum(math.prod(sizes.get(name, 1) for name in names) for names in products)
-    _refuse_more_columns(least, len(variables), settings)
-    try:
-        with np.errstate(invalid="ignore", divide="ignore"):  # rows without a value are told below
-            model_matrix = formula.get_model_matrix(
-                variables, na_action="ignore", context=dict(CONTEXT)
-            )
-    except Exception as error:  # formulaic raises all kinds where a formula makes no sense
-        raise ModelError(
-            f"formula {model.formula!r}: {str(error).partition(chr(10))[0]}"
-        ) from error
+    _refuse_more_columns(_least_columns(formula, levels_used), len(variables), settings)
+    model_matrix = _model_matrix(formula, variables, model.formula)
     terms = Terms(model_matrix, variables, levels_used, model.maps)
     matrix, columns = terms.matrix, terms.columns
     _check_matrix(matrix, columns, variables.index, settings)
@@ -197,7 +210,7 @@ def _check_matrix(
             f"model: no row has {columns[int(np.argmin(lengths))]!r}; remove it from the formula"
         )
     unit = matrix / lengths
-    # What is left of each unit column beside those before it.
+    # The part of each unit column that is orthogonal to the columns before it.
     remainders = np.abs(np.diag(np.linalg.qr(unit, mode="r")))
     if (remainders < DEPENDENCE).any():
         last = int(np.argmax(remainders < DEPENDENCE))
@@ -210,7 +223,7 @@ def _check_matrix(
 
 
 def _refuse_more_columns(n_columns: int, n_rows: int, settings: DesignSettings) -> None:
-    """Refuse more columns than the rows can tell apart."""
+    """Refuse more columns than the rows can distinguish."""
     if n_rows - n_columns < settings.min_residual_df:
         raise ModelError(
             f"model: {n_rows} complete rows are too few for {n_columns} columns; at least"

@@ -34,7 +34,9 @@ def check_people(
     ``people`` are the variables of the models, the groups first.
     """
     factors = {name for design in designs for name in design.references}
-    return check_sums([(one.matrix, one.columns) for one in designs], factors, people, limits)
+    return check_sums(
+        [(design.matrix, design.columns) for design in designs], factors, people, limits
+    )
 
 
 def check_sums(
@@ -166,7 +168,7 @@ def _small_sums(basis: Float, count: int) -> Iterator[Int]:
 
 
 def _plain(basis: Float, cell: Int, numbers: Sequence[Float]) -> bool:
-    """Tell whether the known sums of a cell are its count and sums of numbers: about all in it."""
+    """Check whether the known sums of a cell are its count and sums of numbers: about all in it."""
     sums = np.zeros((len(basis), 1 + len(numbers)))
     sums[cell] = np.column_stack([np.ones(len(cell)), *(x[cell] - x[cell].mean() for x in numbers)])
     is_known = np.sum((basis.T @ sums) ** 2, axis=0) > _WHOLE_SHARE * np.sum(sums**2, axis=0)

@@ -142,7 +142,7 @@ def varies_between(tested: Float, visits: Visits) -> bool:
     An equal curve of time in all of them does not.
     """
     member = visits.classes()[1][:, None] == np.unique(visits.classes()[1])
-    curves = orth(np.hstack([member * one[:, None] for one in _powers(visits, _POWERS)]))
+    curves = orth(np.hstack([member * power[:, None] for power in _powers(visits, _POWERS)]))
     return not all(spans(curves, column) for column in tested.T)
 
 
@@ -191,10 +191,7 @@ def choose_exchange(
 
 
 def exchange_text(
-    matrix: Float,
-    contrasts: Sequence[Contrast],
-    visits: Visits,
-    choice: Literal["auto"] | Exchange,
+    matrix: Float, contrasts: Sequence[Contrast], visits: Visits, choice: Literal["auto"] | Exchange
 ) -> str:
     """Word the exchange of each contrast, without a final period."""
     kinds: dict[Exchange, list[str]] = {}
@@ -213,7 +210,5 @@ def _between(tested: Float, nuisance: Float, visits: Visits, *, changes: bool) -
         return False
     common = _powers(visits, _POWERS if changes else 1)
     model = np.column_stack([tested, nuisance])
-    conditions: list[Bool | bool] = [
-        spans(nuisance, one) or not spans(model, one) for one in common
-    ]
+    conditions: list[Bool | bool] = [spans(nuisance, c) or not spans(model, c) for c in common]
     return all(conditions)

@@ -82,6 +82,21 @@ def model_from_shortcut(formula: str, contrasts: Sequence[str], name: str) -> di
 
 def parse_model(document: Mapping[str, Any]) -> ModelSpec:
     """Read a BIDS Stats Model: one node at dataset level, with ``Model.X`` or ``Model.Formula``."""
+    node, model = _node(document)
+    dummy = node.get("DummyContrasts")
+    formula, maps = split_maps(_formula(model))
+    return ModelSpec(
+        name=str(node.get("Name") or document.get("Name") or "model"),
+        formula=formula,
+        maps=maps,
+        measures=left_side(str(model.get("Formula") or "")),
+        contrasts=_contrasts(node.get("Contrasts", [])),
+        dummy=str(dummy.get("Test", "t")) if isinstance(dummy, Mapping) else None,
+    )
+
+
+def _node(document: Mapping[str, Any]) -> tuple[Mapping[str, Any], Mapping[str, Any]]:
+    """Return the only node and its model."""
     nodes = document.get("Nodes")
     if not isinstance(nodes, list) or len(nodes) != 1 or not isinstance(nodes[0], Mapping):
         raise refusal("needs exactly one node, at dataset level")
@@ -93,28 +108,24 @@ def parse_model(document: Mapping[str, Any]) -> ModelSpec:
     model = node.get("Model")
     if not isinstance(model, Mapping) or str(model.get("Type", "glm")).lower() != "glm":
         raise refusal("needs a Model of Type glm")
-    dummy = node.get("DummyContrasts")
-    contrasts = node.get("Contrasts", [])
+    return node, model
+
+
+def _contrasts(contrasts: object) -> tuple[texts.ContrastSpec, ...]:
+    """Read contrasts; their names and the labels of their files have to differ."""
     if not isinstance(contrasts, list):
         raise refusal("has Contrasts that are no list")
-    specs = tuple(texts.parse_contrast(one) for one in contrasts)
+    specs = tuple(map(texts.parse_contrast, contrasts))
     names = [spec.name for spec in specs]
-    if repeated := sorted({one for one in names if names.count(one) > 1}):
+    if repeated := sorted({name for name in names if names.count(name) > 1}):
         raise refusal(f"has contrasts of the same name: {', '.join(repeated)}")
-    labels = [file_label(one) for one in names]
-    if alike := [one for one in names if labels.count(file_label(one)) > 1]:
+    labels = list(map(file_label, names))
+    if alike := [name for name in names if labels.count(file_label(name)) > 1]:
         raise refusal(
             f"has contrasts whose files would have one name: {listed(alike)}; give one"
             " a name, as other=group[A]:age"
         )
-    return ModelSpec(
-        name=str(node.get("Name") or document.get("Name") or "model"),
-        formula=split_maps(_formula(model))[0],
-        maps=split_maps(_formula(model))[1],
-        measures=left_side(str(model.get("Formula") or "")),
-        contrasts=specs,
-        dummy=str(dummy.get("Test", "t")) if isinstance(dummy, Mapping) else None,
-    )
+    return specs
 
 
 def split_maps(formula: str) -> tuple[str, tuple[str, ...]]:
@@ -263,10 +274,7 @@ def level_labels(values: pd.Series) -> pd.Series:
 
 
 def columns_of(
-    table: pd.DataFrame,
-    formula: str,
-    levels: Mapping[str, Sequence[str]],
-    source: str,
+    table: pd.DataFrame, formula: str, levels: Mapping[str, Sequence[str]], source: str
 ) -> tuple[Float, tuple[str, ...], Int64]:
     """Make columns of a formula with given levels, without intercept; and rows that have all."""
     closed = closed_formula(formula)
@@ -462,7 +470,7 @@ def _levels(values: pd.Series, name: str, settings: DesignSettings) -> list[str]
     check_spelling(counts, name)
     levels = sorted(counts, key=in_order)
     numbers = pd.to_numeric(pd.Series(levels), errors="coerce")
-    codes = [one for one, n in zip(levels, numbers, strict=True) if n in settings.missing_codes]
+    codes = [level for level, n in zip(levels, numbers, strict=True) if n in settings.missing_codes]
     if codes and numbers.isna().any():
         raise ModelError(
             f"model: column {name!r} has {', '.join(f'{code} ({counts[code]})' for code in codes)}"

@@ -114,12 +114,9 @@ def fit_points(
     columns = len(inverse)
     fits = [fit_block(*part, settings) for part in parts_of_points(maps, basis, covariates)]
     names = ("scores", "covariance", "sigma", "n")
-    fit = PointBlock(*(np.concatenate([getattr(one, name) for one in fits]) for name in names))
+    fit = PointBlock(*(np.concatenate([getattr(fit, name) for fit in fits]) for name in names))
     df = np.where(np.isfinite(fit.sigma), fit.n - columns, np.nan)
-    tests = tuple(
-        _test(contrast, contrast.weights @ inverse, fit, df, settings.confidence)
-        for contrast in contrasts
-    )
+    tests = tuple(_test(c, c.weights @ inverse, fit, df, settings.confidence) for c in contrasts)
     return PointwiseFit(inverse @ fit.scores.T, fit.sigma, fit.n, tests)
 
 
@@ -138,10 +135,10 @@ def orthonormal(
     columns = matrix.shape[1] + len(covariates)
     widths = [(0, 0), (0, len(covariates))]
     contrasts = [
-        one
-        if one.weights.shape[1] != matrix.shape[1]
-        else replace(one, weights=np.pad(one.weights, widths))
-        for one in contrasts
+        contrast
+        if contrast.weights.shape[1] != matrix.shape[1]
+        else replace(contrast, weights=np.pad(contrast.weights, widths))
+        for contrast in contrasts
     ]
     check_design(maps, matrix, contrasts, columns)
     basis, triangle = np.linalg.qr(matrix)
@@ -351,7 +348,7 @@ def fit_measures(
             rows = result.t_test(contrast.weights)
             whole = rows if contrast.n_rows == 1 else result.f_test(contrast.weights)
             values_of = (whole.statistic, whole.pvalue, rows.effect, rows.sd)
-            table[:, i] = np.concatenate([np.ravel(one) for one in values_of])
+            table[:, i] = np.concatenate([np.ravel(values) for values in values_of])
             if not tested[i]:
                 table[[0, 1, *range(2 + contrast.n_rows, len(table))], i] = np.nan
     tests = tuple(
@@ -407,10 +404,10 @@ def with_mean(design: Design) -> tuple[Contrast, ...]:
     """Contrasts of a design, with the model's mean over all rows in front."""
     mean = Contrast(MEAN, design.matrix.mean(axis=0))
     matching = [
-        one
-        for one in design.contrasts
-        if one.name == MEAN
-        or (one.weights.shape == mean.weights.shape and np.allclose(one.weights, mean.weights))
+        c
+        for c in design.contrasts
+        if c.name == MEAN
+        or (c.weights.shape == mean.weights.shape and np.allclose(c.weights, mean.weights))
     ]
     return design.contrasts if matching else (mean, *design.contrasts)
 
@@ -448,11 +445,7 @@ class FittedMaps:
 
 
 def fit_maps(
-    hemi: str,
-    side: SideMaps,
-    model: RowModel,
-    *,
-    contrasts: tuple[Contrast, ...] | None = None,
+    hemi: str, side: SideMaps, model: RowModel, *, contrasts: tuple[Contrast, ...] | None = None
 ) -> FittedMaps:
     """Fit a model at each point of all maps of a hemisphere."""
     _, positions, rows = np.intersect1d(

@@ -72,6 +72,19 @@ class ClosedFormula:
     """Factors and reference levels of codings, as in ``C(group, contr.treatment("CN"))``."""
 
 
+def _is_call(tokens: Sequence[tuple[str, str]], position: int) -> bool:
+    words = [word for _, word in tokens[position + 1 : position + 2]]
+    return tokens[position][0] == "name" and words == ["("]
+
+
+def _check_number(text: str, tokens: Sequence[tuple[str, str]], position: int) -> None:
+    """Refuse a number that is neither an intercept nor a power."""
+    is_power = position > 0 and tokens[position - 1][1] == "**"
+    powers = [str(power) for power in range(1, _HIGHEST_POWER + 1)]
+    if tokens[position][1] not in (powers if is_power else ["0", "1"]):
+        _refuse(text, tokens[position][1])
+
+
 def closed_formula(text: str) -> ClosedFormula:
     """Check the right-hand side of a formula; UsageError names unknown and allowed terms."""
     names: dict[str, None] = {}
@@ -85,7 +98,7 @@ def closed_formula(text: str) -> ClosedFormula:
     while position < len(tokens):
         kind, word = tokens[position]
         end = position + 1
-        is_call = kind == "name" and end < len(tokens) and tokens[end][1] == "("
+        is_call = _is_call(tokens, position)
         is_operand = kind in {"name", "quoted", "number"}
         if after_operand and (is_operand or word == "("):
             _refuse(text, f"{tokens[position - 1][1]} {word}")
@@ -97,17 +110,14 @@ def closed_formula(text: str) -> ClosedFormula:
             names |= dict.fromkeys(inside)
             numbers |= set(inside) if word != "C" else set()
         elif kind == "number":
-            is_power = position > 0 and tokens[position - 1][1] == "**"
-            powers = [str(power) for power in range(1, _HIGHEST_POWER + 1)]
-            if word not in (powers if is_power else ["0", "1"]):
-                _refuse(text, word)
+            _check_number(text, tokens, position)
         elif kind in {"name", "quoted"}:
             names[_column(text, word)] = None
             plain.add(_column(text, word))
         elif word not in {*_OPERATORS, "(", ")"}:
             _refuse(text, word)
         after_operand = is_operand or word == ")"
-        is_column = is_operand and kind != "number"
+        is_column = kind in {"name", "quoted"}
         sizes.append(_columns_of_call(tokens[position:end]) if is_column else word)
         parts.append("".join(part for _, part in tokens[position:end]))
         position = end
@@ -205,7 +215,7 @@ def _call_end(tokens: Sequence[_Token], start: int) -> int:
 
 
 def _column(text: str, word: str) -> str:
-    """Name of a column; Python's own words have a meaning unless they are quoted."""
+    """Name of a column; Python's words have a meaning unless they are quoted."""
     if keyword.iskeyword(word):
         _refuse(text, word)
     return word.strip("`")
@@ -237,6 +247,12 @@ class _Call:
         self.names: list[str] = []
         self.base = ""
 
+    def _check_factor(self, positional: list[ast.expr], keywords: list[ast.keyword]) -> None:
+        codings = [option for option in keywords if option.arg == "contrasts"]
+        for coding in [*positional, *(option.value for option in codings)]:
+            self._check_coding(coding)
+        self._check_options([], [option for option in keywords if option not in codings])
+
     def columns(self, node: ast.expr) -> list[str]:
         """Columns in arithmetic or in a call."""
         names: list[str] = []
@@ -260,10 +276,7 @@ class _Call:
                 self._check_options(more, node.keywords)
                 inner = [part]
             case ast.Call(func=ast.Name(id="C"), args=[ast.Name(id=name), *more]):
-                codings = [option for option in node.keywords if option.arg == "contrasts"]
-                for coding in [*more, *(option.value for option in codings)]:
-                    self._check_coding(coding)
-                self._check_options([], [one for one in node.keywords if one not in codings])
+                self._check_factor(more, node.keywords)
                 names = [self._name(name)]
             case _:
                 self._refuse(node)

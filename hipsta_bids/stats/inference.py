@@ -100,8 +100,8 @@ def permute(
     groups = [[part] if isinstance(part, PermutationPart) else part for part in parts]
     runs = [_Run(group, contrast, settings, blocks, combine) for group in groups]
     parts_alone = [part for group in groups for part in group]
-    subjects = [one.subjects for one in parts_alone]
-    subjects += [one.visits.people for one in parts_alone if one.visits]
+    subjects = [part.subjects for part in parts_alone]
+    subjects += [part.visits.people for part in parts_alone if part.visits]
     n_subjects = 1 + max(int(numbers.max()) for numbers in subjects)
     batch = min(_BATCH, max(_KEYS // n_subjects, 1))
 
@@ -299,7 +299,7 @@ class _Run:
         """Count (3, points) permutations that reach the observed values."""
         pairs = ((t, self._observed), (highest, self._observed), (highest_enhanced, self._enhanced))
         # Values may be off by rounding.
-        reach = [np.abs(values) >= np.abs(seen) * (1 - _ROUNDING) for values, seen in pairs]
+        reach = [np.abs(values) >= np.abs(observed) * (1 - _ROUNDING) for values, observed in pairs]
         return np.stack([values.sum(axis=0, dtype=np.float64) for values in reach])
 
     def result(self) -> PermutationTest:
@@ -413,7 +413,7 @@ def correct_joint(
         rules = rules.changed(method=_MAXIMUM)
 
     def parts(key: MapKey) -> list[PermutationPart]:
-        return [_part(*one, model, rules) for one in groups[key].values()]
+        return [_part(*members, model, rules) for members in groups[key].values()]
 
     tested = {key: contrasts[key.contrast] for key in groups}
     blocks = row_blocks(model, table, rules)
@@ -440,23 +440,20 @@ def _permuted(
             if report is not None:
                 report(before + number_done, len(groups) * rules.permutations)
 
+        parts, first = [part(key) for key in keys], tested[keys[0]]
         results = permute(
-            [part(key) for key in keys],
-            tested[keys[0]],
-            settings=rules,
-            blocks=blocks,
-            report=count,
-            combine=combine,
+            parts, first, settings=rules, blocks=blocks, report=count, combine=combine
         )
         corrected = [result.p_enhanced if enhanced else result.p_max for result in results]
+        points = [result.p_uncorrected for result in results]
         if raw is not None:  # a test that ordinary p-values do not have is no test
             pairs = zip(keys, corrected, strict=True)
             corrected = [np.where(np.isfinite(raw[key]), p, np.nan) for key, p in pairs]
+            points = [raw[key] for key in keys]
         rejected = [p <= rules.alpha for p in corrected]
         n_tests = sum(int(np.isfinite(p).sum()) for p in corrected)
         cutoff = np.nan
         if n_tests and not enhanced:
-            points = [r.p_uncorrected for r in results] if raw is None else [raw[k] for k in keys]
             p, survive = np.concatenate(points), np.concatenate(rejected)
             cutoff = p[survive].max() if survive.any() else np.nanmin(p) * BELOW_ALL
         for key, result, p, flags in zip(keys, results, corrected, rejected, strict=True):
@@ -490,8 +487,8 @@ def correct(
     """Determine the points that survive, in families."""
     tests = {
         MapKey(measure, test.contrast.name, hemi): test
-        for hemi, one in fitted.items()
-        for measure, fit in one.fits.items()
+        for hemi, side in fitted.items()
+        for measure, fit in side.fits.items()
         for test in fit.tests
     }
     if rules.method not in PERMUTATIONS:

@@ -49,8 +49,8 @@ def f_limits(f: Float, df1: int, df2: Float, confidence: float) -> tuple[Float, 
         far = start >= _FARTHEST
         if far.any():
             wide = (np.full(far.sum(), _FARTHEST / 10), _WIDEST * first * inside[far])
-            found = elementwise.find_root(excess, wide, args=(inside[far], df2[far]))
-            root[far] = np.where(found.success, found.x, np.nan)
+            solution = elementwise.find_root(excess, wide, args=(inside[far], df2[far]))
+            root[far] = np.where(solution.success, solution.x, np.nan)
         return np.where(reachable | np.isnan(f), root, 0.0)
 
     return limit(1 - tail), limit(tail)

@@ -53,7 +53,7 @@ class LogisticFit:
 def is_separated(matrix: Float, case: Bool) -> bool:
     """Whether a combination of the columns separates the groups without overlap.
 
-    Then maximum-likelihood estimates are infinite (Albert and Anderson 1984). Found exactly, by
+    Then maximum-likelihood estimates are infinite (Albert and Anderson 1984). Detected exactly, by
     a linear program (Konis 2007): the largest sum of margins under which none is negative.
     """
     scale = np.abs(matrix).max(axis=0)
@@ -65,11 +65,7 @@ def is_separated(matrix: Float, case: Bool) -> bool:
 
 
 def fit_logistic(
-    matrix: Float,
-    case: Bool,
-    *,
-    firth: bool,
-    free: Bool | None = None,
+    matrix: Float, case: Bool, *, firth: bool, free: Bool | None = None
 ) -> LogisticFit:
     """Fit a logistic regression by maximum likelihood, or by Firth's method.
 
@@ -161,10 +157,7 @@ def _scales(matrix: Float) -> Float:
 
 
 def firth_maxima(
-    matrix: Float,
-    case: Bool,
-    weights: Float,
-    free: Bool | None = None,
+    matrix: Float, case: Bool, weights: Float, free: Bool | None = None
 ) -> tuple[Float, Float]:
     """Penalize the likelihood by the root of the information's determinant (Firth 1993).
 
@@ -234,7 +227,7 @@ class _Penalized:
         gradient = np.einsum("sck,sc->sk", directions, self.slope(weights, beta))
         along = gradient
         if bent:
-            moved = [_DIFFERENCE * one for one in np.moveaxis(directions, 2, 0)]
+            moved = [_DIFFERENCE * direction for direction in np.moveaxis(directions, 2, 0)]
             changes = [self.slope(weights, beta + d) - self.slope(weights, beta - d) for d in moved]
             bend = np.einsum("sck,lsc->slk", directions, changes) / (-2 * _DIFFERENCE)
             curvature, turned = np.linalg.eigh((bend + np.swapaxes(bend, 1, 2)) / 2)

@@ -103,16 +103,11 @@ class Terms:
 
     def _columns_of(self, variables: frozenset[str]) -> list[int]:
         """Return places of the columns of terms with exactly these variables."""
-        names = {
-            name for own, columns in self._structures() if own == variables for name in columns
-        }
+        names = {name for s, columns in self._structures() if s == variables for name in columns}
         return [place for place, name in enumerate(self.columns) if name in names]
 
-    def _rows(self, name: str, contrast: str) -> Float:
-        """Return (rows, columns) weights of a column, level, slope, term or product of these."""
-        if name in self.names:
-            size = len(self.columns) if name in self.columns else len(self.names)
-            return np.eye(size)[[self.names.index(name)]]
+    def _free_and_fixed(self, name: str, contrast: str) -> tuple[list[str], dict[str, str]]:
+        """Return the variables that a name compares, and those that it fixes, with their levels."""
         atoms, conditions = split_name(name)
         fixed = {self._variable(key, contrast): value for key, value in conditions.items()}
         free: list[str] = []
@@ -124,8 +119,16 @@ class Terms:
                 raise ModelError(f"contrast {contrast!r}: {name} fixes {factor} twice")
         if compared := sorted(set(free) & set(fixed)):
             raise ModelError(f"contrast {contrast!r}: {name} compares and fixes {listed(compared)}")
+        return free, fixed
+
+    def _rows(self, name: str, contrast: str) -> Float:
+        """Return (rows, columns) weights of a column, level, slope, term or product of these."""
+        if name in self.names:
+            size = len(self.columns) if name in self.columns else len(self.names)
+            return np.eye(size)[[self.names.index(name)]]
+        free, fixed = self._free_and_fixed(name, contrast)
         variables = frozenset(free)
-        if variables and not any(variables <= own for own, _ in self._structures()):
+        if variables and not any(variables <= structure for structure, _ in self._structures()):
             raise ModelError(
                 f"contrast {contrast!r}: the formula has no {':'.join(free)}; add the term, or"
                 " contrast something else"

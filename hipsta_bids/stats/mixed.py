@@ -24,7 +24,7 @@ CORRELATIONS = 40
 #: Halvings of the interval that holds the best one.
 HALVINGS = 50
 
-#: Sessions of one participant that tell a slope from noise.
+#: Sessions of one participant that distinguish a slope from noise.
 _SLOPE_SESSIONS = 3
 #: A gain in minus twice the restricted likelihood by slopes that is none.
 _NO_GAIN = 1e-6
@@ -46,7 +46,7 @@ class Sums:
     """(sizes,) numbers of sessions of a participant that occur."""
     people: Float
     """(sizes, points) participants with that number."""
-    own_squares: Float
+    person_squares: Float
     """(sizes, points, columns + 1, columns + 1) of each participant's sums, over participants."""
 
     def where(self, usable: Bool) -> "Sums":
@@ -57,7 +57,7 @@ class Sums:
             self,
             n=np.where(usable, self.n, size + 1),
             squares=np.where(mask, self.squares, np.eye(size)),
-            own_squares=np.where(mask, self.own_squares, 0.0),
+            person_squares=np.where(mask, self.person_squares, 0.0),
         )
 
     def at(self, ratio: Float) -> tuple[Float, Float, Float, Float, Float]:
@@ -70,7 +70,7 @@ class Sums:
         sizes = self.sizes[:, None]
         spread = 1 + sizes * ratio
         take = (ratio / spread, 1 / spread**2, -2 * sizes / spread**3)
-        off, first, second = (-np.einsum("kp,kpij->pij", one, self.own_squares) for one in take)
+        off, first, second = (-np.einsum("kp,kpij->pij", w, self.person_squares) for w in take)
         whole = self.squares + off
         inverse = np.linalg.inv(whole[:, :-1, :-1])
         scores = np.einsum("pij,pj->pi", inverse, whole[:, :-1, -1])
@@ -78,7 +78,7 @@ class Sums:
         left = np.column_stack([-scores, np.ones(len(scores))])
         moved = np.einsum("pij,pj->pi", first, left)
         change = np.einsum("pij,pj->pi", inverse, moved[:, :-1])
-        gradient, bent = (np.einsum("pij,pj->pi", one, left) for one in (whole, second))
+        gradient, bent = (np.einsum("pij,pj->pi", matrices, left) for matrices in (whole, second))
         residual_second = np.einsum("pi,pi->p", left, bent)
         residual_second -= 2 * np.einsum("pi,pi->p", change, moved[:, :-1])
         relative = inverse @ first[:, :-1, :-1]
@@ -118,8 +118,8 @@ def collect_sums(maps: Float, basis: Float, participants: Int) -> Sums:
         repeated=np.asarray((counts > 1).any(axis=0)),
         squares=squares(columns, np.ones(maps.shape)),
         sizes=sizes,
-        people=np.array([who.sum(axis=0) for who in masks]),
-        own_squares=np.array([squares(sums, who) for who in masks]),
+        people=np.array([mask.sum(axis=0) for mask in masks]),
+        person_squares=np.array([squares(sums, mask) for mask in masks]),
     )
 
 
@@ -162,15 +162,15 @@ def fit_mixed(
 ) -> glm.PointwiseFit:
     """Fit ``value = matrix @ coefficients + participant + residual`` at each point.
 
-    With times, participants also have a slope of their own, correlated with the intercept, except
+    With times, participants also have a separate slope, correlated with the intercept, except
     at points whose restricted likelihood slopes do not raise: there intercepts alone are fitted.
     Whether slopes vary is tested by the ratio of restricted likelihoods, whose distribution is an
     equal mixture of chi squared with 1 and 2 degrees of freedom (Stram and Lee 1994).
 
     By restricted maximum likelihood, which for one random intercept depends on one number: the
-    ratio of the two variances. It is found for all points at once. Degrees of freedom are
+    ratio of the two variances. It is estimated for all points at once. Degrees of freedom are
     Satterthwaite's, from the curvature of the likelihood at the optimum, as in R's ``lmerTest``
-    (Kuznetsova et al. 2017); where no variance between participants is found they are the linear
+    (Kuznetsova et al. 2017); where the variance between participants is 0, they are the linear
     model's. Several rows are tested by F: the mean of the squared t of combinations that are
     independent, with the degrees of freedom that give F its expectation (Fai and Cornelius 1996).
     Covariates (maps, rows, points) are as of :func:`~hipsta_bids.stats.glm.fit_points`.
@@ -213,9 +213,7 @@ def _larger_where_better(
     """Join the fits of some points: with slopes, except where the likelihood gains nothing."""
     gain = intercepts["loss"] - slopes["loss"]
     is_worse = gain < _NO_GAIN
-    chosen_values = {
-        name: np.where(is_worse, intercepts[name], own) for name, own in slopes.items()
-    }
+    chosen_values = {name: np.where(is_worse, intercepts[name], v) for name, v in slopes.items()}
     chosen_values["slope"] = np.where(is_worse, 0.0, slopes["slope"])
     gain = np.where(gain < 0, 0.0, gain)
     chosen_values["slopes_p"] = (special.chdtrc(1, gain) + special.chdtrc(2, gain)) / 2
@@ -275,10 +273,7 @@ def _tested(
 
 
 def _fit(
-    maps: Float,
-    basis: Float,
-    participants: Int,
-    rotated: Sequence[Float],
+    maps: Float, basis: Float, participants: Int, rotated: Sequence[Float]
 ) -> dict[str, Float]:
     """Fit intercepts at some points; points last."""
     sums = collect_sums(maps, basis, participants)
@@ -305,12 +300,7 @@ def _fit(
 
 
 def _fit_slopes(
-    maps: Float,
-    basis: Float,
-    participants: Int,
-    rotated: Sequence[Float],
-    *,
-    times: Float,
+    maps: Float, basis: Float, participants: Int, rotated: Sequence[Float], *, times: Float
 ) -> dict[str, Float]:
     """Fit intercepts and slopes at some points; points last."""
     unit = float(times.std())

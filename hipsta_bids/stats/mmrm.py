@@ -111,7 +111,7 @@ def fit_visits(
             first[:, numbers] = baseline[:, points].T
             data = _with_baseline(data, first)
         parts.append(_fit(replace(data, maps=np.nan_to_num(data.maps)), rotated, settings))
-    whole = [np.concatenate(one, axis=-1) for one in zip(*parts, strict=True)]
+    whole = [np.concatenate(arrays, axis=-1) for arrays in zip(*parts, strict=True)]
     scores, sigma, n, *tested = whole
     tests = []
     for i, contrast in enumerate(contrasts):
@@ -245,7 +245,7 @@ def _products(left: Float, right: Float, entries: Float) -> Float:
     """Sum tr(left E_j right E_k) over participants: (points, parameters, parameters)."""
     count, people, n_visits = left.shape[:3]
     size = n_visits**2
-    flat = (one.reshape(count, people, size) for one in (left, right))
+    flat = (factors.reshape(count, people, size) for factors in (left, right))
     sums = _sums(*flat).reshape(count, *[n_visits] * 4)  # a, b, c, d
     turned = sums.transpose(0, 2, 3, 4, 1).reshape(count, size, size)
     pairs = entries.reshape(size, -1)
@@ -454,7 +454,7 @@ def visit_model(
 
 def _equal_at_first(design: Design, arms: str) -> Design:
     """Remove columns of arms at the first visit, which is the reference of visits."""
-    names = [[atom.partition("[")[0] for atom in split_name(one)[0]] for one in design.columns]
+    names = [[atom.partition("[")[0] for atom in split_name(c)[0]] for c in design.columns]
     is_first = np.array([arms in atoms and VISIT not in atoms for atoms in names])
     if not any(arms in atoms and VISIT in atoms for atoms in names):
         raise ModelError(
@@ -466,9 +466,7 @@ def _equal_at_first(design: Design, arms: str) -> Design:
         matrix=design.matrix[:, keep],
         columns=tuple(np.array(design.columns)[keep].tolist()),
         contrasts=tuple(
-            one
-            if one.weights.shape[1] == keep.sum()
-            else replace(one, weights=one.weights[:, keep])
-            for one in design.contrasts
+            c if c.weights.shape[1] == keep.sum() else replace(c, weights=c.weights[:, keep])
+            for c in design.contrasts
         ),
     )

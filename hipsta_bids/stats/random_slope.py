@@ -47,9 +47,9 @@ class SlopeSums:
     """(points,)"""
     moments: Float
     """(3, points or 1, participants) sessions, sums of times and of their squares."""
-    own_columns: Float
+    person_columns: Float
     """(2, points or 1, participants, columns) sums of columns, plain and times time."""
-    own_values: Float
+    person_values: Float
     """(2, points, participants) the same of the values."""
 
     def take(self, points: Int) -> "SlopeSums":
@@ -61,8 +61,8 @@ class SlopeSums:
             self.products[points],
             self.total[points],
             self.moments if shared else self.moments[:, points],
-            self.own_columns if shared else self.own_columns[:, points],
-            self.own_values[:, points],
+            self.person_columns if shared else self.person_columns[:, points],
+            self.person_values[:, points],
         )
 
 
@@ -85,8 +85,10 @@ def collect_slope_sums(maps: Float, basis: Float, participants: Int, times: Floa
         products=(np.swapaxes(basis, -1, -2) @ values.T[:, :, None])[:, :, 0],
         total=np.einsum("sp,sp->p", values, values),
         moments=np.stack([per_person(weight_shown * power[:, None]) for power in powers]),
-        own_columns=np.stack([per_person(weighted * power[:, None, None]) for power in powers[:2]]),
-        own_values=np.stack([per_person(values * power[:, None]) for power in powers[:2]]),
+        person_columns=np.stack(
+            [per_person(weighted * power[:, None, None]) for power in powers[:2]]
+        ),
+        person_values=np.stack([per_person(values * power[:, None]) for power in powers[:2]]),
     )
 
 
@@ -105,7 +107,7 @@ def solve_slopes(sums: SlopeSums, triangles: Float) -> tuple[Float, Float, Float
     plain = a**2 * second / determinant
     mixed = a * (b * second - c * cross) / determinant
     timed = (b**2 * second - 2 * b * c * cross + c**2 * first) / determinant
-    (x, z), (y, t) = sums.own_columns, sums.own_values
+    (x, z), (y, t) = sums.person_columns, sums.person_values
     weighted = plain * y + mixed * t, mixed * y + timed * t
     information = sums.squares - _products(x, z, plain, mixed, timed)
     right = sums.products - _sums(x, weighted[0]) - _sums(z, weighted[1])
@@ -228,17 +230,17 @@ def _derivatives(sums: SlopeSums, at: Float) -> tuple[Float, Float, Float]:
 def _second(function: Callable[[Float], Float], at: Float) -> Float:
     """Second derivatives for the three numbers, by central differences of a wider step.
 
-    Values beside the middle serve all entries: 13 evaluations.
+    Values next to the middle serve all entries: 13 evaluations.
     """
     step = 10 * _STEP
     shifts = step * np.eye(3)
     middle = function(at)
-    beside = [function(at + shift) + function(at - shift) for shift in shifts]
+    shifted = [function(at + shift) + function(at - shift) for shift in shifts]
     result = np.empty((len(at), 3, 3))
     for i in range(3):
-        result[:, i, i] = (beside[i] - 2 * middle) / step**2
+        result[:, i, i] = (shifted[i] - 2 * middle) / step**2
         for j in range(i):
             corners = function(at + shifts[i] + shifts[j]) + function(at - shifts[i] - shifts[j])
-            mixed = (corners - beside[i] - beside[j] + 2 * middle) / (2 * step**2)
+            mixed = (corners - shifted[i] - shifted[j] + 2 * middle) / (2 * step**2)
             result[:, i, j] = result[:, j, i] = mixed
     return result

@@ -15,7 +15,7 @@ _NEGATIONS = frozenset(_WORDS["negations"])
 _WHOLE_LEVELS = frozenset(_WORDS["alone"])
 #: Beginnings that negate another level: nondemented, unaffected.
 _NEGATING = ("non", "un", "a")
-_MINUS = re.compile(r"(.+?)\s*[-\u2212\u2013]")  # APOE4- beside APOE4+
+_MINUS = re.compile(r"(.+?)\s*[-\u2212\u2013]")  # APOE4-, if APOE4+ is a level
 
 
 @dataclass(frozen=True)
@@ -26,6 +26,12 @@ class Reference:
     reason: str
     is_known: bool
     """Whether the level is a control by its name, or was asked for."""
+
+
+def _phrases(spelled: Mapping[str, str], controls: Iterable[str]) -> list[str]:
+    """Return the levels with the first control word that any has."""
+    matches = ([n for n, text in spelled.items() if _has_control(text, w)] for w in controls)
+    return next(filter(None, matches), [])
 
 
 def choose_reference(
@@ -44,15 +50,13 @@ def choose_reference(
     """
     if requested is not None:
         return Reference(requested, "as requested", is_known=True)
-    levels = [level for level in declared if level in levels] or levels
+    levels = list(filter(levels.__contains__, declared)) or levels
     controls = {_singular(word): None for word in chain(words, *_WORDS["controls"].values())}
     spelled = {level: " ".join(_words(level)) for level in levels}
     names = {_singular(text): level for level, text in reversed(spelled.items())}
-    exact = [names[word] for word in controls if word in names]
-    if exact:
+    if exact := [names[word] for word in filter(names.__contains__, controls)]:
         return Reference(exact[0], "control", is_known=len(exact) == 1)
-    matches = ([n for n in levels if _has_control(spelled[n], word)] for word in controls)
-    phrases = next(filter(None, matches), [])
+    phrases = _phrases(spelled, controls)
     negations = [level for level in levels if _is_negation(level, levels, spelled)]
     for reason, candidates in (("control", phrases), ("negation", negations)):
         if len(candidates) == 1:
@@ -92,8 +96,8 @@ def _is_negation(level: str, levels: Sequence[str], spelled: Mapping[str, str]) 
     if _NEGATIONS & set(spelled[level].split()):
         return True
     minus = _MINUS.fullmatch(level.strip())
-    if minus and any(other.replace(" ", "") == f"{minus[1]}+" for other in levels):
+    if minus and any(label.replace(" ", "") == f"{minus[1]}+" for label in levels):
         return True
     whole = spelled[level].replace(" ", "")
     spellings = {text.replace(" ", "") for name, text in spelled.items() if name != level}
-    return any(whole == f"{start}{other}" for start in _NEGATING for other in spellings)
+    return any(whole == f"{start}{spelling}" for start in _NEGATING for spelling in spellings)

@@ -57,7 +57,7 @@ def _shifts(warps: Float) -> Float:
 def register(profiles: Float, settings: RegistrationSettings) -> Registration:
     """Register profiles to a template that is made from them.
 
-    ``registr`` takes turns: each profile is warped onto its own approximation by the mean and
+    ``registr`` takes turns: each profile is warped onto its approximation by the mean and
     the principal components; these are estimated again from the warped profiles (Wrobel et al.
     2018, as in version 2.1.1 of the R package of that name). Unlike R, each profile is first
     standardized (setting ``standardize``; else all are divided by one standard deviation, since
@@ -98,7 +98,7 @@ def register(profiles: Float, settings: RegistrationSettings) -> Registration:
 def register_to(
     profiles: Float, template: warping.Template, settings: RegistrationSettings
 ) -> Registration:
-    """Register profiles to a template that does not change; each subject is on its own."""
+    """Register profiles to a template that does not change; subjects are independent."""
     if settings.align == "none":
         raise ModelError(
             "registration: the template was made with align registr, not none; use the same"
@@ -143,7 +143,7 @@ def _after_inverse(warps: Float, common: Float) -> Float:
 
 
 def _scaled(profiles: Float, scale: float | None) -> Float:
-    """Profiles over one standard deviation, or each less its mean over its own."""
+    """Profiles over one standard deviation, or each less its mean over its standard deviation."""
     if scale is not None:
         return profiles / scale
     centered = profiles - profiles.mean(axis=1, keepdims=True)

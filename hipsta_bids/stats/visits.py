@@ -35,13 +35,15 @@ def visit_contrasts(
     """
     first, *after = labels
     if not groups:
-        changes = (f"change to {one} = {VISIT}[{one}] - {VISIT}[{first}]" for one in after)
+        changes = (f"change to {visit} = {VISIT}[{visit}] - {VISIT}[{first}]" for visit in after)
         return [] if endpoint else list(changes)
     if endpoint:
-        terms = {one: f"{VISIT}[{one}]" for one in (after if endpoint[0] == "clda" else labels)}
+        terms = {
+            visit: f"{VISIT}[{visit}]" for visit in (after if endpoint[0] == "clda" else labels)
+        }
     else:
-        terms = {f"change to {one}": f"({VISIT}[{one}] - {VISIT}[{first}])" for one in after}
-    pairs = [one.split(" = ") for one in groups]
+        terms = {f"change to {visit}": f"({VISIT}[{visit}] - {VISIT}[{first}])" for visit in after}
+    pairs = [group.split(" = ") for group in groups]
     return [
         *([] if endpoint else groups),
         *(f"{name} in {p} = ({d}):{term}" for name, term in terms.items() for p, d in pairs),

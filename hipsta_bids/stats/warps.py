@@ -78,7 +78,7 @@ class Template:
     """Variance of what is left, in squares of the same."""
     scale: float | None
     """Standard deviation of the profiles that made it, in their unit; None where each profile
-    was standardized by its own mean and standard deviation."""
+    was standardized by its mean and standard deviation."""
     turns: int
     """Iterations of template and warps, which new subjects take as well."""
     center: Float
@@ -110,10 +110,7 @@ class _Moments:
 
 
 def fit_template(
-    profiles: Float,
-    warps: Float,
-    splines: int,
-    components: int,
+    profiles: Float, warps: Float, splines: int, components: int
 ) -> tuple[Template, Float]:
     """Estimate mean, components and noise of profiles at given warps.
 
@@ -141,7 +138,7 @@ def fit_template(
 
 
 def subject_curves(template: Template, profiles: Float, warps: Float) -> Float:
-    """Each subject's own curve, by a template that does not change."""
+    """Each subject's curve, by a template that does not change."""
     moments = _Moments(profiles, warps, template.knots)
     scores, *_ = _expect(moments, template.mean, template.components, template.noise)
     return template.mean + scores @ template.components.T
@@ -237,7 +234,7 @@ class WarpBasis:
 def fit_warps(
     profiles: Float, knots: Float, coefficients: Float, basis: WarpBasis, parameters: Float
 ) -> tuple[Float, Float]:
-    """Warp each profile onto its own curve, by damped Gauss-Newton steps for all at once.
+    """Warp each profile onto its curve, by damped Gauss-Newton steps for all at once.
 
     Minimizes the sum of squared differences, from ``parameters`` (subjects, steps) on. Returns
     parameters, and warps (subjects, nodes): registered coordinate of each node, 0..1.

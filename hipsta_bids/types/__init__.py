@@ -58,7 +58,7 @@ class EditedMask:
     inside: Bool
     """(I, J, K) whether a voxel of the labels' grid belongs to the body."""
     voxel: float
-    """Edge of a voxel in plane in the mask's own file, mm."""
+    """Edge of a voxel in plane in the mask's file, mm."""
 
     def __post_init__(self) -> None:
         _set(self, "inside", np.bool_, (None, None, None))
@@ -112,12 +112,12 @@ class GivenEnd:
     point: tuple[float, float, float]
     """A point of the plane, scanner RAS, mm."""
     normal: tuple[float, float, float] | None = None
-    """Its normal, RAS, of any length and sign; None for the direction found without it."""
+    """Its normal, RAS, of any length and sign; None for the estimated direction."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LabelVolume:
-    """A segmentation in the package's own vocabulary."""
+    """A segmentation in the package's vocabulary."""
 
     tissue: NDArray[np.uint8]
     """(I, J, K), values of :class:`~hipsta_bids.protocols.Tissue`."""
@@ -213,7 +213,7 @@ class Coordinates:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Sheet:
-    """The hippocampal body on a regular grid of its own coordinates."""
+    """The hippocampal body on a regular grid in coordinates of the body."""
 
     points: Float
     """(Nx, Ny, Nz, 3) RAS mm, NaN where undefined; the middle z level is the mid-surface."""
@@ -272,17 +272,17 @@ class Finding:
     limit: float
     """A larger value is flagged."""
     text: str
-    """What was found, for people."""
+    """The finding, for people."""
     remedy: str
     """What to try, for people."""
     points: Float = field(default_factory=_nowhere)
-    """(N, 3) where it was found, RAS mm; none if it concerns the sheet as a whole."""
+    """(N, 3) where it is, RAS mm; none if it concerns the sheet as a whole."""
     placed: bool = False
     """Whether :attr:`text` says where."""
     share: float = float("nan")
-    """Share of the columns that are concerned, where the points do not tell."""
+    """Share of the columns that are concerned, where the points do not show."""
     change: float = float("nan")
-    """What the mean thickness may be off by, mm, where the points do not tell."""
+    """What the mean thickness may be off by, mm, where the points do not show."""
 
     @property
     def margin(self) -> float:
@@ -310,7 +310,7 @@ class Flag:
     limit: float = float("nan")
     """Its limit."""
     points: Float = field(default_factory=_nowhere)
-    """(N, 3) where it was found, RAS mm."""
+    """(N, 3) where it is, RAS mm."""
     share: float = float("nan")
     """Share of the columns that are concerned."""
     change: float = float("nan")
@@ -366,7 +366,7 @@ class HemisphereMaps:
     summary: Mapping[str, float]
     """One number per summary column (see the output table for units)."""
     qc: Mapping[str, Any]
-    """Numbers and words, ready for JSON, that tell whether to trust the maps."""
+    """Numbers and words, ready for JSON, that show whether to trust the maps."""
     repairs: tuple[str, ...] = ()
     """Changes of the body's topology, one line each."""
     flags: tuple[Flag, ...] = ()

@@ -155,7 +155,7 @@ def test_a_membrane_that_costs_little_more_is_a_second_choice(monkeypatch):
     """Without the price of cuts that sever, filling the hole costs 5.4 times as much as a cut."""
     monkeypatch.setattr(membranes, "SEVER_FACTOR", 1.0)
     assert repaired(with_hole_at_the_edge()).rival is None
-    monkeypatch.setattr(membranes, "RIVAL_PRICE", 6.0)
+    monkeypatch.setattr(membranes, "ALTERNATIVE_PRICE", 6.0)
     solid = repaired(with_hole_at_the_edge())
     assert only_repair(solid, "cut")
     hole = with_hole_at_the_edge() != ribbon_mask()

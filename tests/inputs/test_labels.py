@@ -537,7 +537,7 @@ def test_large_images_are_read_by_their_labels(tmp_path):
     assert read_labels(path).data.shape == (20, 10, 10)
     assert read_labels(path, 0.9).start == (297, 197, 497)
     np.testing.assert_array_equal(
-        read_labels(path).own_affine[:3, 3], np.array([300, 200, 500]) * np.float32(0.3)
+        read_labels(path).file_affine[:3, 3], np.array([300, 200, 500]) * np.float32(0.3)
     )
     assert label_values(small) == {1, 2}
     assert peak_memory(path) < 250  # the whole image has 309

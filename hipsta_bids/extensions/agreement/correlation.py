@@ -28,7 +28,7 @@ def correlate_maps(
 
     Surrogates of the first map have random signs of its coefficients in the eigenmodes of a
     covariance (Moran spectral randomization; Wagner and Dray 2015): coefficients of a field with
-    this covariance are uncorrelated. The Laplacian's own modes are not the field's, as they double
+    this covariance are uncorrelated. The Laplacian's modes are not the field's, as they double
     the variance at the boundary.
     """
     if first.shape != second.shape or first.shape != (len(mesh.points),):

@@ -95,7 +95,7 @@ def _analyses(results: GroupResults) -> Mapping[str, Any] | None:
 
 
 def _maps(results: GroupResults) -> Mapping[str, Any] | None:
-    """Show effect maps beside each other, and how far they agree."""
+    """Show effect maps side by side, and how far they agree."""
     table = results.table("agreement")
     columns = ["measure", "hemi", "contrast", "analysis", "other", "r", "dice", "n_significant"]
     text = (

@@ -271,6 +271,33 @@ def _most_complete(analysis: Analysis, rows: Int, least: int) -> Int:
     return max(options, key=lambda option: option[0])[1]
 
 
+def _designs(
+    table: pd.DataFrame, analysis: Analysis, settings: GroupSettings
+) -> tuple[dict[str, Design], list[str]]:
+    """Build the design of each formula for some participants, and note what is omitted."""
+    designs, notes = {}, []
+    for formula in dict.fromkeys((analysis.model.formula, *(f for _, f in analysis.measures))):
+        # Anew, since contrasts may hold means over all participants.
+        spec = replace(analysis.model, formula=formula)
+        rebuilt = build_design(table, spec, settings.design, analysis.design.references)
+        if lacking := len(table) - len(rebuilt.rows):
+            notes.append(f"{SUMMARY}: without {formula}: {lacking} participants lack a variable")
+        else:
+            designs[formula] = replace(rebuilt, contrasts=with_mean(rebuilt))
+    return designs, notes
+
+
+def _missing_note(model: Mapping[str, Any]) -> Iterator[str]:
+    """Note points or measures of a model that the summary omits."""
+    if missing := model["sd"].count(None):
+        is_map = model["kind"] == "map"
+        yield (
+            f"{SUMMARY}: {model['measures'][0] if is_map else 'summaries'}, {model['hemi']}:"
+            f" without {missing} {'points' if is_map else 'measures'} that are not known of all"
+            " participants, or differ in few"
+        )
+
+
 def _summarize(
     cohort: Cohort,
     analysis: Analysis,
@@ -281,22 +308,11 @@ def _summarize(
     inputs: Mapping[str, Any],
 ) -> tuple[dict[str, Any], list[str]]:
     """Make the summary of the participants in ``rows``, and note its omissions."""
-    compared, notes = analysis.compared, []
+    compared = analysis.compared
     table = compared.table.iloc[rows]
-    designs = {}
-    for formula in dict.fromkeys((analysis.model.formula, *(f for _, f in analysis.measures))):
-        # Anew, since contrasts may hold means over all participants.
-        spec = replace(analysis.model, formula=formula)
-        rebuilt = build_design(table, spec, settings.design, analysis.design.references)
-        if len(rebuilt.rows) == len(rows):
-            designs[formula] = replace(rebuilt, contrasts=with_mean(rebuilt))
-        else:
-            lacking = len(rows) - len(rebuilt.rows)
-            notes.append(f"{SUMMARY}: without {formula}: {lacking} participants lack a variable")
-    people = {name: typed(table[name]) for name in analysis.design.references}
-    factors = {
-        name: _counts(people[name], first) for name, first in analysis.design.references.items()
-    }
+    designs, notes = _designs(table, analysis, settings)
+    references = analysis.design.references.items()
+    factors = {name: _counts(typed(table[name]), first) for name, first in references}
     groups = {}
     if analysis.groups is not None:
         column = table[analysis.groups.column]
@@ -313,13 +329,7 @@ def _summarize(
         )
     for model in models:
         model["units"] = [cohort.units.get(name, "1") for name in model["measures"]]
-        if missing := model["sd"].count(None):
-            points_text = "points" if model["kind"] == "map" else "measures"
-            notes.append(
-                f"{SUMMARY}: {model['measures'][0] if points_text == 'points' else 'summaries'},"
-                f" {model['hemi']}: without {missing} {points_text} that are not known of all"
-                " participants, or differ in few"
-            )
+        notes += _missing_note(model)
     numbers = {
         name: typed(table[name]).astype(np.float64)
         for name in closed_formula(analysis.model.formula).names
@@ -374,7 +384,7 @@ def _check_model(analysis: Analysis, settings: GroupSettings) -> None:
             f"with {match[1]}() has other columns at each site; write numbers that are the same"
             " everywhere, as I((age - 65) / 10)"
         )
-    elif not any(one.n_rows == 1 and not one.side for one in analysis.design.contrasts):
+    elif not any(c.n_rows == 1 and not c.side for c in analysis.design.contrasts):
         problem = "has no two-sided contrast of one row; others cannot be combined"
     if problem is not None:
         raise ModelError(f"--export-summary: a model {problem}")
@@ -434,9 +444,7 @@ def _model(
 ) -> dict[str, Any]:
     """Fit the model where all participants have a value, and spell the results."""
     names = [test.contrast.name for test in tests]
-    contrasts = [
-        one for one in design.contrasts if one.n_rows == 1 and not one.side and one.name in names
-    ]
+    contrasts = [c for c in design.contrasts if c.n_rows == 1 and not c.side and c.name in names]
     complete = np.isfinite(values).all(axis=0)
     fit = fit_points(np.where(complete, values, 0.0), design.matrix, contrasts, settings.glm)
     traceable = is_traceable(values, cells, settings.of(ExchangeSettings).min_cell)
@@ -448,7 +456,7 @@ def _model(
     return {
         "columns": list(design.columns),
         "df": len(design.matrix) - len(design.columns),
-        "contrasts": {one.name: one.weights[0].tolist() for one in contrasts},
+        "contrasts": {contrast.name: contrast.weights[0].tolist() for contrast in contrasts},
         "sd": known(fit.sigma),
         "estimate": {test.contrast.name: known(test.estimate[0]) for test in fit.tests},
         "se": {test.contrast.name: known(test.se[0]) for test in fit.tests},

@@ -94,7 +94,7 @@ def _read(paths: Sequence[tuple[str | None, Path]]) -> list[SiteSummary]:
 
 def _write_maps(folder: Path, meta: Meta) -> None:
     """Write maps of both models as GIFTI and CIFTI, and the sheets to draw them on."""
-    tests = (one for item in meta.of("map") for one in meta.tests(item))
+    tests = (test for item in meta.of("map") for test in meta.tests(item))
     write.write_stats(
         folder, write.stats_of((key, test, meta.discoveries[key]) for key, test, _ in tests)
     )
@@ -131,7 +131,7 @@ def _figures(meta: Meta) -> Iterator[tuple[str, Drawing]]:
     places = grounds_of(cohort, {hemi: _place(meta, hemi, cohort) for hemi in tests})
     like = {item.label(RANDOM): item.label(FIXED) for item in maps}
     for measure in dict.fromkeys(item.model.measures[0] for item in maps):
-        sides = {hemi: one for hemi, one in places.items() if measure in tests[hemi]}
+        sides = {hemi: points for hemi, points in places.items() if measure in tests[hemi]}
         blocks = list(contrasts(tests, measure, like))
         items = [item for item in maps if item.model.measures[0] == measure]
         for number, contrast in enumerate(dict.fromkeys(item.contrast for item in items)):
@@ -204,8 +204,26 @@ def _record(
     }
 
 
+def _random_effects(method: str, cite: Citations) -> str:
+    """Return how the variance between sites was estimated."""
+    if method == "dl":
+        return (
+            f"estimated by the moments of DerSimonian and Laird {cite('dl')}. Tests used the normal"
+            " distribution"
+        )
+    text = (
+        f"estimated by restricted maximum likelihood {cite('reml')}. Tests and limits followed"
+        f" Knapp and Hartung {cite('knapp-hartung')}"
+    )
+    if method == "reml-adhoc":
+        text += (
+            f", with standard errors not smaller than without their correction {cite('modified')}"
+        )
+    return text
+
+
 def _methods(meta: Meta) -> str:
-    """Return what was done and what was found."""
+    """Return methods and results."""
     rules, sites = meta.settings.of(MetaSettings), meta.sites
     cite = Citations()
     counts = Counter[str]()
@@ -222,21 +240,7 @@ def _methods(meta: Meta) -> str:
     method_text = cite("method")
     if sites[0].template is not None:
         aligned += f" Registration used monotone B-spline warps {cite('registr')}."
-    if rules.random == "dl":
-        random = (
-            f"estimated by the moments of DerSimonian and Laird {cite('dl')}. Tests used the normal"
-            " distribution"
-        )
-    else:
-        random = (
-            f"estimated by restricted maximum likelihood {cite('reml')}. Tests and limits followed"
-            f" Knapp and Hartung {cite('knapp-hartung')}"
-        )
-        if rules.random == "reml-adhoc":
-            random += (
-                f", with standard errors not smaller than without their correction"
-                f" {cite('modified')}"
-            )
+    random = _random_effects(rules.random, cite)
     measure_text = (
         f"Measures of the hippocampal body {method_text} of {meta.people} participants{groups} at"
         f" {len(sites)} sites were combined with hipsta_bids {__version__}. No value of a"
@@ -260,9 +264,9 @@ def _methods(meta: Meta) -> str:
     )
     paragraphs = [f"{measure_text} {aligned}", effects, errors]
     survivors = [
-        f"- {escaped(f'{key.measure}, {key.contrast}, {key.hemi}')}: {int(found.rejected.sum())} of"
-        f" {found.n_tests} points"
-        for key, found in meta.discoveries.items()
+        f"- {escaped(f'{key.measure}, {key.contrast}, {key.hemi}')}: {int(test.rejected.sum())} of"
+        f" {test.n_tests} points"
+        for key, test in meta.discoveries.items()
     ]
     if survivors:
         paragraphs.append("\n".join(["Significant points after correction:", "", *survivors]))

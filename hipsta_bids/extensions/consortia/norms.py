@@ -1,6 +1,6 @@
 """Norms of several sites become one, by sums over their participants."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,22 @@ _COMMON = (
 )
 
 
+def _shared_maps(
+    sums_of_files: Sequence[Mapping[tuple[str, str], Any]],
+) -> tuple[list[tuple[str, str]], list[str]]:
+    """List the maps, by hemisphere and name, that all files have, and note the others."""
+    shared = [key for key in sums_of_files[0] if all(key in sums for sums in sums_of_files)]
+    omitted = sorted({name for sums in sums_of_files for _, name in set(sums) - set(shared)})
+    note = f"not all sites have norms of {listed(omitted)}, which are omitted"
+    return shared, [note] * bool(omitted)
+
+
+def _labels(loaded: Sequence[NormsFile]) -> dict[str, list[str]]:
+    """Return all kinds of labels in the norms of some sites."""
+    names = dict.fromkeys(name for file in loaded for name in file.labels)
+    return {n: sorted({x for file in loaded for x in file.labels.get(n, ())}) for n in names}
+
+
 def merge_norms(
     paths: Sequence[Path], out_dir: Path, settings: GroupSettings
 ) -> tuple[Path, list[str]]:
@@ -38,11 +54,7 @@ def merge_norms(
             f"meta --norms: {participants} participants, {least} are needed; add sites"
         )
     sums_of_files = [file.site_sums() for file in loaded]
-    shared = [key for key in sums_of_files[0] if all(key in sums for sums in sums_of_files)]
-    omitted = {name for sums in sums_of_files for _, name in set(sums) - set(shared)}
-    notes = [f"not all sites have norms of {listed(sorted(omitted))}, which are omitted"] * bool(
-        omitted
-    )
+    shared, notes = _shared_maps(sums_of_files)
     columns = np.concatenate([np.array(file.columns) for file in loaded])
     norms, nested = {}, dict[str, dict[str, Any]]()
     for hemi, name in shared:
@@ -55,10 +67,7 @@ def merge_norms(
     update = {
         "version": __version__,
         "versions": sorted({version for file in loaded for version in file.versions}),
-        "labels": {
-            name: sorted({value for file in loaded for value in file.labels.get(name, ())})
-            for name in dict.fromkeys(name for file in loaded for name in file.labels)
-        },
+        "labels": _labels(loaded),
         "sites": sites,
         "participants": participants,
         "columns": columns.tolist(),

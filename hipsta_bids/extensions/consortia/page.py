@@ -1,7 +1,7 @@
 """The page of a meta-analysis: what sites have in common, where they differ, and how."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from string import ascii_uppercase
 from typing import Any
@@ -19,7 +19,7 @@ from hipsta_bids.reports.group_tables import map_unit
 from hipsta_bids.reports.page import Section, build_sections, render
 from hipsta_bids.types import SIDES, p_text
 
-#: Folder and page, in an output folder of their own.
+#: Folder and page, in a separate output folder.
 FOLDER, REPORT = "meta", "meta.html"
 _PREFIX = "meta"
 #: Forest plots of summary measures on the page; all are in the table.
@@ -53,6 +53,27 @@ def _forests(results: GroupResults, *, maps: bool) -> Iterator[dict[str, Any]]:
         }
 
 
+def _mark(row: Mapping[str, Any], number: int, across: Callable[[float], float]) -> dict[str, Any]:
+    """Place the mark of a row, with positions ``across`` the plot."""
+    is_site, estimate = row["kind"] == _SITE, row["estimate"]
+    low_text, high_text = (cells.number_text(row[f"estimate_{end}"]) for end in ("low", "high"))
+    text = f"[{low_text} to {high_text}]"
+    if row["kind"] != _PREDICTION:
+        text = f"{cells.number_text(estimate)} {text}"
+    size = _LARGEST * math.sqrt(row["weight"]) if is_site else 0.0
+    return {
+        "kind": "diamond" if not is_site and row["kind"] != _PREDICTION else row["kind"],
+        "name": row["site"],
+        "n": f"n {row['n']:.0f}" if math.isfinite(row["n"]) else "",
+        "y": _TOP + _ROW * number + _ROW / 2 + (6 if not is_site else 0),
+        "low": across(row["estimate_low"]),
+        "high": across(row["estimate_high"]),
+        "at": across(estimate) if math.isfinite(estimate) else 0.0,
+        "size": round(max(3.0, size), 1),
+        "text": text,
+    }
+
+
 def _drawing(rows: Sequence[Mapping[str, Any]], unit: str) -> dict[str, Any]:
     """Place the marks of a forest plot; rows from top to bottom."""
     estimated = [row for row in rows if math.isfinite(row["estimate_low"])]
@@ -65,28 +86,7 @@ def _drawing(rows: Sequence[Mapping[str, Any]], unit: str) -> dict[str, Any]:
     def across(value: float) -> float:
         return float(round(_NAMES + (min(max(value, low), high) - low) * scale, 1))
 
-    marks = []
-    for number, row in enumerate(estimated):
-        is_site = row["kind"] == _SITE
-        estimate = row["estimate"]
-        low_text, high_text = (cells.number_text(row[f"estimate_{end}"]) for end in ("low", "high"))
-        text = f"[{low_text} to {high_text}]"
-        if row["kind"] != _PREDICTION:
-            text = f"{cells.number_text(estimate)} {text}"
-        size = _LARGEST * math.sqrt(row["weight"]) if is_site else 0.0
-        marks.append(
-            {
-                "kind": "diamond" if not is_site and row["kind"] != _PREDICTION else row["kind"],
-                "name": row["site"],
-                "n": f"n {row['n']:.0f}" if math.isfinite(row["n"]) else "",
-                "y": _TOP + _ROW * number + _ROW / 2 + (6 if not is_site else 0),
-                "low": across(row["estimate_low"]),
-                "high": across(row["estimate_high"]),
-                "at": across(estimate) if math.isfinite(estimate) else 0.0,
-                "size": round(max(3.0, size), 1),
-                "text": text,
-            }
-        )
+    marks = [_mark(row, number, across) for number, row in enumerate(estimated)]
     random = next(row for row in rows if row["kind"] == _RANDOM)
     tau = cells.number_text(random["tau2"] ** 0.5)
     height = _TOP + _ROW * len(estimated) + 10
@@ -247,7 +247,7 @@ def meta_page(folder: Path) -> str:
 
 
 def write_meta_page(out_dir: Path) -> Path:
-    """Write the page of a meta-analysis beside its folder, and return its path."""
+    """Write the page of a meta-analysis next to its folder, and return its path."""
     path = out_dir / REPORT
     files.remove([path])  # it may be that of an earlier one
     files.write_text(path, meta_page(out_dir / FOLDER))

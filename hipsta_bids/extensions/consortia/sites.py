@@ -125,21 +125,24 @@ def check_agreement(sites: Sequence[SiteSummary]) -> list[str]:
         _agree(sites, f"{title}: columns", [", ".join(s.models[number].columns) for s in sites])
         _agree(sites, f"{title}: contrasts", [", ".join(s.models[number].contrasts) for s in sites])
         for name in model.contrasts:
-            # The mean is that of a site's own participants, whatever their age.
+            # The mean is that of a site's participants, whatever their age.
             rows = [site.models[number].contrasts[name] for site in sites if name != MEAN]
             if rows:
                 words = [", ".join(f"{weight:.6g}" for weight in row) for row in rows]
                 item = f"{title}: weights of {name} on {', '.join(model.columns)}"
                 _agree(sites, item, words, _BY_COLUMNS)
-    notes = []
+    return list(_differences(sites))
+
+
+def _differences(sites: Sequence[SiteSummary]) -> Iterator[str]:
+    """Note in which versions and labels the sites differ."""
     if len({site.version for site in sites}) > 1:
-        notes.append("sites used several versions of hipsta_bids, see sites.tsv")
+        yield "sites used several versions of hipsta_bids, see sites.tsv"
     for name in dict.fromkeys(name for site in sites for name in site.labels):
         kinds = {site.site: ", ".join(site.labels.get(name, ["unknown"])) for site in sites}
         if len(set(kinds.values())) > 1:
             texts = "; ".join(f"{kind} at {site}" for site, kind in kinds.items())
-            notes.append(f"labels of sites differ in {name}: {texts}")
-    return notes
+            yield f"labels of sites differ in {name}: {texts}"
 
 
 def _agree(
@@ -205,7 +208,7 @@ def analyze_sites(sites: list[SiteSummary], settings: GroupSettings) -> Meta:
     ]
     maps = [item for item in items if item.model.kind == "map"]
     discoveries = discover(
-        {item.key(name): one.p for item in maps for name, one in item.result.models.items()},
+        {item.key(name): model.p for item in maps for name, model in item.result.models.items()},
         settings.multiplicity,
     )
     frames: dict[str, columns.Frame] = {
@@ -281,11 +284,9 @@ def meta_tables(meta: Meta) -> Iterator[tuple[str, pd.DataFrame]]:
 def _sites(meta: Meta) -> pd.DataFrame:
     rows = []
     for site in meta.sites:
-        counts = {k: shown_counts(own) for k, own in site.factors.items()}
-        levels = {f"{k}_{level}": n for k, own in counts.items() for level, n in own.items()}
-        numbers = {
-            f"{k}_{what}": v for k, own in site.covariates.items() for what, v in own.items()
-        }
+        counts = {k: shown_counts(levels) for k, levels in site.factors.items()}
+        levels = {f"{k}_{level}": n for k, levels in counts.items() for level, n in levels.items()}
+        numbers = {f"{k}_{s}": v for k, n in site.covariates.items() for s, v in n.items()}
         people = {"site": site.site, "n": site.participants, **levels, **numbers}
         about = {"version": site.version, "template": site.template_hash}
         rows.append({**people, "df": site.models[0].df, **about})
@@ -403,12 +404,12 @@ def _left_out(meta: Meta) -> Iterator[dict[str, Any]]:
     maps = [item for item in meta.of("map") if item.result.without]
     for number, site in enumerate(meta.sites if maps else ()):
         without = {
-            item.key(name): one
+            item.key(name): model
             for item in maps
-            for name, one in item.result.without[number].models.items()
+            for name, model in item.result.without[number].models.items()
         }
         discoveries = discover(
-            {key: one.p for key, one in without.items()}, meta.settings.multiplicity
+            {key: model.p for key, model in without.items()}, meta.settings.multiplicity
         )
         for item in maps:
             for name, all_sites in item.result.models.items():

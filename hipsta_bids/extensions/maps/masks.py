@@ -45,13 +45,11 @@ def mask_sheets(
             _mask(is_masked[sheet], record, tables, repaired=REPAIRED in masks)
         maps = {name: np.where(is_masked, np.nan, values) for name, values in side.maps.items()}
         sides[hemi] = replace(side, maps=maps, unmasked=side.maps["curvature"])
-        shares += [
-            {"visit": visit, "side": hemi, "share": share}
-            for visit, share in zip(visits, is_masked.mean(axis=(1, 2)), strict=True)
-        ]
+        share = is_masked.mean(axis=(1, 2))
+        shares.append(pd.DataFrame({"visit": visits, "side": hemi, "share": share}))
     names = [(record.result.name, None) for record in records]
     notes = [note for table in tables for note in table.notes(names)]
-    return replace(measured, sides=sides), pd.DataFrame(shares), notes
+    return replace(measured, sides=sides), pd.concat(shares, ignore_index=True), notes
 
 
 def _mask(

@@ -154,7 +154,7 @@ class Norms:
 
 def age_columns(age: Float, knots: Float) -> Float:
     """(visits, knots - 1) natural cubic spline without constant (Hastie et al. 2009, eq. 5.4)."""
-    at, t = ((one - knots[0]) / (knots[-1] - knots[0]) for one in (knots, age))
+    at, t = ((ages - knots[0]) / (knots[-1] - knots[0]) for ages in (knots, age))
     cubes = np.maximum(t[:, None] - at, 0.0) ** 3
     slopes = (cubes[:, :-1] - cubes[:, -1:]) / (at[-1] - at[:-1])
     return np.column_stack([t, slopes[:, :-1] - slopes[:, -1:]])
@@ -199,7 +199,7 @@ def fit_norms(
     ]
     return Norms(
         knots=knots,
-        **{name: np.hstack([getattr(one, name) for one in parts]) for name in NORM_ARRAYS},
+        **{name: np.hstack([getattr(part, name) for part in parts]) for name in NORM_ARRAYS},
     )
 
 
@@ -240,7 +240,7 @@ def _fit(
     part = n / np.maximum(n.sum(axis=0), 1)
     means = np.where(is_informed, coefficients[:n_sites], np.nan)
     sds = np.where(is_informed, log_sd[:n_sites], np.nan)
-    average = [np.sum(part * np.where(n > 0, one, 0.0), axis=0) for one in (means, sds)]
+    average = [np.sum(part * np.where(n > 0, values, 0.0), axis=0) for values in (means, sds)]
     slopes = coefficients[n_sites:]
     return Norms(
         knots=knots,

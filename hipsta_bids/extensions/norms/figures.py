@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from hipsta_bids.extensions.norms.scoring import ScoredMaps
+from hipsta_bids.extensions.norms.wscores import ScoredMaps
 from hipsta_bids.group.output import panels, style
 from hipsta_bids.group.output.color_bar import spanned
 from hipsta_bids.io.files import MISSING

@@ -92,7 +92,7 @@ class NormsFile(TomlTable):
             kind = np.tile(np.eye(max(len(self.sexes), 1))[number, 1:], (len(ages), 1))
             people = People(age=ages, sex=kind, site=np.zeros(len(ages), dtype=np.int64))
             values = norms.centiles(people, LEVELS)[:, :, 0]
-            columns = {f"p{100 * one:g}": row for one, row in zip(LEVELS, values, strict=True)}
+            columns = {f"p{100 * level:g}": row for level, row in zip(LEVELS, values, strict=True)}
             blocks.append(pd.DataFrame({"sex": sex, "age": ages, **columns}))
         return pd.concat(blocks)
 

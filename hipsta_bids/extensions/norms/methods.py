@@ -16,6 +16,21 @@ Cite = Callable[[str], str]
 """Numbers a work by its key."""
 
 
+def _coverage_text(coverage: pd.DataFrame) -> str:
+    of_maps = coverage["n_points"] > 1
+    kinds = {"points of maps": coverage[of_maps], "summary measures": coverage[~of_maps]}
+    parts = []
+    for kind, numbers in kinds.items():
+        below = [numbers[name].mean() for name in numbers.columns if name.startswith("below_")]
+        if len(numbers):
+            parts.append(f"{', '.join(f'{100 * share:.1f}' for share in below)} % of {kind}")
+    levels = ", ".join(f"{100 * level:g}" for level in LEVELS)
+    return (
+        f"In {CENTILE_FOLDS}-fold cross-validation, {' and '.join(parts)} lay below the"
+        f" centiles {levels}."
+    )
+
+
 def norms_text(
     file: NormsFile,
     *,
@@ -67,18 +82,7 @@ def norms_text(
     )
     paragraphs = [first, model]
     if coverage is not None:
-        of_maps = coverage["n_points"] > 1
-        kinds = {"points of maps": coverage[of_maps], "summary measures": coverage[~of_maps]}
-        parts = []
-        for kind, numbers in kinds.items():
-            below = [numbers[name].mean() for name in numbers.columns if name.startswith("below_")]
-            if len(numbers):
-                parts.append(f"{', '.join(f'{100 * one:.1f}' for one in below)} % of {kind}")
-        levels = ", ".join(f"{100 * one:g}" for one in LEVELS)
-        paragraphs.append(
-            f"In {CENTILE_FOLDS}-fold cross-validation, {' and '.join(parts)} lay below the"
-            f" centiles {levels}."
-        )
+        paragraphs.append(_coverage_text(coverage))
     if new:
         counts = ", ".join(f"{escaped(site)} ({file.sites[site]})" for site in new)
         paragraphs.append(

@@ -19,10 +19,10 @@ from hipsta_bids.extensions.norms.columns import COLUMNS
 from hipsta_bids.extensions.norms.figures import deviation_rows, draw_norms, norm_rows
 from hipsta_bids.extensions.norms.file import NormsFile, load_norms, save_norms
 from hipsta_bids.extensions.norms.methods import norms_text
-from hipsta_bids.extensions.norms.scoring import ScoredMaps, map_rows, score_rows, write_scores
+from hipsta_bids.extensions.norms.scoring import map_rows, score_rows, write_scores
 from hipsta_bids.extensions.norms.settings import NormSettings
 from hipsta_bids.extensions.norms.sites import with_sums
-from hipsta_bids.extensions.norms.wscores import NormativeScores
+from hipsta_bids.extensions.norms.wscores import NormativeScores, ScoredMaps
 from hipsta_bids.group.cohort.data import SHEET, Cohort, layers
 from hipsta_bids.group.model import BOTH, Comparison
 from hipsta_bids.group.output import write
@@ -55,7 +55,7 @@ Values = Mapping[Key, tuple[Int, Float]]
 
 
 @dataclass(frozen=True, eq=False)
-class _Made:
+class _Scoring:
     """What is written."""
 
     path: Path | None
@@ -66,7 +66,7 @@ class _Made:
     people: normative.People
     cohorts: Mapping[str, Cohort]
     """With registered sheets; with other programs' maps by their names."""
-    found: Values
+    data: Values
     tables: dict[str, pd.DataFrame]
     known: int
     """Sites that the norms had before."""
@@ -104,7 +104,7 @@ def run_norms(
         file, people, values = with_sums(study, file, people, values)
     norms, tables["coverage"] = _fit(values, people, file, settings.of(NormSettings))
     n_sites = len(file.sites)
-    scoring = _Made(None, None, file, norms, people, cohorts, values, tables, n_sites)
+    scoring = _Scoring(None, None, file, norms, people, cohorts, values, tables, n_sites)
     return _write(study, scoring, ())
 
 
@@ -153,9 +153,9 @@ def _score_people(
             numbers[at], people.take(rows[at]), len(file.sites), least
         )
     scored = {
-        name: _score_maps(one, values, extended, people, adapted) for name, one in cohorts.items()
+        name: _score_maps(c, values, extended, people, adapted) for name, c in cohorts.items()
     }
-    scoring = _Made(
+    scoring = _Scoring(
         path, controls, file, extended, people, cohorts, values, tables, n_sites, scored, adapted
     )
     tables["zscores"] = pd.concat(_score_rows(scoring, adapted, settings), ignore_index=True)
@@ -181,14 +181,13 @@ def _registered(
     return template, tables, cohorts, values
 
 
-def _write(study: studies.Study, scoring: _Made, notes: Iterable[str]) -> studies.GroupResult:
+def _write(study: studies.Study, scoring: _Scoring, notes: Iterable[str]) -> studies.GroupResult:
     """Write all results; charts are of the measures that the settings name."""
     file, people, cohort = scoring.file, scoring.people, study.cohort
-    settings = study.settings
     charts = [
         file.centiles(norms).assign(hemi=hemi, measure=name, unit=cohort.units.get(name, "1"))
         for (hemi, name), norms in scoring.norms.items()
-        if name in settings.of(NormSettings).charts and hemi != BOTH
+        if name in study.settings.of(NormSettings).charts and hemi != BOTH
     ]
     if charts:
         table = pd.concat(charts, ignore_index=True)
@@ -238,7 +237,7 @@ def _write(study: studies.Study, scoring: _Made, notes: Iterable[str]) -> studie
     }
     name = studies.folder_of(["norms" if scoring.path is None else "scores"], study.among)
     notes = [*notes]
-    if n_later := sum(one.reason == "later-session" for one in study.exclusions):
+    if n_later := sum(exclusion.reason == "later-session" for exclusion in study.exclusions):
         notes.append(f"{n_later} later sessions are not in the norms, which take first ones")
     if file.site not in cohort.table:
         notes.append(f"no column {file.site!r}: all are taken to be at one, {_NO_SITE!r}")
@@ -416,7 +415,7 @@ def _with_new_sites(
 def _fit(
     values: Values, people: normative.People, file: NormsFile, rules: NormSettings
 ) -> tuple[dict[Key, normative.Norms], pd.DataFrame]:
-    """Fit all norms, and tell by cross-validation how many lie below each centile."""
+    """Fit all norms, and estimate by cross-validation how many lie below each centile."""
     n_sites, knots = len(file.sites), np.array(file.knots)
     fit: Callable[[Float, normative.People, int, Float], normative.Norms]
     fit = partial(normative.fit_norms, settings=rules)
@@ -442,7 +441,8 @@ def _fit(
             z[out] = fold_norms.score(sampled[out], people_here.take(out))
         scores = z[np.isfinite(z)]
         below = {
-            f"below_{100 * one:g}": np.mean(scores < special.ndtri(one)) for one in normative.LEVELS
+            f"below_{100 * level:g}": np.mean(scores < special.ndtri(level))
+            for level in normative.LEVELS
         }
         rows.append(
             {
@@ -485,15 +485,21 @@ def _score_maps(
     return scored
 
 
-def _score_rows(scoring: _Made, adapted: Bool, settings: GroupSettings) -> Iterator[pd.DataFrame]:
+def _score_rows(
+    scoring: _Scoring, adapted: Bool, settings: GroupSettings
+) -> Iterator[pd.DataFrame]:
     """List scores: of maps over regions, of summary measures also centiles."""
     maps = set()
     for name, scored in scoring.scored.items():
-        maps |= {(hemi, measure) for hemi, one in scored.items() for measure in one.scores}
+        maps |= {
+            (hemi, measure)
+            for hemi, side_scores in scored.items()
+            for measure in side_scores.scores
+        }
         for rows in map_rows(scoring.cohorts[name], scored, settings):
             table = rows.drop(columns="p").rename(columns={"w": "z", "reference": "adapted"})
             yield table[table["z"].notna()].assign(centile=np.nan)
-    for (hemi, measure), (visits, numbers) in scoring.found.items():
+    for (hemi, measure), (visits, numbers) in scoring.data.items():
         if (hemi, measure) not in maps:
             rows_known = visits[scoring.people.known[visits] & np.isfinite(numbers[:, 0])]
             z = scoring.norms[hemi, measure].score(
@@ -506,15 +512,15 @@ def _score_rows(scoring: _Made, adapted: Bool, settings: GroupSettings) -> Itera
             )
 
 
-def _figures(scoring: _Made) -> Iterator[tuple[str, Drawing]]:
+def _figures(scoring: _Scoring) -> Iterator[tuple[str, Drawing]]:
     """List charts of summary measures, and maps."""
     if "centiles" in scoring.tables:
         for measure, centiles in scoring.tables["centiles"].groupby("measure", sort=False):
             yield f"{measure}_norms", partial(draw_norms, centiles, _dots(scoring, centiles))
     for surface, cohort in scoring.cohorts.items():
         for measure in dict.fromkeys(n for side in cohort.sides.values() for n in side.maps):
-            sides = {h: one for h, one in cohort.sides.items() if (h, measure) in scoring.norms}
-            grounds = grounds_of(cohort, {hemi: points_of(one) for hemi, one in sides.items()})
+            sides = {h: side for h, side in cohort.sides.items() if (h, measure) in scoring.norms}
+            grounds = grounds_of(cohort, {hemi: points_of(side) for hemi, side in sides.items()})
             unit = cohort.units.get(measure, "1")
             middle = scoring.file.middle
             means = {hemi: scoring.norms[hemi, measure].expected(middle) for hemi in sides}
@@ -524,11 +530,11 @@ def _figures(scoring: _Made) -> Iterator[tuple[str, Drawing]]:
             yield f"{measure}_normmaps", partial(draw_pages, grounds, [list(rows)])
 
 
-def _dots(scoring: _Made, lines: pd.DataFrame) -> pd.DataFrame:
+def _dots(scoring: _Scoring, lines: pd.DataFrame) -> pd.DataFrame:
     """Collect values of new people as they would be at the average site."""
     sexes, blocks = scoring.file.sexes or [files.MISSING], []
     for key in lines[["hemi", "measure"]].drop_duplicates().itertuples(index=False, name=None):
-        rows, numbers = scoring.found[key]
+        rows, numbers = scoring.data[key]
         rows, numbers = (rows, numbers) if scoring.adapted is not None else (rows[:0], numbers[:0])
         people_here = scoring.people.take(rows)
         level = (people_here.sex @ np.arange(1, len(sexes))).astype(np.int64)

@@ -6,7 +6,7 @@ from pathlib import Path
 import pandas as pd
 import pyarrow as pa
 
-from hipsta_bids.extensions.norms.scoring import ScoredMaps
+from hipsta_bids.extensions.norms.wscores import ScoredMaps
 from hipsta_bids.group.cohort.data import Cohort
 from hipsta_bids.group.output import parquet
 from hipsta_bids.stats.arrays import blocks

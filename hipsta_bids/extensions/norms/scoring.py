@@ -7,12 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from hipsta_bids.errors import ModelError
 from hipsta_bids.extensions.norms import STEP
 from hipsta_bids.extensions.norms.columns import COLUMNS
-from hipsta_bids.extensions.norms.wscores import NormativeScores, w_scores
+from hipsta_bids.extensions.norms.wscores import ScoredMaps, w_scores
 from hipsta_bids.group.cohort import data
 from hipsta_bids.group.output.results import Analysis
 from hipsta_bids.group.output.tables import entity_label
@@ -31,21 +30,6 @@ from hipsta_bids.types import PARTICIPANT, SESSION
 
 #: Region of a score that is the mean over the whole sheet.
 WHOLE = "all"
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class ScoredMaps:
-    """Scores of one hemisphere."""
-
-    rows: Int
-    """(sheets,) rows of the cohort's table."""
-    reference: NDArray[np.bool_]
-    """(sheets,) who belongs to the reference group."""
-    scores: Mapping[str, NormativeScores]
-    """By measure; points in the order of the sheet."""
-    subfield: Int
-    """(x, y) most frequent subfield, position in ``names``."""
-    names: tuple[str, ...]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -1,12 +1,13 @@
 """Scores of participants against a reference group of the same cohort (w-scores)."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from scipy import special
 
 from hipsta_bids.errors import ModelError
-from hipsta_bids.stats.arrays import Bool, Float
+from hipsta_bids.stats.arrays import Bool, Float, Int
 from hipsta_bids.stats.glm import chunks, fit_block
 from hipsta_bids.stats.settings import GlmSettings
 
@@ -20,6 +21,21 @@ class NormativeScores:
     group (Jack et al. 1997)."""
     p: Float
     """(subjects, points) two-sided, with the uncertainty of the expectation."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ScoredMaps:
+    """Scores of one hemisphere."""
+
+    rows: Int
+    """(sheets,) rows of the cohort's table."""
+    reference: Bool
+    """(sheets,) who belongs to the reference group."""
+    scores: Mapping[str, NormativeScores]
+    """By measure; points in the order of the sheet."""
+    subfield: Int
+    """(x, y) most frequent subfield, position in ``names``."""
+    names: tuple[str, ...]
 
 
 def w_scores(maps: Float, matrix: Float, reference: Bool, settings: GlmSettings) -> NormativeScores:
@@ -53,7 +69,7 @@ def w_scores(maps: Float, matrix: Float, reference: Bool, settings: GlmSettings)
         leverage = np.einsum("psi,si->sp", rotated @ inverse, rotated)
         residuals = values - rotated @ fit.scores.T
         df = np.where(np.isfinite(fit.sigma), fit.n - basis.shape[1], np.nan) - member
-        # A subject that alone determines a coefficient cannot be told without it.
+        # A subject that alone determines a coefficient cannot be predicted without it.
         left = np.where(member, 1 - leverage, 1.0)
         left[left <= np.sqrt(np.finfo(np.float64).eps)] = np.nan
         # Of members, the variance without themselves.

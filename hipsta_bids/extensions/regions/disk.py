@@ -224,8 +224,8 @@ def find_edges(disk: Disk, medial: Float, lateral: Float, height: Float) -> Edge
     arcs = [first, second]
     count = len(disk.loop)
     between = [
-        (here[-1] + np.arange(1, (there[0] - here[-1]) % count)) % count
-        for here, there in (arcs, arcs[::-1])
+        (first[-1] + np.arange(1, (second[0] - first[-1]) % count)) % count
+        for first, second in (arcs, arcs[::-1])
     ]
     between.sort(key=lambda arc: float(np.median(height[arc])))
     sides = [disk.loop[arc] for arc in (*arcs, *between)]
@@ -255,7 +255,7 @@ def map_to_rectangle(
     """Two functions (V, 2): x from -1 to 1 between the edges, y between the two values of ``ends``.
 
     Where ``body`` (V, 2) is a number, beyond ``NEAR`` of edges, ends and holes, both are the
-    body's; elsewhere they continue as harmonic functions. A harmonic function changes most beside a
+    body's; elsewhere they continue as harmonic functions. A harmonic function changes most at a
     short end: there its lines would all lie. Beyond plus and minus ``extent``, y is therefore the
     mean distance along the sheet, from the body, of the points of a line.
     """

@@ -1,13 +1,13 @@
 """The surface of the whole sheet, head and tail included, and its two faces.
 
-Nothing is cut, and nothing is made a ball of: where banks of the head touch, the labels do not tell
+Nothing is cut, and nothing is made a ball of: where banks of the head touch, the labels do not show
 them apart. A function on the surface, near 1 on the interior and near -1 on the exterior face, is
-found in one linear system from labels beside the surface, from sharp bends, and from the opposite
+solved in one linear system from labels next to the surface, from sharp bends, and from the opposite
 wall; its zero line is the rim.
 
 Where the cleft between two banks is lost, the wall there has the same face on both sides. Banks of
 low folds hardly face each other: what is left of such a fold is a narrow ridge of a thick wall.
-Two walls are thick beside any wall of the head; a thin neighborhood alone makes no ridge.
+Two walls are thick next to any wall of the head; a thin neighborhood alone makes no ridge.
 """
 
 from dataclasses import dataclass
@@ -41,7 +41,7 @@ EVIDENCE = {
     Tissue.BACKGROUND: (-1.0, 0.04),
     Tissue.OTHER: (-1.0, 0.04),
 }
-"""Face beside which a label lies, and how much that weighs. Dentate gyrus lies beside the lateral
+"""Face next to which a label lies, and how much that weighs. Dentate gyrus lies next to the lateral
 edge, too, and what has no label may be either."""
 PROBES = (0.25, 0.4, 0.55, 0.7)
 """Where labels are looked for, mm outside the surface."""
@@ -130,10 +130,7 @@ def whole_surface(
 
 
 def find_faces(
-    surface: Surface,
-    volume: LabelVolume,
-    field: NDArray[np.float32],
-    grid: Float,
+    surface: Surface, volume: LabelVolume, field: NDArray[np.float32], grid: Float
 ) -> Faces:
     """Find the interior and the exterior face, and the strip between them."""
     points, triangles = surface.vertices, surface.triangles
@@ -207,7 +204,7 @@ def _opposite(
 def _label_evidence(
     points: Float, normals: Float, volume: LabelVolume
 ) -> list[tuple[float, Float]]:
-    """Which side labels beside the surface speak for, and how strongly, (V,) each."""
+    """Which side labels next to the surface speak for, and how strongly, (V,) each."""
     inverse = np.linalg.inv(volume.affine)
     evidence = {1.0: np.zeros(len(points)), -1.0: np.zeros(len(points))}
     for distance in PROBES:
@@ -287,7 +284,7 @@ def find_ridges(sheet: Sheet, among: Bool) -> list[tuple[Bool, float]]:
     values = thickness[sheet.valid]
     near = cKDTree(middle).query_ball_point(middle, AROUND)
     ratio = np.zeros(thickness.shape)
-    ratio[sheet.valid] = values / [np.median(values[own]) for own in near]
+    ratio[sheet.valid] = values / [np.median(values[neighbors]) for neighbors in near]
     places, count = ndimage.label(among & (ratio > SLOPE))
     if not count:
         return []

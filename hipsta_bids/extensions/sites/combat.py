@@ -90,7 +90,7 @@ def fit_effects(
     square of the conditional residuals, as the variant MSR of Beer et al. (2020): without effects
     of sites it leaves the values as they are. Every one of the ``n_sites`` has visits. Where
     effects are ``pooled``, points inform each other (empirical Bayes), as points of one map do;
-    else each site's own mean and variance are removed.
+    else each site's mean and variance are removed.
 
     Parameters are NaN at points where missing values leave sites and columns inseparable; moments
     are of residuals before harmonization.
@@ -151,11 +151,7 @@ def fit_effects(
 
 
 def extend_effects(
-    effects: SiteEffects,
-    values: Float,
-    visits: Visits,
-    *,
-    pooled: bool,
+    effects: SiteEffects, values: Float, visits: Visits, *, pooled: bool
 ) -> tuple[SiteEffects, SiteMoments]:
     """Estimate the effects of further sites, with all else as it was estimated before.
 
@@ -178,7 +174,7 @@ def extend_effects(
 def harmonize(values: Float, visits: Visits, effects: SiteEffects) -> Float:
     """Take shifts and scales of sites out of values (visits, points).
 
-    What the columns explain stays, and with repeated sessions what participants have of their own.
+    What the columns explain stays, and with repeated sessions the effects of participants.
     Visits without a site or column are NaN.
     """
     rows = np.flatnonzero(visits.site >= 0)
@@ -196,7 +192,7 @@ def _residuals(
 ) -> Iterator[tuple[slice, Float]]:
     """Take what columns and participants explain out of values, at one block of points at a time.
 
-    A participant's own part is the mean of what the model leaves, shrunk as the best linear
+    A participant's part is the mean of what the model leaves, shrunk as the best linear
     unbiased prediction is.
     """
     for part in chunks(values.shape, 4):
@@ -232,11 +228,7 @@ def _moments(effects: SiteEffects, values: Float, visits: Visits) -> tuple[Float
 
 
 def _with_shifts(
-    effects: SiteEffects,
-    values: Float,
-    visits: Visits,
-    *,
-    pooled: bool,
+    effects: SiteEffects, values: Float, visits: Visits, *, pooled: bool
 ) -> tuple[SiteEffects, SiteMoments]:
     """Complete effects by the shifts and scales that standardized residuals show."""
     n, mean, around = _moments(effects, values, visits)
@@ -288,4 +280,4 @@ def _pool(n: Float, mean: Float, around: Float, is_informed: Bool) -> tuple[Floa
 
 
 #: Names of the arrays of :class:`SiteEffects`, and those that have one value per point.
-ARRAYS = tuple(one.name for one in fields(SiteEffects))
+ARRAYS = tuple(column.name for column in fields(SiteEffects))

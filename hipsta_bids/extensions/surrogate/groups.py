@@ -27,7 +27,7 @@ from hipsta_bids.types import SIDES
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-#: Numbers that are compared: of single slices, and of the sheet beside them.
+#: Numbers that are compared: of single slices, and of the whole sheet.
 _NUMBERS = ("thickness", "thickness_mesh")
 
 
@@ -134,9 +134,7 @@ def draw_surrogate(results: GroupResults) -> "list[Figure]":
         axis.set_title(f"{SIDES[hemi]}, {title}", loc="right")
     for axis in axes[:, 0]:
         axis.set_ylabel("surrogate thickness [mm]")
-    limits = np.array([axis.get_ylim() for axis in axes.flat])
-    for axis in axes.flat:
-        axis.set_ylim(limits[:, 0].min(), limits[:, 1].max())
+    style.share_limits(axes.ravel())
     confidence = ((results.record.get("settings") or {}).get("glm") or {}).get("confidence", 0.95)
     style.explain(figure, axes[0, 0], f"mean, {confidence:.0%} limits")
     style.letter_panels(axes.flat)

@@ -234,11 +234,11 @@ def participants_needed(
 def point_level(rules: MultiplicitySettings, plan: PowerSettings) -> float:
     """Level of the test at a point that holds the false discovery rate, on average.
 
-    If a share a of the points differs, and is found with the power P, while the rest are found
-    at the level t, a share a P + (1 - a) t of the points is found. The procedure of Benjamini and
+    If a share a of the points differs, and is rejected with the power P, and the rest at the
+    level t, a share a P + (1 - a) t of the points is rejected. The procedure of Benjamini and
     Hochberg has then t = q (a P + (1 - a) t), which gives t (Jung 2005; Liu and Hwang 2007). The
     two-stage procedure does it with q / (1 + q), and again with q / (1 + q) over the share of
-    points not found in the first stage; its power in the first stage is the power at the level
+    points not rejected in the first stage; its power in the first stage is the power at the level
     there.
     """
     if rules.method not in {"fdr2", "bh"}:
@@ -289,7 +289,7 @@ def repeatability(
     columns = size * ((sessions - grand) ** 2).sum(axis=0) / (k - 1)
     error = (residual**2).sum(axis=(0, 1)) / ((size - 1) * (k - 1))
     usable &= error > 0
-    rows, columns, error = (np.where(usable, one, np.nan) for one in (rows, columns, error))
+    rows, columns, error = (np.where(usable, squares, np.nan) for squares in (rows, columns, error))
     freedom = size * (k - 1)
     within = np.sqrt(((k - 1) * columns + (size - 1) * (k - 1) * error) / freedom)
     tails = np.array([[(1 + confidence) / 2], [(1 - confidence) / 2]])

@@ -54,7 +54,7 @@ MAPS: dict[str, tuple[str, str, str]] = {
 }
 #: Months per unit of columns of time with these names.
 _MONTHS = {"years": 12.0, "months": 1.0, "days": 12 / 365.25}
-#: Sessions that tell a participant's change from noise.
+#: Sessions that distinguish a participant's change from noise.
 _SLOPE_SESSIONS = 3
 
 
@@ -96,7 +96,7 @@ class Retested:
         self._table = table[self.complete]
         self.participants = sorted(self._table[PARTICIPANT].unique())
         names = [*[""] * ("" in counts.index), *self.sessions]
-        sessions_text = listed([f"{one or 'without a name'} ({counts[one]})" for one in names])
+        sessions_text = listed([f"{name or 'without a name'} ({counts[name]})" for name in names])
         if len(self.sessions) < 2:  # noqa: PLR2004 -- two sessions
             raise ModelError(
                 f"--retest: there is no second session, only {sessions_text}; measure repeated"
@@ -126,9 +126,7 @@ class Retested:
         data = layer.data
         values = self.arrange(data, layer.rows)
         agreed = trials.repeatability(
-            values,
-            confidence=self._settings.confidence,
-            least=self._settings.min_participants,
+            values, confidence=self._settings.confidence, least=self._settings.min_participants
         )
         # Of one visit, the variance between and within; of several, that within.
         n = agreed["n"]
@@ -234,20 +232,22 @@ class Modeled:
         mean = mean_of_known(values, 0)
         people = np.unique(participants.astype(str), return_inverse=True)[1]
         counts = glm.sum_by(people, np.isfinite(values).astype(np.float64))
-        own_means = glm.sum_by(people, np.nan_to_num(values)) / np.where(counts > 0, counts, np.nan)
+        person_means = glm.sum_by(people, np.nan_to_num(values)) / np.where(
+            counts > 0, counts, np.nan
+        )
         plain = trials.Reference(
             n=n,
             mean=mean,
             variance=fit.sigma**2,
             freedom=np.maximum(n - float(len(self.model.design.columns)), 1.0),
-            mean_limits=mean + _reach(own_means, self._settings.glm),
+            mean_limits=mean + _reach(person_means, self._settings.glm),
         )
         if self.time is None:
             return plain
         months = self._table[self.time].iloc[rows].to_numpy(dtype=np.float64) * self.months
         visits = glm.sum_by(people, np.stack([np.ones_like(months), months, months**2], axis=1))
         spreads = visits[:, 2] - visits[:, 1] ** 2 / visits[:, 0]
-        (test,) = (one for one in fit.tests if one.contrast.name == self.time)
+        (test,) = (test for test in fit.tests if test.contrast.name == self.time)
         slope, se = test.estimate[0] / self.months, test.se[0] / self.months
         reach = stats.t.ppf((1 + self._settings.glm.confidence) / 2, test.df) * se
         return replace(
@@ -285,7 +285,7 @@ def _reach(means: Float, settings: GlmSettings | RetestSettings) -> Float:
 
 
 def _check_times(table: pd.DataFrame, time: str | None, settings: GroupSettings) -> None:
-    """Refuse a reference in which change cannot be told from noise."""
+    """Refuse a reference in which change cannot be distinguished from noise."""
     if time is None:
         raise ModelError(
             "--power with --visits needs the time of each session of the reference: a column"
@@ -343,7 +343,6 @@ def run_trial(
     if effect is not None:
         for result in results:
             result.tables.update(_sample_sizes(effect, result, settings))
-    people = int(modeled[PARTICIPANT].nunique())
 
     def fill(folder: Path) -> list[str]:
         _write_tables(folder, cohorts, results)
@@ -353,20 +352,6 @@ def run_trial(
         files.write_text(folder / "methods.md", _methods(study, source, modeled, results, effect))
         return write.write_figures(folder, _figures(cohorts, results), prints=options.figures)
 
-    record = {
-        "formula": source.spec.formula if isinstance(source, Modeled) else None,
-        "hemispheres": {hemi: len(side.rows) for hemi, side in cohort.sides.items()},
-        "retest": {"participants": people, "sessions": source.sessions}
-        if isinstance(source, Retested)
-        else None,
-        "power": effect
-        and asdict(effect)
-        | {
-            "alpha_point": trials.point_level(settings.multiplicity, settings.of(PowerSettings)),
-            "most": trials.MOST_PARTICIPANTS,
-        },
-        "among": among,
-    }
     name = ["retest"] if retest else []
     if effect is not None:
         name.append(f"power-{effect.kind}-{100 * effect.share:g}".replace(".", "p"))
@@ -376,7 +361,7 @@ def run_trial(
         visits=modeled,
         tables=tables,
         meaning=COLUMNS,
-        record=record,
+        record=_record(study, source, modeled, effect) | {"among": among},
         fill=fill,
     )
 
@@ -397,6 +382,25 @@ def _sample_sizes(effect: trials.TrialEffect, result: Described, settings: Group
     confidence = settings.glm.confidence if single else None
     size = trials.sample_size(effect, moments, plan, alpha=alpha, confidence=confidence)
     return {"power": size}
+
+
+def _record(
+    study: studies.Study, source: Source, visits: pd.DataFrame, effect: trials.TrialEffect | None
+) -> dict[str, Any]:
+    """Return the record of the model or the sessions, and of the trial."""
+    settings, people = study.settings, int(visits[PARTICIPANT].nunique())
+    power = {
+        "alpha_point": trials.point_level(settings.multiplicity, settings.of(PowerSettings)),
+        "most": trials.MOST_PARTICIPANTS,
+    }
+    return {
+        "formula": source.spec.formula if isinstance(source, Modeled) else None,
+        "hemispheres": {hemi: len(side.rows) for hemi, side in study.cohort.sides.items()},
+        "retest": {"participants": people, "sessions": source.sessions}
+        if isinstance(source, Retested)
+        else None,
+        "power": effect and asdict(effect) | power,
+    }
 
 
 def _notes(

@@ -1,1 +1,1 @@
-"""Who and what is compared: found, read, joined and chosen."""
+"""Participants and measures that are compared: read, joined and selected."""

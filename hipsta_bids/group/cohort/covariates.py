@@ -2,7 +2,7 @@
 
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import cache
@@ -72,7 +72,7 @@ def read_covariates(
     """Join covariates to visits; cells stay text. Also who is not in participants.tsv.
 
     In this order: ``participants.tsv``, ``sessions.tsv`` of the participants, ``phenotype/*.tsv``,
-    and the user's own tables. A later table fills or replaces columns of the same name. Columns
+    and the user's tables. A later table fills or replaces columns of the same name. Columns
     whose ``Levels`` a sidecar lists are factors, with the names of the levels instead of numbers.
     """
     joined = visits.copy()
@@ -332,16 +332,16 @@ def add_icv(
 
 
 def read_icv(sources: Sequence[str], roots: Sequence[Path]) -> list[float | None]:
-    """Intracranial volumes in mm^3 as the segmentations' own programs estimated them.
+    """Intracranial volumes in mm^3 as the segmentations' programs estimated them.
 
-    FreeSurfer's ``stats/aseg.stats`` (EstimatedTotalIntraCranialVol) beside the ``mri`` folder, or
-    ASHS's ``*_icv.txt`` beside or above the segmentation.
+    FreeSurfer's ``stats/aseg.stats`` (EstimatedTotalIntraCranialVol) next to the ``mri`` folder, or
+    ASHS's ``*_icv.txt`` next to or above the segmentation.
     """
     paths = locate_sources(sources, roots)
-    return [None if path is None else _icv_beside(path) for path in paths]
+    return [None if path is None else _icv_of(path) for path in paths]
 
 
-def _icv_beside(path: Path) -> float | None:
+def _icv_of(path: Path) -> float | None:
     stats = path.parent.parent / "stats" / "aseg.stats"
     if stats.exists():
         for line in _read_text(stats).splitlines():
@@ -392,6 +392,16 @@ def order_sessions(table: pd.DataFrame, settings: GroupSettings) -> list[str]:
     return sorted(sessions, key=lambda name: float(medians[name]))
 
 
+def _named_time(
+    table: pd.DataFrame, time_columns: Iterable[str], by_name: Mapping[str, str]
+) -> tuple[str | None, Any]:
+    """Return the first column of time that varies between the sessions of a participant."""
+    columns = [by_name[name] for name in map(str.casefold, time_columns) if name in by_name]
+    candidates = ((column, typed(table[column])) for column in columns)
+    varying = ((n, values) for n, values in candidates if _varies(values, table[PARTICIPANT]))
+    return next(varying, (None, None))
+
+
 def add_time(
     table: pd.DataFrame, settings: GroupSettings, comparison: Comparison | None = None
 ) -> VisitTime:
@@ -415,18 +425,15 @@ def add_time(
             covariates = tuple(
                 FIRST_AGE if name.casefold() == "age" else name for name in covariates
             )
-    names = [name.casefold() for name in settings.longitudinal.time_columns]
-    named = {by_name[name]: table[by_name[name]] for name in names if name in by_name}
-    candidates = ((name, typed(values)) for name, values in named.items())
-    column, own = next((one for one in candidates if _varies(one[1], people)), (None, None))
+    column, values = _named_time(table, settings.longitudinal.time_columns, by_name)
     if column is None:
         if _DATE in table.columns and table[_DATE].notna().any():
             times, unit = _dates(table[_DATE]), _DAYS_PER_YEAR
         if times is not None:
             first = times.groupby(people).transform("min")
-            column, own = TIME, (times - first) / unit
+            column, values = TIME, (times - first) / unit
     if column is not None:
-        columns[column] = own
+        columns[column] = values
     time = VisitTime(table.assign(**columns), column, covariates)
     if comparison and (comparison.endpoint or settings.longitudinal.random == "visits"):
         return _with_visits(time, settings, comparison)

@@ -184,7 +184,9 @@ def _after_baseline(cohort: Cohort, comparison: Comparison) -> Cohort:
         has_first = ~is_first & visits[PARTICIPANT].isin(sheet_of).to_numpy()
         if has_first.any():
             rows = np.array([row_of[visit] for visit in visits.index[has_first]])
-            sheets = np.array([sheet_of[one] for one in visits[PARTICIPANT][has_first]])
+            sheets = np.array(
+                [sheet_of[participant] for participant in visits[PARTICIPANT][has_first]]
+            )
             first = replace(
                 side,
                 rows=rows,

@@ -61,7 +61,7 @@ def draw_bar(
     if level is not None:
         texts = {sign * at: text for at, text in display.p_ticks(level, high) for sign in signs}
         for sign in signs:
-            axes.axhline(-sign * np.log10(level), color="black", linewidth=style.FOUND_LINE)
+            axes.axhline(-sign * np.log10(level), color="black", linewidth=style.SIGNIFICANT_LINE)
     elif not texts:
         n = max(2, int(axes.bbox.height / (2 * LINE * MM)))
         places = MaxNLocator(min(n, 5), steps=[1, 2, 2.5, 5, 10]).tick_values(low, high)
@@ -80,7 +80,7 @@ def _spaced(ticks: Mapping[float, str], gap: float, level: float | None) -> dict
     first = f"{level:g}" if level is not None else None
     places = list[float]()
     for at in sorted(ticks, key=lambda at: (ticks[at] != first, abs(at))):
-        if all(abs(at - other) >= gap for other in places):
+        if all(abs(at - place) >= gap for place in places):
             places.append(at)
     return {at: ticks[at] for at in sorted(places)}
 

@@ -38,6 +38,12 @@ def demographics_of(cohort: Cohort, analysis: Analysis, settings: GroupSettings)
     return demographics_table(visits, settings, formulas, analysis.groups, baseline)
 
 
+def _variables(formulas: Iterable[str]) -> tuple[set[str], set[str]]:
+    """Return the variables of some formulas, and which of them are factors."""
+    closed = [closed_formula(formula) for formula in formulas]
+    return {n for part in closed for n in part.names}, {n for part in closed for n in part.factors}
+
+
 def demographics_table(
     visits: pd.DataFrame,
     settings: GroupSettings,
@@ -57,9 +63,7 @@ def demographics_table(
     if groups is not None:
         parts = {level: people[people[groups.column] == level] for level in groups.levels}
     rows = [{"variable": "participants", "group": g, "n": len(part)} for g, part in parts.items()]
-    closed = [closed_formula(formula) for formula in formulas]
-    factors = {name for part in closed for name in part.factors}
-    modeled = {name for part in closed for name in part.names}
+    modeled, factors = _variables(formulas)
     defaults = {name.casefold() for name in (*_ALWAYS, *settings.model.covariates)}
     skipped = {VISIT, FIRST_AGE, groups and groups.column}
     for name in (str(column) for column in people.columns if column not in skipped):

@@ -3,10 +3,10 @@
 Figures of maps are in ``maps`` and ``panels``. Colors are those of the pages (``reports.display``).
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from itertools import cycle
+from itertools import chain, cycle
 from textwrap import wrap
 from typing import TYPE_CHECKING, Any
 
@@ -114,6 +114,43 @@ def draw_calibration(analysis: Analysis) -> "list[Figure]":
     return _draw_pairs(curves, labels, "slope, Brier score", marker="o", markersize=3)
 
 
+def _first_added(curves: Sequence[Curve]) -> dict[tuple[str, str], dict[str, list[Curve]]]:
+    """Return the curves of the first added measure, by pair of groups and side."""
+    first: dict[tuple[str, str], dict[str, list[Curve]]] = {}
+    for curve in curves:
+        side_curves = first.setdefault(curve.pair, {}).setdefault(curve.hemi, [])
+        if not side_curves or side_curves[0].added == curve.added:
+            side_curves.append(curve)
+    return first
+
+
+def _draw_curves(axis: "Axes", curves: Iterable[Curve], options: Mapping[str, Any]) -> None:
+    axis.plot([0, 1], [0, 1], color="0.6", linewidth=0.5)
+    for curve in curves:
+        axis.plot(*curve.points, color=COLORS[curve.full], **options)
+    axis.set_xticks([0, 0.5, 1])
+    axis.set_yticks([0, 0.5, 1])
+
+
+def _add_legend(axis: "Axes", lines: Sequence[str]) -> None:
+    """Write a heading and entries; entries of curves have the next color."""
+    from matplotlib.lines import Line2D  # noqa: PLC0415  (slow to load)
+
+    heading, *entries = lines
+    colors = iter(COLORS)
+    handles = [
+        Line2D([], [], linestyle="none", color="none")
+        if entry.startswith(_SIDE_MARK)
+        else Line2D([], [], linestyle="-", color=next(colors))
+        for entry in entries
+    ]
+    legend = axis.legend(
+        handles, [entry.lstrip(_SIDE_MARK) for entry in entries], title=heading,
+        loc="upper left", borderaxespad=0, alignment="left", handlelength=1.2, labelspacing=0.2,
+    )  # fmt: skip
+    legend.set_in_layout(False)
+
+
 def _draw_pairs(
     curves: Sequence[Curve],
     labels: tuple[str, str],
@@ -121,52 +158,32 @@ def _draw_pairs(
     width: float | None = None,
     **options: Any,  # noqa: ANN401  (of matplotlib)
 ) -> "list[Figure]":
-    """Draw a row for each pair of groups, with its legend beside it: the first added measure."""
-    from matplotlib.lines import Line2D  # noqa: PLC0415  (slow to load)
-
-    first: dict[tuple[str, str], dict[str, list[Curve]]] = {}
-    for curve in curves:
-        side_curves = first.setdefault(curve.pair, {}).setdefault(curve.hemi, [])
-        if not side_curves or side_curves[0].added == curve.added:
-            side_curves.append(curve)
+    """Draw a row for each pair of groups, with its legend next to it: the first added measure."""
+    first = _first_added(curves)
     n = max(map(len, first.values()))
     width = width or (style.TWO_COLUMNS if n > 1 else style.ONE_COLUMN)
-    beside = n == 1 or width > style.ONE_COLUMN  # is the legend
-    side = (width - 6.0) / (n + beside)
-    letters = int((side if beside else width - 12.0) / (0.22 * style.SMALL))
+    legend_right = n == 1 or width > style.ONE_COLUMN  # is the legend
+    side = (width - 6.0) / (n + legend_right)
+    letters = int((side if legend_right else width - 12.0) / (0.22 * style.SMALL))
     legends = {pair: _legend(pair, by_side, title, letters) for pair, by_side in first.items()}
     lines = max("\n".join(legend).count("\n") + 1 for legend in legends.values())
     text = 18.0 + 3.2 * lines
-    height = max(side + 13, text) if beside else side + 13 + text
-    ratios = None if beside else [side + 13, text] * len(first)
-    shape = (len(first), n + 1) if beside else (2 * len(first), n)
+    n_rows, height, ratios = 1, max(side + 13, text), None
+    if not legend_right:
+        n_rows, height, ratios = 2, side + 13 + text, [side + 13, text] * len(first)
+    shape = n_rows * len(first), n + legend_right
     figure, axes = style.new_panels(*shape, (width, len(first) * height), ratios)
     for number, (pair, by_side) in enumerate(first.items()):
-        row = axes[number] if beside else axes[2 * number]
+        row, *below = axes[n_rows * number : n_rows * (number + 1)]
         for axis, (hemi, side_curves) in zip(row, by_side.items(), strict=False):
-            axis.plot([0, 1], [0, 1], color="0.6", linewidth=0.5)
-            for curve in side_curves:
-                axis.plot(*curve.points, color=COLORS[curve.full], **options)
-            axis.set_title(_sides_name(hemi), loc="center" if beside else "right")
+            _draw_curves(axis, side_curves, options)
+            axis.set_title(_sides_name(hemi), loc="center" if legend_right else "right")
             axis.set(xlabel=labels[0], aspect="equal")
-            axis.set_xticks([0, 0.5, 1])
-            axis.set_yticks([0, 0.5, 1])
         row[0].set_ylabel(labels[1])
-        empty = [*row[len(by_side) :], *(() if beside else axes[2 * number + 1])]
+        empty = [*row[len(by_side) :], *chain(*below)]
         for axis in empty:
             axis.set_axis_off()
-        heading, *entries = legends[pair]
-        colors = iter(COLORS)
-        handles = [
-            Line2D([], [], linestyle="none" if entry.startswith(_SIDE_MARK) else "-",
-                   color=next(colors) if not entry.startswith(_SIDE_MARK) else "none")
-            for entry in entries
-        ]  # fmt: skip
-        legend = (row[-1] if beside else empty[-n]).legend(
-            handles, [entry.lstrip(_SIDE_MARK) for entry in entries], title=heading,
-            loc="upper left", borderaxespad=0, alignment="left", handlelength=1.2, labelspacing=0.2,
-        )  # fmt: skip
-        legend.set_in_layout(False)
+        _add_legend(row[-1] if legend_right else empty[-n], legends[pair])
     style.letter_panels([axis for axis in axes.flat if axis.axison])
     return [figure]
 
@@ -195,10 +212,29 @@ def _sides_name(hemi: str) -> str:
     return {"L": "left", "R": "right"}.get(hemi, "both sides")
 
 
-def draw_registration(results: GroupResults, width: float | None = None) -> "list[Figure]":
-    """Draw curvature from medial to lateral before and after registration, and positions."""
+def _draw_warps(shifts: "Axes", positions: "Axes", warps: Mapping[str, Float], side: str) -> None:
+    """Draw shifts of participants (n, nodes) by group, their means, and registered positions."""
     from matplotlib.collections import LineCollection  # noqa: PLC0415  (slow to load)
 
+    step = -(-sum(map(len, warps.values())) // _MOST_LINES)
+    for color, values in zip(cycle(COLORS), warps.values(), strict=False):
+        nodes = np.linspace(0, 1, values.shape[1])
+        shifted = values[::step]
+        for axis, drawn in ((shifts, shifted), (positions, nodes + shifted / (len(nodes) - 1))):
+            lines = [np.column_stack([nodes, line]) for line in drawn]
+            axis.add_collection(LineCollection(lines, colors=color, alpha=0.25, linewidths=0.4))
+    for color, (group, values) in zip(cycle(COLORS), warps.items(), strict=False):
+        _, mean, sd = describe_known([values])
+        _curve(shifts, mean, sd / np.sqrt(max(len(values), 1)), color, group)
+    shifts.axhline(0, color="black", linewidth=0.5)
+    shifts.set_title(f"{side}, warps" + (f" (1 of {step} drawn)" if step > 1 else ""))
+    shifts.set_ylabel("shift to lateral [nodes]")
+    positions.set_title(f"{side}, positions")
+    _mark_positions(positions)
+
+
+def draw_registration(results: GroupResults, width: float | None = None) -> "list[Figure]":
+    """Draw curvature from medial to lateral before and after registration, and positions."""
     profiles = results.table("profiles")
     profiles = profiles[profiles["measure"] == "curvature"]
     sides = [str(hemi) for hemi in profiles["hemi"].unique()]
@@ -219,30 +255,13 @@ def draw_registration(results: GroupResults, width: float | None = None) -> "lis
                 _curve(axis, curve["mean"], curve["mean_se"], color, name)
             axis.set_title(f"{SIDES[hemi]}, {'after' if registered else 'before'}")
             axis.set_ylabel(label)
-        moved = _shifts_of(results, hemi, groups)
-        step = -(-sum(map(len, moved.values())) // _MOST_LINES)
-        for color, group in zip(cycle(COLORS), groups, strict=False):
-            nodes = np.linspace(0, 1, moved[group].shape[1])
-            shifted = moved[group][::step]
-            for axis, drawn in ((shifts, shifted), (positions, nodes + shifted / (len(nodes) - 1))):
-                lines = [np.column_stack([nodes, line]) for line in drawn]
-                axis.add_collection(LineCollection(lines, colors=color, alpha=0.25, linewidths=0.4))
-        for color, group in zip(cycle(COLORS), groups, strict=False):
-            _, mean, sd = describe_known([moved[group]])
-            _curve(shifts, mean, sd / np.sqrt(max(len(moved[group]), 1)), color, group)
-        shifts.axhline(0, color="black", linewidth=0.5)
-        shifts.set_title(f"{SIDES[hemi]}, warps" + (f" (1 of {step} drawn)" if step > 1 else ""))
-        shifts.set_ylabel("shift to lateral [nodes]")
-        positions.set_title(f"{SIDES[hemi]}, positions")
-        _mark_positions(positions)
+        _draw_warps(shifts, positions, _shifts_of(results, hemi, groups), SIDES[hemi])
         for axis in (before, after, shifts, positions):
             mark_medial(axis, np.array([0.0, 1.0]))
     # Sides can be compared, as can both states.
     grid = axes if wide else axes.T
     for panels_alike in (grid[:, :2].ravel(), grid[:, 2], grid[:, 3]):
-        ends = np.array([axis.get_ylim() for axis in panels_alike])
-        for axis in panels_alike:
-            axis.set_ylim(ends[:, 0].min(), ends[:, 1].max())
+        style.share_limits(panels_alike)
     style.explain(figure, grid[0, 0], "mean, 2 standard errors")
     style.letter_panels(axes.flat)
     return [figure]
@@ -289,7 +308,7 @@ def draw_sections(
     places = {name: round(share * last) for share, name in _SECTIONS.items()}
     if (parts := parts_of(cohort.y)) is not None:
         named = {name: np.flatnonzero(parts == name) for name in ("tail", "body", "head")}
-        places = {name: int(np.median(own)) for name, own in named.items() if len(own)}
+        places = {name: int(np.median(counts)) for name, counts in named.items() if len(counts)}
     figure, axes = style.new_panels(len(shapes), len(places), (style.TWO_COLUMNS, 55 * len(shapes)))
     for i, (hemi, shape) in enumerate(shapes.items()):
         for j, (name, node) in enumerate(places.items()):
@@ -357,11 +376,11 @@ def draw_figures(
     for surface, analysis in analyses.items():
         yield from blocks("figures", analysis.request, cohorts[surface], analysis)
     analysis = analyses[SHEET]
-    templates = [one.template for one in analysis.registrations.values()]
+    templates = [registration.template for registration in analysis.registrations.values()]
     if templates and None not in templates:
         yield "registration", partial(draw_registration, saved)
     unregistered = {key.measure for key in analysis.unregistered}
-    for measure in (name for name in measures if name in unregistered):
+    for measure in filter(unregistered.__contains__, measures):
         yield f"{measure}_alignment", partial(draw_alignment, saved, measure)
     if shapes:
         yield "sections", partial(draw_sections, cohorts[SHEET], analysis, shapes)
@@ -369,5 +388,5 @@ def draw_figures(
         yield from list_figures(saved)
     if analysis.pairs:
         yield "roc", partial(draw_roc, saved)
-        if any(one.full.calibration.judged for *_, one in analysis.pairs):
-            yield "calibration", partial(draw_calibration, analysis)
+    if any(model.full.calibration.judged for *_, model in analysis.pairs):
+        yield "calibration", partial(draw_calibration, analysis)

@@ -5,6 +5,8 @@ No model is fitted for a figure: what a figure shows is in the tables of its fol
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from itertools import chain
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -73,16 +75,21 @@ def alignment_rows(results: GroupResults, measure: str) -> Iterator[list[Row]]:
         kind = group_maps.kind_of_test(measure, next(iter(points.values())))
         low, colors, _ = display.effect_colors(kind)
         statistics = {
-            end: {hemi: own[f"statistic{end}"].to_numpy(np.float64) for hemi, own in points.items()}
+            end: {
+                hemi: table[f"statistic{end}"].to_numpy(np.float64)
+                for hemi, table in points.items()
+            }
             for end in _STATES
         }
-        values = display.known([own for sides in statistics.values() for own in sides.values()])
+        values = display.known(
+            [values for sides in statistics.values() for values in sides.values()]
+        )
         reach = float(np.abs(values).max(initial=1.0))
         block = []
         for end, state in _STATES.items():
             survive = {
-                hemi: (own[f"significant{end}"] == True).to_numpy(bool)  # noqa: E712  (may be missing)
-                for hemi, own in points.items()
+                hemi: (table[f"significant{end}"] == True).to_numpy(bool)  # noqa: E712  (may be missing)
+                for hemi, table in points.items()
             }
             block.append(
                 Row(
@@ -137,8 +144,8 @@ def mean_rows(results: GroupResults, measure: str) -> Iterator[Row]:
         scale = _mean_scale(measure, part, change=change or difference)
         title = "mean change" if change else "mean"
         for index, (group, rows) in enumerate(part.groupby("group", sort=False)):
-            by_side = {str(hemi): own for hemi, own in rows.groupby("hemi", sort=False)}
-            counts = {hemi: int(own["n"].max()) for hemi, own in by_side.items()}
+            by_side = {str(hemi): part for hemi, part in rows.groupby("hemi", sort=False)}
+            counts = {hemi: int(part["n"].max()) for hemi, part in by_side.items()}
             number = ", ".join(f"{n} {SIDES[hemi]}" for hemi, n in counts.items())
             if len(set(counts.values())) == 1:
                 number = f"n = {max(counts.values())}"
@@ -148,7 +155,7 @@ def mean_rows(results: GroupResults, measure: str) -> Iterator[Row]:
                 title=f"{title.capitalize()}, {group} ({number})",
                 label=cells.with_brackets(f"{title},\n{cells.display_name(measure)}", unit),
                 scale=scale,
-                values={hemi: own["mean"].to_numpy(np.float64) for hemi, own in by_side.items()},
+                values={hemi: part["mean"].to_numpy(np.float64) for hemi, part in by_side.items()},
             )
     yield from _count_rows(results, measure)
 
@@ -165,8 +172,10 @@ def _count_rows(results: GroupResults, measure: str) -> Iterator[Row]:
     maps = results.table("maps")
     first = records(maps[maps["measure"] == measure].drop_duplicates("hemi"))
     points = {str(row["hemi"]): results.table(str(row["file"])) for row in first}
-    if all("y" in own and parts_of(np.unique(own["y"])) is not None for own in points.values()):
-        counts = {hemi: own["n"].to_numpy(np.float64) for hemi, own in points.items()}
+    if all(
+        "y" in table and parts_of(np.unique(table["y"])) is not None for table in points.values()
+    ):
+        counts = {hemi: table["n"].to_numpy(np.float64) for hemi, table in points.items()}
         yield Row(
             kind="count",
             index=0,
@@ -178,26 +187,25 @@ def _count_rows(results: GroupResults, measure: str) -> Iterator[Row]:
 
 
 def contrasts(
-    every_test: Tests, measure: str, like: Mapping[str, str] | None = None
+    every_test: Tests, measure: str, like: Mapping[str, str] = MappingProxyType({})
 ) -> Iterator[list[Row]]:
     """Show effect sizes and corrected p-values of each contrast of a measure.
 
     Tests of all measures share their colors; ``like`` names contrasts that
     have the colors of others.
     """
-    tests = {hemi: own[measure] for hemi, own in every_test.items() if measure in own}
+    tests = {hemi: maps[measure] for hemi, maps in every_test.items() if measure in maps}
     signed = {
-        hemi: {
-            name: group_maps.signed_logarithm(test.adjusted, test.statistic)
-            for name, test in own.items()
-        }
-        for hemi, own in tests.items()
+        (hemi, name): group_maps.signed_logarithm(test.adjusted, test.statistic)
+        for hemi, by_name in tests.items()
+        for name, test in by_name.items()
     }
-    top = display.significance_reach([one for own in signed.values() for one in own.values()])
-    for index, name in enumerate(dict.fromkeys(name for own in tests.values() for name in own)):
-        sides = {hemi: own[name] for hemi, own in tests.items() if name in own}
+    top = display.significance_reach(list(signed.values()))
+    names = dict.fromkeys(chain.from_iterable(tests.values()))
+    for index, name in enumerate(names):
+        sides = {hemi: by_name[name] for hemi, by_name in tests.items() if name in by_name}
         first = next(iter(sides.values()))
-        reach = _reach(every_test, first.kind, (like or {}).get(name, name), sides)
+        reach = _reach(every_test, first.kind, like.get(name, name), sides)
         low, colors, p_colors = display.effect_colors(first.kind)
         survive = {hemi: test.rejected for hemi, test in sides.items()}
         word = "Joint evidence" if first.kind == "z" else "Effect"
@@ -217,7 +225,7 @@ def contrasts(
                 title=f"Significant: {_counts(sides)}",
                 label="corrected p" + (", signed" if low else ""),
                 scale={"cmap": p_colors, "vmin": low * top, "vmax": top},
-                values={hemi: signed[hemi][name] for hemi in sides},
+                values={hemi: signed[hemi, name] for hemi in sides},
                 survive=survive,
                 level=first.alpha,
             ),
@@ -227,8 +235,13 @@ def contrasts(
 def _reach(every_test: Tests, kind: str, name: str, sides: Mapping[str, ContrastMap]) -> float:
     """Return the effect size at the end of the colors of a contrast."""
     if kind == "z":
-        return max(_LEAST_Z, *(float(np.nanmax(one.effect)) for one in sides.values()))
-    tests = [own[name] for side in every_test.values() for own in side.values() if name in own]
+        return max(_LEAST_Z, *(float(np.nanmax(test.effect)) for test in sides.values()))
+    tests = [
+        by_name[name]
+        for side in every_test.values()
+        for by_name in side.values()
+        if name in by_name
+    ]
     return display.effect_reach(
         [display.Effects(t.kind, t.effect, t.statistic, t.df) for t in tests if t.kind == kind]
     )

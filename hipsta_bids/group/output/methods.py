@@ -47,6 +47,19 @@ PROCEDURES: Mapping[str, str] = {
 }
 
 
+def _sample_notes(demographics: pd.DataFrame, ratings: Mapping[str, int] | None) -> str:
+    text = ""
+    if tests := escaped(joined(demographic_tests(demographics))):
+        text = f" Demographics of the groups were compared by {tests}."
+    if ratings is not None:
+        counts = ", ".join(f"{n} {rating}" for rating, n in ratings.items())
+        text += (
+            f" Hemispheres were rated on their report pages ({counts}); hemispheres rated exclude"
+            " were excluded."
+        )
+    return text
+
+
 def methods_text(
     cohort: Cohort,
     analysis: Analysis,
@@ -62,14 +75,7 @@ def methods_text(
     """Return methods and results, as a paper prints them."""
     cite = Citations()
     paragraphs = [_sample(cohort, analysis, n_out, cite, surfaces)]
-    if tests := escaped(joined(demographic_tests(demographics))):
-        paragraphs[0] += f" Demographics of the groups were compared by {tests}."
-    if ratings is not None:
-        counts = ", ".join(f"{n} {rating}" for rating, n in ratings.items())
-        paragraphs[0] += (
-            f" Hemispheres were rated on their report pages ({counts}); hemispheres rated exclude"
-            " were excluded."
-        )
+    paragraphs[0] += _sample_notes(demographics, ratings)
     aligned = [_registration(analysis, settings, cite)] if analysis.registrations else []
     aligned += sentences
     if aligned:
@@ -119,7 +125,9 @@ def _sample(
         counts = Counter(members.dropna().astype(str))
         text += f" ({', '.join(f'{counts[g]} {escaped(g)}' for g in analysis.groups.levels)})"
     sheets = [
-        f"{len(one.used)} {_SIDES[hemi]}" for hemi, one in analysis.fitted.items() if hemi in _SIDES
+        f"{len(side.used)} {_SIDES[hemi]}"
+        for hemi, side in analysis.fitted.items()
+        if hemi in _SIDES
     ]
     text += f", with {joined(sheets)} sheets" if sheets else ""
     excluded = "1 hemisphere or visit was" if n_out == 1 else f"{n_out} hemispheres or visits were"
@@ -130,15 +138,15 @@ def _sample(
 def _registration(analysis: Analysis, settings: GroupSettings, cite: Callable[[str], str]) -> str:
     rules = settings.registration
     if rules.align == "none":
-        fewest = min(len(one.warps) for one in analysis.registrations.values())
+        fewest = min(len(registration.warps) for registration in analysis.registrations.values())
         reason = f", since a template needs {rules.min_subjects} sheets per hemisphere"
         return f"Maps were not registered to each other{reason * (fewest < rules.min_subjects)}."
     shares = "; ".join(
-        f"{one.explained_before:.0%} before and {one.explained_after:.0%} after registration"
+        f"{fit.explained_before:.0%} before and {fit.explained_after:.0%} after registration"
         f" ({_SIDES[hemi]})"
-        for hemi, one in analysis.registrations.items()
+        for hemi, fit in analysis.registrations.items()
     )
-    extreme = sum(int(one.extreme.sum()) for one in analysis.registrations.values())
+    extreme = sum(int(r.extreme.sum()) for r in analysis.registrations.values())
     standardization = (
         " Each profile was standardized to mean 0 and standard deviation 1."
         if rules.standardize
@@ -146,10 +154,10 @@ def _registration(analysis: Analysis, settings: GroupSettings, cite: Callable[[s
     )
     groups = joined(
         [
-            f"{one.difference['difference']:.2f} nodes ({_SIDES[hemi]};"
-            f" p = {one.difference['difference_p']:.2g})"
-            for hemi, one in analysis.registrations.items()
-            if one.difference
+            f"{registration.difference['difference']:.2f} nodes ({_SIDES[hemi]};"
+            f" p = {registration.difference['difference_p']:.2g})"
+            for hemi, registration in analysis.registrations.items()
+            if registration.difference
         ]
     )
     moved = (
@@ -170,7 +178,7 @@ def _registration(analysis: Analysis, settings: GroupSettings, cite: Callable[[s
 
 def _rims(analysis: Analysis) -> str:
     """Return how points were handled that some participants lack."""
-    fits = [fit for one in analysis.fitted.values() for fit in one.fits.values()]
+    fits = [fit for side in analysis.fitted.values() for fit in side.fits.values()]
     n = np.concatenate([fit.n[np.isfinite(fit.tests[0].p)] for fit in fits])
     span = f" ({n.min()} to {n.max()} per point)" if len(n) else ""
     return (
@@ -210,15 +218,24 @@ def _models(analysis: Analysis, settings: GroupSettings, cite: Callable[[str], s
     if analysis.comparison.longitudinal:
         text += _visits(analysis, settings, cite)
     text += _tests(contrasts)
-    if "Satterthwaite" in text and any(one.n_rows > 1 for one in contrasts):
+    if "Satterthwaite" in text and any(contrast.n_rows > 1 for contrast in contrasts):
         text += f" Contrasts of several rows were tested by F {cite('fai')}."
     text += _slopes(analysis, cite) if analysis.comparison.longitudinal else ""
     text += f" {_correction(settings.multiplicity, cite, analysis)}"
-    kinds = [f"Cohen's d ({d})"] * any(one.n_rows == 1 for one in contrasts)
-    kinds += ["partial eta squared"] * any(one.n_rows > 1 for one in contrasts)
+    text += _effect_sizes(analysis, settings, d, cite)
+    return f"{text}{_nonlinear(analysis, settings)}"
+
+
+def _effect_sizes(
+    analysis: Analysis, settings: GroupSettings, d: str, cite: Callable[[str], str]
+) -> str:
+    """Return the definitions of effect sizes, and how summary measures were tested."""
+    contrasts = analysis.design.contrasts
+    kinds = [f"Cohen's d ({d})"] * any(contrast.n_rows == 1 for contrast in contrasts)
+    kinds += ["partial eta squared"] * any(contrast.n_rows > 1 for contrast in contrasts)
     adjusted = any(formula != analysis.model.formula for _, formula in analysis.measures)
     sizes = f"; {SIZES} were also adjusted for intracranial volume" if adjusted else ""
-    text += (
+    text = (
         f" Effect sizes are {' or '.join(kinds)}, with {settings.glm.confidence:.0%} confidence"
         f" limits from non-central distributions {cite('steiger')}."
     )
@@ -230,14 +247,14 @@ def _models(analysis: Analysis, settings: GroupSettings, cite: Callable[[str], s
             " rate was controlled over all measures, sides and models of a contrast (families of"
             f" tests: {n_families})."
         )
-    return f"{text}{_nonlinear(analysis, settings)}"
+    return text
 
 
 def _tests(contrasts: Sequence[Contrast]) -> str:
     """Return the names of contrasts, and the alternatives of one-sided tests."""
     names = escaped(joined([contrast.name for contrast in contrasts]))
     text = f" Contrasts were {names}." if len(contrasts) > 1 else f" The contrast was {names}."
-    if sided := [f"{escaped(one.name)} ({one.hypothesis})" for one in contrasts if one.side]:
+    if sided := [f"{escaped(c.name)} ({c.hypothesis})" for c in contrasts if c.side]:
         text += f" Tests were one-sided, with this alternative and margin: {joined(sided)}."
     return text
 
@@ -251,8 +268,7 @@ def _visits(analysis: Analysis, settings: GroupSettings, cite: Callable[[str], s
             f" It had random {effects} of participants, and was estimated by restricted maximum"
             f" likelihood. Degrees of freedom were Satterthwaite's {cite('mixed')}."
         )
-    kind, *sessions = analysis.comparison.endpoint or ("",)
-    first = escaped(sessions[0] if sessions else "")
+    kind, first, *_ = map(escaped, (*(analysis.comparison.endpoint or ()), "", ""))
     if kind == "ancova":
         text = f" The value at {first} was a covariate at each point (analysis of covariance)."
     else:
@@ -274,14 +290,14 @@ def _visits(analysis: Analysis, settings: GroupSettings, cite: Callable[[str], s
         )
     elif kind != "ancova":
         text += f" Degrees of freedom were Satterthwaite's {cite('mixed')}."
-    fits = [fit for one in analysis.fitted.values() for fit in one.fits.values()]
+    fits = [fit for side in analysis.fitted.values() for fit in side.fits.values()]
     n_missing = sum(int((np.isnan(fit.sigma) & (fit.n > 0)).sum()) for fit in fits)
     return f"{text} The model could not be fitted at {n_missing} points." if n_missing else text
 
 
 def _slopes(analysis: Analysis, cite: Callable[[str], str]) -> str:
     """Return at how many points slopes vary, and at how many they were omitted."""
-    fits = [fit for one in analysis.fitted.values() for fit in one.fits.values()]
+    fits = [fit for side in analysis.fitted.values() for fit in side.fits.values()]
     p = np.concatenate([fit.slopes_p for fit in fits if fit.slopes_p is not None] or [np.empty(0)])
     tested = int(np.isfinite(p).sum())
     if not tested:
@@ -302,7 +318,7 @@ def _slopes(analysis: Analysis, cite: Callable[[str], str]) -> str:
 
 def _nonlinear(analysis: Analysis, settings: GroupSettings) -> str:
     """Return how age was modeled, and in how many summary measures it was not linear."""
-    names = [one.name for one in analysis.design.contrasts if one.name.endswith(" nonlinear")]
+    names = [c.name for c in analysis.design.contrasts if c.name.endswith(" nonlinear")]
     if not names or settings.model.age == "linear":
         return ""
     curve = "its square" if settings.model.age == "quadratic" else "a natural cubic spline"
@@ -339,7 +355,7 @@ def _correction(rules: MultiplicitySettings, cite: Callable[[str], str], analysi
         exchanged = exchange_text(design.matrix, design.contrasts, visits, rules.visits)
         text += f" {escaped(exchanged)} {cite('repeated')}."
     elif analysis.comparison.asymmetry or not all(
-        spans_constant(design.matrix, one) for one in design.contrasts
+        spans_constant(design.matrix, contrast) for contrast in design.contrasts
     ):
         text += " For means, the signs of residuals were flipped instead."
     if rules.method == "permutation-tfce":
@@ -357,9 +373,7 @@ def _families(rules: MultiplicitySettings, maps: Iterable[inference.MapKey]) -> 
 
 
 def discovery_text(
-    rules: MultiplicitySettings,
-    cite: Callable[[str], str],
-    maps: Iterable[inference.MapKey],
+    rules: MultiplicitySettings, cite: Callable[[str], str], maps: Iterable[inference.MapKey]
 ) -> str:
     """Return how the false discovery rate was controlled."""
     return (
@@ -410,14 +424,14 @@ def _asymmetry(analysis: Analysis, settings: GroupSettings, cite: Citations) -> 
 def _classification(analysis: Analysis, settings: GroupSettings, cite: Citations) -> str:
     rules, base = settings.classification, escaped(" + ".join(settings.classification.base))
     delong = cite("delong")
-    separated = sum(one.columns["separated"] for *_, one in analysis.pairs)
+    separated = sum(models.columns["separated"] for *_, models in analysis.pairs)
     by_firth = (
         f" In {separated} comparisons a model separated the groups completely; both models were"
         f" then fitted by Firth's method {cite('firth')}."
         if separated
         else ""
     )
-    is_judged = any(one.full.calibration.judged for *_, one in analysis.pairs)
+    is_judged = any(models.full.calibration.judged for *_, models in analysis.pairs)
     calibration = (
         f" Calibration was assessed if both groups had {rules.least_calibrated} members or more"
         f" {cite('snell')}."

@@ -4,7 +4,7 @@ A row of panels is one quantity of all sides. Surfaces are those of ``views``; h
 colors, and how maps lie, is that of the pages (``reports.display``).
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
@@ -16,7 +16,7 @@ from hipsta_bids.group.output import style
 from hipsta_bids.group.output.color_bar import Scale, draw_bar
 from hipsta_bids.group.output.ground import Ground, beyond, middles_of
 from hipsta_bids.group.output.style import DOTS_PER_INCH, LETTER, MM, SMALL, TITLE
-from hipsta_bids.group.output.views import View, across, draw_mesh, laid_out, look
+from hipsta_bids.group.output.views import View, across, draw_mesh, flat_layout, look
 from hipsta_bids.reports.display import X_ENDS, Y_ENDS
 from hipsta_bids.reports.group_maps import map_id
 from hipsta_bids.reports.maps import new_figure
@@ -149,7 +149,7 @@ def draw_view(
     colors[~np.isfinite(pixels)] = _UNKNOWN
     if survive is not None:
         inside = view.region(survive.ravel().astype(np.int64), 1)
-        borders = borders | view.border(inside, style.FOUND_LINE * point)
+        borders = borders | view.border(inside, style.SIGNIFICANT_LINE * point)
     return view.picture(colors, borders)
 
 
@@ -166,6 +166,27 @@ class _Column:
     """What lies to the left and to the right."""
     seen: tuple[View, Bool] | None = None
     """Of a surface, with the borders of subfields."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Viewer:
+    """Draws surfaces with the borders of subfields, each view once."""
+
+    views: Views
+    scale: float
+    size: tuple[int, int]
+    dpi: float
+
+    def look(self, mesh: Mesh, axes: Float, ground: Ground) -> tuple[View, Bool]:
+        """Draw a surface from the direction of ``axes``."""
+        options = axes.tobytes(), self.size, self.scale, self.dpi
+        key = *options, mesh.points.tobytes(), ground.subfield.tobytes()
+        if key not in self.views:
+            share = self.dpi / DOTS_PER_INCH
+            size = round(self.size[0] * share), round(self.size[1] * share)
+            view = look(mesh, axes, self.scale * share, size)
+            self.views[key] = view, _borders(view, ground, self.dpi / 72)
+        return self.views[key]
 
 
 # Places on figures are pixels from the upper left corner.
@@ -190,15 +211,46 @@ def _axes(figure: "Figure", left: float, top: float, width: float, height: float
     return axes
 
 
+def _surfaces(
+    sides: Mapping[str, Ground],
+) -> Iterator[tuple[str, tuple[Mesh, Mapping[str, Float]]]]:
+    for hemi, ground in sides.items():
+        if (mesh := ground.folded) is not None:
+            is_sheet = ground.mesh is None
+            yield hemi, (mesh, _axes_of(mesh, ground.subfield.shape, hemi[0], sheet=is_sheet))
+
+
+def _unfolded_column(hemi: str, ground: Ground, left: float, width: float) -> _Column:
+    ends = X_ENDS if ground.mesh is None else flat_layout(ground.mesh)[1]
+    box = round(left), round(width)
+    return _Column(hemi=hemi, ground=ground, box=box, title="unfolded", ends=ends)
+
+
+def _view_columns(
+    hemi: str,
+    ground: Ground,
+    surface: tuple[Mesh, Mapping[str, Float]],
+    left: float,
+    viewer: _Viewer,
+) -> Iterator[_Column]:
+    """Place the views of a surface side by side, from ``left``, pixels."""
+    mesh, axes_of = surface
+    medial, lateral = (f"{word[:3]}." for word in X_ENDS)
+    for title, axes in axes_of.items():
+        # The right side's lateral is to the right in the scanner, and the left one's is not.
+        turned = (axes[0, 0] > 0) != (hemi == "R")
+        ends = (lateral, medial) if turned else (medial, lateral)
+        seen = viewer.look(mesh, axes, ground)
+        box = round(left), viewer.size[1]
+        yield _Column(hemi=hemi, ground=ground, box=box, title=title, ends=ends, seen=seen)
+        left += viewer.size[1] + _GAP * MM
+
+
 def _draw_rows(
     sides: Mapping[str, Ground], rows: Sequence[Row], views: Views, width: float | None, dpi: float
 ) -> "Figure":
     """Draw rows of panels; all boxes are whole pixels, so that pictures are not resampled."""
-    surfaces = {
-        hemi: (mesh, _axes_of(mesh, ground.subfield.shape, hemi[0], sheet=ground.mesh is None))
-        for hemi, ground in sides.items()
-        if (mesh := ground.folded) is not None
-    }
+    surfaces = dict(_surfaces(sides))
     page_width = width or (style.TWO_COLUMNS if len(sides) > 1 and surfaces else style.ONE_COLUMN)
     space = (page_width - _LEFT - _RIGHT - _BETWEEN * (len(sides) - 1)) / len(sides)
     n_flat = int(any(ground.unfolded for ground in sides.values()))
@@ -209,39 +261,22 @@ def _draw_rows(
     if n_flat and _VIEW_WIDTH * widest(2) < _LEAST_VIEW:
         surfaces = {}
     unit = widest(2 * bool(surfaces))
-    upright = _UPRIGHT if all(parts_of(one.y) is None for one in sides.values()) else _LONG
+    upright = _UPRIGHT if all(parts_of(ground.y) is None for ground in sides.values()) else _LONG
     feet = _feet_height(sides, unit)
     tallest = (_TALLEST - _TOP - feet) / len(rows) - _HEAD
     unit = min(unit, max(tallest, _LEAST_VIEW / _VIEW_WIDTH))
     height = round(min(unit * upright, tallest) * MM)
     size = height, round(_VIEW_WIDTH * unit * MM)
     scale = min((_fitting(*surface, size) for surface in surfaces.values()), default=1.0)
+    viewer = _Viewer(views=views, scale=scale, size=size, dpi=dpi)
     columns: list[_Column] = []
     for number, (hemi, ground) in enumerate(sides.items()):
         left = (_LEFT + number * (space + _BETWEEN)) * MM
         if ground.unfolded:
-            ends = X_ENDS if ground.mesh is None else laid_out(ground.mesh)[1]
-            box = round(left), round(unit * MM)
-            columns.append(_Column(hemi=hemi, ground=ground, box=box, title="unfolded", ends=ends))
+            columns.append(_unfolded_column(hemi, ground, left, unit * MM))
             left += (unit + _GAP) * MM
-        for title, axes in surfaces[hemi][1].items() if hemi in surfaces else ():
-            mesh = surfaces[hemi][0]
-            key = title, size, scale, dpi, mesh.points.tobytes(), ground.subfield.tobytes()
-            if key not in views:
-                share = dpi / DOTS_PER_INCH
-                view = look(
-                    mesh, axes, scale * share, (round(size[0] * share), round(size[1] * share))
-                )
-                views[key] = view, _borders(view, ground, dpi / 72)
-            # The right side's lateral is to the right in the scanner, and the left one's is not.
-            turned = (axes[0, 0] > 0) != (hemi == "R")
-            medial, lateral = (f"{word[:3]}." for word in X_ENDS)
-            ends = (lateral, medial) if turned else (medial, lateral)
-            box = round(left), size[1]
-            columns.append(
-                _Column(hemi=hemi, ground=ground, box=box, title=title, ends=ends, seen=views[key])
-            )
-            left += size[1] + _GAP * MM
+        if hemi in surfaces:
+            columns += _view_columns(hemi, ground, surfaces[hemi], left, viewer)
     pixels = (
         round(page_width * MM),
         round((_TOP + feet) * MM) + len(rows) * (height + _HEAD_PIXELS),
@@ -330,20 +365,23 @@ def _write_feet(figure: "Figure", columns: Sequence[_Column], bottom: int, scale
             line += feet * MM
         ends = column.ends
         if column.seen is None and width < _LEAST_ENDS * MM:
-            ends = tuple(f"{word[:3]}." for word in ends if word)
+            ends = tuple(word[:3] + "." for word in filter(None, ends))
         for x, end, side in zip((left, left + width), ends, ("left", "right"), strict=False):
             _text(figure, x, line, end, ha=side)
     if views := [column for column in columns if column.seen is not None]:
-        from matplotlib.lines import Line2D  # noqa: PLC0415  (slow to load)
+        _draw_ruler(figure, views[-1].box, bottom + (2.4 + max(feet, style.LINE)) * MM, scale)
 
-        left, wide = views[-1].box
-        lengths = [n for n in _RULERS if n * scale <= wide * _HALF]
-        length = (lengths or [_RULERS[-1]])[0]
-        width, height = _size(figure)
-        line_ends = [(left + wide - n * scale) / width for n in (length, 0)]
-        y = bottom + (2.4 + max(feet, style.LINE)) * MM
-        figure.add_artist(Line2D(line_ends, [1 - y / height] * 2, color="black", linewidth=1.2))
-        _text(figure, line_ends[0] * width - MM, y, f"{length:g} mm", ha="right")
+
+def _draw_ruler(figure: "Figure", box: tuple[int, int], y: float, scale: float) -> None:
+    """Draw a ruler that ends at the right of a box and takes at most half of it."""
+    from matplotlib.lines import Line2D  # noqa: PLC0415  (slow to load)
+
+    left, wide = box
+    length = next((n for n in _RULERS if n * scale <= wide * _HALF), _RULERS[-1])
+    width, height = _size(figure)
+    line_ends = [(left + wide - n * scale) / width for n in (length, 0)]
+    figure.add_artist(Line2D(line_ends, [1 - y / height] * 2, color="black", linewidth=1.2))
+    _text(figure, line_ends[0] * width - MM, y, f"{length:g} mm", ha="right")
 
 
 def _write_subfields(figure: "Figure", column: _Column, bottom: int) -> None:
@@ -447,11 +485,11 @@ def _enclose(axes: "Axes", ground: Ground, survive: Bool) -> None:
     """Draw a line round the points that survive."""
     if not survive.any():
         return
-    line: Any = {"levels": [_HALF], "colors": "black", "linewidths": style.FOUND_LINE}
+    line: Any = {"levels": [_HALF], "colors": "black", "linewidths": style.SIGNIFICANT_LINE}
     if ground.mesh is not None:
         from matplotlib.tri import Triangulation  # noqa: PLC0415  (slow to load)
 
-        plane = laid_out(ground.mesh)[0]
+        plane = flat_layout(ground.mesh)[0]
         grid = Triangulation(plane[:, 0], plane[:, 1], ground.mesh.triangles)
         axes.tricontour(grid, survive.ravel().astype(np.float64), **line)
         return

@@ -49,9 +49,7 @@ def write_maps(
         if suffix != "_harmonized":
             fields.append(pa.field(f"subfield{suffix}", WORD, metadata={"description": text}))
         fields += [_number(f"{name}{suffix}", cohorts[SHEET], name, text) for name in measures]
-    fields += [
-        _number(name, one, name, "as given") for name, one in cohorts.items() if name != SHEET
-    ]
+    fields += [_number(name, c, name, "as given") for name, c in cohorts.items() if name != SHEET]
     about = {
         "description": "one row per visit, hemisphere and point; x medial to lateral, "
         "y posterior to anterior; empty without the measure"
@@ -70,7 +68,7 @@ def write_blocks(path: Path, schema: pa.Schema, rows: Iterable[Columns]) -> None
 
     Measured values hardly repeat: a dictionary of them takes longer than it saves.
     """
-    repeated = [one.name for one in schema if one.name in "xy" or not pa.types.is_float32(one.type)]
+    repeated = [c.name for c in schema if c.name in "xy" or not pa.types.is_float32(c.type)]
     try:
         with pq.ParquetWriter(path, schema, compression="zstd", use_dictionary=repeated) as writer:
             for columns in rows:
@@ -103,8 +101,8 @@ def _map_blocks(
                 if surface == SHEET:
                     for suffix, state in zip(_SUFFIXES, states, strict=False):
                         columns[f"subfield{suffix}"] = _subfields(state[hemi], part)
-                        own_maps = some_sheets(state[hemi].maps, part)
-                        columns |= value_columns(own_maps, slice(None), suffix)
+                        sheet_maps = some_sheets(state[hemi].maps, part)
+                        columns |= value_columns(sheet_maps, slice(None), suffix)
                 else:
                     columns |= value_columns(side.maps, part)
                 yield columns

@@ -1,4 +1,4 @@
-"""What an analysis found: the values that tables, figures and pages are made of."""
+"""Results of an analysis: the values that tables, figures and pages are made of."""
 
 import hashlib
 import json
@@ -30,7 +30,7 @@ ALL = "all"
 
 def templates_of(registrations: Mapping[str, alignment.Registration]) -> dict[str, Any] | None:
     """Write the templates of registration for ``template.json``; ``None`` without registration."""
-    templates = {hemi: one.template for hemi, one in registrations.items() if one.template}
+    templates = {hemi: r.template for hemi, r in registrations.items() if r.template}
     return templates_to_json(templates) if templates else None
 
 

@@ -1,4 +1,4 @@
-"""Average shapes: sheets of many participants laid upon each other without scaling."""
+"""Average shapes: sheets of many participants averaged without scaling."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -39,7 +39,7 @@ class AverageShape:
     mean: Float
     """(3, x, y, 3) interior, middle and exterior, of all; axes are those of the scanner."""
     by_group: Mapping[str, Float]
-    """The same of each group, laid upon ``mean``."""
+    """The same of each group, aligned to ``mean``."""
     counts: Mapping[str, int]
     """Sheets by group."""
 
@@ -77,8 +77,10 @@ def average_shape(
     moved = (moved @ np.swapaxes(rotations, 1, 2) + center).reshape(registered.shape)
     return AverageShape(
         mean=mean_of_known(moved, 0),
-        by_group={name: mean_of_known(moved[own], 0) for name, own in members.items() if own.any()},
-        counts={name: int(own.sum()) for name, own in members.items() if own.any()},
+        by_group={
+            name: mean_of_known(moved[rows], 0) for name, rows in members.items() if rows.any()
+        },
+        counts={name: int(rows.sum()) for name, rows in members.items() if rows.any()},
     )
 
 
@@ -134,7 +136,9 @@ def average_shapes(
 ) -> dict[str, AverageShape]:
     """Average the surfaces of each hemisphere, of the first visit of each participant."""
     names = [(record.result.name, record.result) for record in records]
-    result_of = {(visit_name(one.subject, one.session), one.hemi): result for one, result in names}
+    result_of = {
+        (visit_name(name.subject, name.session), name.hemi): result for name, result in names
+    }
     shapes = {}
     for hemi, side in analysis.registered.items() if records else ():
         visits = cohort.table.iloc[side.rows]

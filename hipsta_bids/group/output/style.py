@@ -24,7 +24,7 @@ MM, POINT = DOTS_PER_INCH / 25.4, DOTS_PER_INCH / 72  # pixels
 LETTER, TITLE, SMALL = 9.0, 8.0, 7.0
 LINE = 3.2  # mm, of small type
 LETTER_WIDTH = 0.6  # over the size of type
-FOUND_LINE = 1.3  # points, round what survives
+SIGNIFICANT_LINE = 1.3  # points, round what survives
 ELLIPSIS = "\N{HORIZONTAL ELLIPSIS}"
 
 _STYLE: Any = {
@@ -79,7 +79,7 @@ Drawing = Callable[[], "list[Figure]"]
 @contextmanager
 def style() -> Iterator[None]:
     """Have matplotlib draw as all figures are."""
-    new_figure((1.0, 1.0), None)  # loads the library with settings of its own
+    new_figure((1.0, 1.0), None)  # loads the library with separate settings
     from matplotlib import rc_context  # noqa: PLC0415  (slow to load)
 
     with rc_context(_STYLE):
@@ -121,8 +121,15 @@ def explain(figure: "Figure", axis: "Axes", title: str | None = None) -> None:
     legend.set_title(title or "")
 
 
+def share_limits(axes: "Sequence[Axes]") -> None:
+    """Give panels the same vertical range, which has all of theirs."""
+    limits = np.array([axis.get_ylim() for axis in axes])
+    for axis in axes:
+        axis.set_ylim(limits[:, 0].min(), limits[:, 1].max())
+
+
 def letter_panels(axes: "Sequence[Axes]") -> None:
-    """Put letters on panels, beside their titles."""
+    """Put letters on panels, next to their titles."""
     for axis, letter in zip(axes, cycle(LETTERS), strict=False):
         axis.set_title(letter, loc="left", fontsize=LETTER, weight="bold")
 

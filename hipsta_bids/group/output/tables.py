@@ -66,7 +66,7 @@ def result_tables(
     if analysis.pairs:
         yield "classification", _classification(analysis, settings)
         yield "roc", _stacked(_curves(analysis, _roc))
-        if any(one.full.calibration.judged for *_, one in analysis.pairs):
+        if any(models.full.calibration.judged for *_, models in analysis.pairs):
             yield "calibration", _stacked(_curves(analysis, _calibration))
     yield from _statistics(cohort, analysis)
 
@@ -264,8 +264,8 @@ def _registration_tables(cohort: Cohort, analysis: results.Analysis) -> Iterator
     if analysis.groups is not None:
         shifts = (
             {"hemi": hemi, "group": group, **shift}
-            for hemi, one in analysis.registrations.items()
-            for group, shift in one.by_group.items()
+            for hemi, registration in analysis.registrations.items()
+            for group, shift in registration.by_group.items()
         )
         yield "shifts", _stacked(shifts)
 
@@ -277,14 +277,14 @@ def registration_tables(
     rows = [
         {
             "hemi": hemi,
-            "n": len(one.warps),
-            "explained_before": one.explained_before,
-            "explained_after": one.explained_after,
-            "iterations": one.iterations,
-            "converged": one.converged,
-            **one.difference,
+            "n": len(registration.warps),
+            "explained_before": registration.explained_before,
+            "explained_after": registration.explained_after,
+            "iterations": registration.iterations,
+            "converged": registration.converged,
+            **registration.difference,
         }
-        for hemi, one in registrations.items()
+        for hemi, registration in registrations.items()
     ]
     yield "registration", pd.DataFrame(rows)
     yield "warps", _stacked(_warps(cohort, registrations))
@@ -393,9 +393,9 @@ class JointMap:
         """The test of each map by itself, by its title."""
         return {
             title: next(
-                test for test in one.fits[measure].tests if test.contrast.name == self.key.contrast
+                test for test in side.fits[measure].tests if test.contrast.name == self.key.contrast
             )
-            for title, (one, measure) in self.parts.items()
+            for title, (side, measure) in self.parts.items()
         }
 
 

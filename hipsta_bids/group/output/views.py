@@ -133,13 +133,13 @@ def look(mesh: Mesh, axes: Float, scale: float, shape: tuple[int, int]) -> View:
     nearest = np.full(rows * columns, -np.inf)
     triangle = np.full(rows * columns, -1, dtype=np.int64)
     weights = np.zeros((rows * columns, 3))
-    for numbers, pixels, own in _covered(flat, rows, columns):
-        depth = np.einsum("pc,pc->p", projected[mesh.triangles[numbers], 2], own)
+    for numbers, pixels, corners in _covered(flat, rows, columns):
+        depth = np.einsum("pc,pc->p", projected[mesh.triangles[numbers], 2], corners)
         # Of those given to one pixel the last stays: the nearest.
         order = np.argsort(depth, kind="stable")
         order = order[depth[order] > nearest[pixels[order]]]
         at = pixels[order]
-        nearest[at], triangle[at], weights[at] = depth[order], numbers[order], own[order]
+        nearest[at], triangle[at], weights[at] = depth[order], numbers[order], corners[order]
     weights = weights[triangle >= 0]
     normals = (_normals(mesh) @ axes.T)[mesh.triangles[triangle[triangle >= 0]]]
     depths = nearest.reshape(rows, columns) / (scale * _FINER)
@@ -163,10 +163,10 @@ def _covered(flat: Float, rows: int, columns: int) -> Iterator[tuple[Int, Int, F
     counts[area == 0] = 0
     parts = np.cumsum(counts) // _CHUNK
     for part in np.unique(parts):
-        own = np.flatnonzero((parts == part) & (counts > 0))
-        numbers = np.repeat(own, counts[own])
+        corners = np.flatnonzero((parts == part) & (counts > 0))
+        numbers = np.repeat(corners, counts[corners])
         steps = np.arange(len(numbers)) - np.repeat(
-            np.cumsum(counts[own]) - counts[own], counts[own]
+            np.cumsum(counts[corners]) - counts[corners], counts[corners]
         )
         j = low[numbers, 0] + steps % spans[numbers, 0]
         i = low[numbers, 1] + steps // spans[numbers, 0]
@@ -201,7 +201,7 @@ def _light(normals: Float) -> Float:
 
 
 def _outline(depth: Float, jump: float) -> Bool:
-    """Pixels of the surface beside the background, or in front of another fold."""
+    """Pixels of the surface next to the background, or in front of another fold."""
     line = np.zeros(depth.shape, dtype=bool)
     padded = np.pad(np.maximum(depth, -_FAR), 1, constant_values=-_FAR)
     rows, columns = depth.shape
@@ -222,8 +222,8 @@ def _thick(line: Bool, width: float) -> Bool:
 
 
 def draw_mesh(axes: "Axes", mesh: Mesh, values: Float, scale: Mapping[str, Any]) -> None:
-    """Draw a map on a flat surface, in its own coordinates."""
-    plane, _, name = laid_out(mesh)
+    """Draw a map on a flat surface, in its coordinates."""
+    plane, _, name = flat_layout(mesh)
     finite = np.isfinite(values.ravel()[mesh.triangles]).all(axis=1)
     axes.set_aspect("equal")
     axes.set_ylabel(name, labelpad=2)
@@ -244,7 +244,7 @@ def draw_mesh(axes: "Axes", mesh: Mesh, values: Float, scale: Mapping[str, Any])
     axes.set_ylim(bottom, top)
 
 
-def laid_out(mesh: Mesh) -> tuple[Float, tuple[str, str], str]:
+def flat_layout(mesh: Mesh) -> tuple[Float, tuple[str, str], str]:
     """Positions of a flat surface in the plane, words at its lower ends, and the upright axis.
 
     HippUnfold's surfaces lie as sheets do, the posterior end at the bottom. Others have their

@@ -247,17 +247,15 @@ def _write_surfaces(folder: Path, cohort: Cohort, analysis: results.Analysis) ->
 _Stats = dict[str, Float]
 
 
-def stats_of(
-    tested: Iterable[tuple[MapKey, PointTest, Discoveries]],
-) -> dict[MapKey, _Stats]:
+def stats_of(tested: Iterable[tuple[MapKey, PointTest, Discoveries]]) -> dict[MapKey, _Stats]:
     """Collect statistics, effect sizes and corrected p-values."""
     return {
         key: {
             test.kind: test.statistic,
             **({"d": test.cohen_d} if test.kind == "t" else {"eta2": test.eta_squared}),
-            "pcorrected": found.adjusted,
+            "pcorrected": discoveries.adjusted,
         }
-        for key, test, found in tested
+        for key, test, discoveries in tested
     }
 
 
@@ -316,7 +314,7 @@ def write_stats(folder: Path, maps: Mapping[MapKey, _Stats], about: _About | Non
             grouped.setdefault(name, {})[key.hemi] = stats
     for name, sides in grouped.items():
         names = list(next(iter(sides.values())))
-        stacked = {hemi: np.stack([own[stat] for stat in names]) for hemi, own in sides.items()}
+        stacked = {hemi: np.stack([v[stat] for stat in names]) for hemi, v in sides.items()}
         files.write_bytes(folder / f"{name}.dscalar.nii", gifti.cifti_bytes(stacked, names))
 
 

@@ -34,43 +34,61 @@ def with_mixes(
     ``rows`` are visits or, of pairs of sessions, participants; without ``terms`` they do not count.
     ``source`` names a file of norms or effects of sites, and the segmentations that it rests on.
     """
-    table, sides, pair = study.cohort.table, study.cohort.sides, study.options.comparison.pair
-    records = ((record.result.name, record.provenance) for record in study.collection.records)
-    origins = {(visit_name(n.subject, n.session), n.hemi): origin for n, origin in records}
-    places = [(visit, hemi) for hemi, side in sides.items() for visit in table.index[side.rows]]
-    entries = [(*place, *origins[place]) for place in places if place in origins]
-    frame = pd.DataFrame(entries, columns=["visit", "side", *PROVENANCE])
-    frame = frame.join(table[[PARTICIPANT, SESSION]], on="visit")
+    frame, pair = _origins(study), study.options.comparison.pair
     key = PARTICIPANT if pair else "visit"
     is_used = frame.duplicated([PARTICIPANT, "side"], keep=False) | (pair is None)
     complete = pd.DataFrame({t: typed(rows[t]) for t in terms if t in rows}, rows.index).dropna()
     frame = frame[is_used & frame[key].isin(complete.index)]
     frame = frame.assign(voxel_size=frame["voxel_size"].map(_sizes(Counter(frame["voxel_size"]))))
-    mixed = {f: f"{f}: {counts_text(n)}" for f in PROVENANCE if len(n := Counter(frame[f])) > 1}
-    labels = {field: sorted(set(frame[field])) for field in PROVENANCE}
-    for field, expected in source[1].items():
-        present = labels.get(field, [])
-        sizes = _sizes(Counter({**dict.fromkeys(present, 1), **dict.fromkeys(expected, 2)}))
-        if set(map(sizes.get, present) if field == "voxel_size" else present) - set(expected):
-            text = mixed.get(field, f"{field}: {', '.join(present)}")
-            mixed[field] = f"{text}, but {', '.join(expected)} in {source[0]}"
-        labels[field] = sorted({*present, *expected})
+    mixed, labels = _mixed(frame, *source)
     if refused := [field for field in mixed if field not in study.settings.design.mixed]:
         raise InputError(
-            f"hemispheres of one analysis differ in {'; '.join(mixed[one] for one in refused)};"
+            f"hemispheres of one analysis differ in {'; '.join(map(mixed.__getitem__, refused))};"
             f" segment all alike, exclude some, or allow it by --mixed {' '.join(refused)}"
         )
     values = {str(term): frame[key].map(complete[term]) for term in complete}
     values |= {"session": frame[SESSION], "side": frame["side"]}
-    lines = []
-    for field, text in mixed.items():
-        tests = [(name, *_association(frame, field, column)) for name, column in values.items()]
-        parts = ", ".join(f"with {name} p {p_text(p)} ({test})" for name, test, p in tests if test)
-        names = ", ".join(name for name, _, p in tests if p < _LEVEL)
-        ending = f"; association {parts}" if parts else ""
-        ending += f"; effects of {names} may be effects of {field}" if names else ""
-        lines.append(f"hemispheres differ in {text}{ending}")
+    lines = (
+        f"hemispheres differ in {text}{_associations(frame, field, values)}"
+        for field, text in mixed.items()
+    )
     return replace(study, mixes=tuple(lines), labels=labels)
+
+
+def _origins(study: Study) -> pd.DataFrame:
+    """Return the origin of the labels of each hemisphere of a cohort."""
+    table, sides = study.cohort.table, study.cohort.sides
+    records = ((record.result.name, record.provenance) for record in study.collection.records)
+    origins = {(visit_name(n.subject, n.session), n.hemi): origin for n, origin in records}
+    places = [(visit, hemi) for hemi, side in sides.items() for visit in table.index[side.rows]]
+    entries = [(*place, *origins[place]) for place in places if place in origins]
+    frame = pd.DataFrame(entries, columns=["visit", "side", *PROVENANCE])
+    return frame.join(table[[PARTICIPANT, SESSION]], on="visit")
+
+
+def _mixed(
+    frame: pd.DataFrame, source: object, expected_of: Mapping[str, Sequence[str]]
+) -> tuple[dict[str, str], dict[str, list[str]]]:
+    """Describe the fields in which hemispheres differ, and list the values of all fields."""
+    mixed = {f: f"{f}: {counts_text(n)}" for f in PROVENANCE if len(n := Counter(frame[f])) > 1}
+    labels = {field: sorted(set(frame[field])) for field in PROVENANCE}
+    for field, expected in expected_of.items():
+        present = labels.get(field, [])
+        sizes = _sizes(Counter({**dict.fromkeys(present, 1), **dict.fromkeys(expected, 2)}))
+        if set(map(sizes.get, present) if field == "voxel_size" else present) - set(expected):
+            text = mixed.get(field, f"{field}: {', '.join(present)}")
+            mixed[field] = f"{text}, but {', '.join(expected)} in {source}"
+        labels[field] = sorted({*present, *expected})
+    return mixed, labels
+
+
+def _associations(frame: pd.DataFrame, field: str, values: Mapping[str, pd.Series]) -> str:
+    """Describe tests of a field with the variables of a model."""
+    tests = [(name, *_association(frame, field, column)) for name, column in values.items()]
+    parts = ", ".join(f"with {name} p {p_text(p)} ({test})" for name, test, p in tests if test)
+    names = ", ".join(name for name, _, p in tests if p < _LEVEL)
+    ending = f"; association {parts}" if parts else ""
+    return ending + (f"; effects of {names} may be effects of {field}" if names else "")
 
 
 def _sizes(counts: Counter[str]) -> dict[str, str]:

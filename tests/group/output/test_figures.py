@@ -26,7 +26,7 @@ from hipsta_bids.group.output.panels import draw_view
 from hipsta_bids.group.output.results import Analysis
 from hipsta_bids.group.output.shapes import AverageShape
 from hipsta_bids.group.output.style import encode, style
-from hipsta_bids.group.output.views import across, draw_mesh, laid_out, look
+from hipsta_bids.group.output.views import across, draw_mesh, flat_layout, look
 from hipsta_bids.io.gifti import sheet_triangles, surface_bytes
 from hipsta_bids.reports.maps import new_figure
 from hipsta_bids.stats.classify import Area, calibrate, roc_curve
@@ -119,7 +119,7 @@ def test_a_flat_surface_is_drawn_upright_in_its_own_coordinates(size, words):
     mesh, _ = surface(*size, 0.0)
     axis = new_figure((3.0, 3.0), None).subplots()
     draw_mesh(axis, mesh, np.zeros(len(mesh.points)), GRAY)
-    assert laid_out(mesh)[1] == (f"{words[0]} of the surface", "")
+    assert flat_layout(mesh)[1] == (f"{words[0]} of the surface", "")
     assert axis.get_ylabel() == f"{words[1]} of the surface"
     assert axis.get_xlim() == (-4.0, 4.0)
     assert axis.get_ylim() == (-10.0, 10.0)
@@ -131,7 +131,7 @@ def test_unfolded_surfaces_of_hippunfold_lie_as_sheets_do(version):
     mesh, _ = surface(40.0, 20.0, 0.0)
     points = mesh.points + np.array([-20.0, -190.0, 1.0])  # version 1: x is posterior to anterior
     mesh = replace(mesh, points=points if version == 1 else points[:, [1, 0, 2]])
-    plane, ends, name = laid_out(mesh)
+    plane, ends, name = flat_layout(mesh)
     np.testing.assert_array_equal(plane, points[:, [1, 0]])
     assert ends == ("medial", "lateral")
     assert name == "posterior to anterior"
