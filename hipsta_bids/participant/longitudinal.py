@@ -25,7 +25,8 @@ from hipsta_bids.geometry.label_checks import check_label_image
 from hipsta_bids.geometry.measures import bending_angle, subfield_volumes
 from hipsta_bids.geometry.topology import SolidField, repaired_columns
 from hipsta_bids.participant import measure
-from hipsta_bids.participant.measure import Clock, Evidence
+from hipsta_bids.participant.evidence import Evidence, describe_repair, find_all
+from hipsta_bids.participant.measure import Clock
 from hipsta_bids.protocols.load import for_region
 from hipsta_bids.protocols.protocol import Tissue
 from hipsta_bids.settings import Settings
@@ -288,7 +289,7 @@ def measure_laid(
             *_of_visit(body, solid, settings),
             *_fits(walls, sheet, overlap, settings),
             *folded_layers,
-            *(_of_frame(finding, motion) for finding in measure.find_all(common)),
+            *(_of_frame(finding, motion) for finding in find_all(common)),
         ]
         doubtful = repairs.doubtful_columns(sheet, solid, findings)
         return HemisphereMaps(
@@ -368,7 +369,7 @@ def _of_visit(body: Body, solid: SolidField, settings: Settings) -> list[Finding
     cuts = solid.touched & (solid.field.values < 0)
     step = 2 * body.ends.half_slice
     return [
-        *map(measure.describe_repair, solid.repairs),
+        *map(describe_repair, solid.repairs),
         *checks.check_cavities(body, settings.checks),
         *checks.check_labels(body, settings.checks),
         *checks.check_cross_sections(solid.field, step, settings.checks, cuts),

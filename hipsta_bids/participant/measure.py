@@ -4,33 +4,22 @@ Reads like the methods section of Diers et al. 2023 (NeuroImage 276:120182): lab
 tetrahedra, boundaries, coordinates, sheet, measures.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import AbstractContextManager, suppress
-from dataclasses import asdict, dataclass, replace
-from functools import cached_property, partial
+from dataclasses import asdict, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from hipsta_bids.errors import GeometryError
-from hipsta_bids.geometry import coverage, repairs, sheet_checks
+from hipsta_bids.geometry import repairs, sheet_checks
 from hipsta_bids.geometry.body import Body, check_mask, check_side, extract_body
 from hipsta_bids.geometry.boundaries import Boundaries, find_boundaries
-from hipsta_bids.geometry.bumps import check_bumps, check_swollen_ends
-from hipsta_bids.geometry.catalog import (
-    Measured,
-    average_profiles,
-    measure_maps,
-    measure_sections,
-    summarize,
-)
+from hipsta_bids.geometry.catalog import average_profiles, measure_maps, measure_sections, summarize
 from hipsta_bids.geometry.checks import (
-    check_cavities,
-    check_cross_sections,
     check_end_labels,
-    check_image,
     check_label_order,
-    check_labels,
     check_thickness,
     check_voxels_across,
     describe_uncus,
@@ -59,15 +48,14 @@ from hipsta_bids.geometry.sheet import (
     straighten_rows,
     whole_body,
 )
-from hipsta_bids.geometry.topology import Repair, SolidField, repair_topology, repaired_columns
+from hipsta_bids.geometry.topology import SolidField, repair_topology
 from hipsta_bids.joints import find_regions, load
+from hipsta_bids.participant.evidence import Evidence, find_all
 from hipsta_bids.protocols import EXPERIMENTAL
 from hipsta_bids.protocols.load import for_region
-from hipsta_bids.protocols.protocol import LATERAL_END, MEDIAL_END, Tissue
 from hipsta_bids.settings import Settings
 from hipsta_bids.types import (
     BodyMask,
-    Bool,
     Coordinates,
     Finding,
     Flag,
@@ -78,169 +66,6 @@ from hipsta_bids.types import (
     Surface,
     TetMesh,
 )
-
-# Numbers that say whether to trust a map, and flags.
-
-
-#: What every protocol labels along the sheet, from medial to lateral.
-_PARTS = {
-    "subiculum": MEDIAL_END,
-    "CA1": (Tissue.CA1,),
-    "CA2 or CA3": LATERAL_END,
-}
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Evidence(Measured):
-    """One hemisphere's sheet, and the evidence of the stages before it."""
-
-    surface: Surface
-    coordinates: Coordinates
-    image: tuple[Finding, ...]
-    """What the checks of the label image found."""
-    side: float
-    """How far the medial subfields lie medially of CA1, mm."""
-    solid: SolidField
-    voxels_across: float
-    smoothed: int
-    """How often the surface was smoothed more because TetGen could not fill it."""
-    boundaries: Boundaries
-    label_order: float
-    """Rank correlation of x with the labels' order."""
-    bending: float
-    """Angle by which the sheet bends round its interior side, rad."""
-    folded: float
-    """Fraction of the volume in which the coordinates have the opposite orientation."""
-    rivals: Mapping[str, Float]
-    """Thickness (Nx, Ny), mm, after a second choice that is as likely, by what was chosen."""
-
-    @cached_property
-    def repaired(self) -> Bool:
-        """Columns (Nx, Ny) that a repair touched."""
-        return repaired_columns(self.sheet, self.solid)
-
-
-def find_all(evidence: Evidence) -> list[Finding]:
-    """List what the checks of one hemisphere found, within their limits or not."""
-    solid, boundaries, settings = evidence.solid, evidence.boundaries, evidence.settings
-    body, sheet, checks = evidence.body, evidence.sheet, settings.checks
-    middle = sheet.points[:, :, sheet.middle]
-    present = set(np.unique(body.tissue[body.inside]).tolist())
-    ends = body.ends
-    rows: list[tuple[str, float, float, str, str, Float | float]] = [
-        (
-            "ends-uncertain",
-            uncertainty,
-            checks.flag_end,
-            f"the {end} end has no label and is uncertain by {uncertainty:.1f} mm",
-            "check the end plane, or place it by hand (--ends)",
-            middle[:, row],
-        )
-        for end, uncertainty, row in (
-            ("posterior", ends.posterior.uncertainty, 0),
-            ("anterior", ends.anterior.uncertainty, -1),
-        )
-    ]
-    rows += [
-        (
-            "subfield-missing",
-            float(not present & set(tissues)),
-            0,
-            f"the body has no {name}: the sheet ends there",
-            "look at the labels",
-            1.0,
-        )
-        for name, tissues in _PARTS.items()
-        if body.region != "entorhinal"
-    ]
-    rows += [
-        (
-            "much-repaired",
-            solid.changed_fraction,
-            settings.topology.flag_fraction,
-            f"{solid.changed_fraction:.1%} of the body was changed by repairs",
-            "look at the labels",
-            middle[evidence.repaired],
-        ),
-        (
-            "boundary-doubtful",
-            float(boundaries.tilt),
-            0,
-            "no medial and lateral boundary runs from end to end with the operator of the settings",
-            "look at the edges of the sheet",
-            1.0,
-        ),
-        (
-            # The cortex beside the body bends the other way.
-            "side-doubtful",
-            -evidence.bending
-            if body.region == "body" and boundaries.side_rule == "labels"
-            else 0.0,
-            checks.flag_bending,
-            f"dentate gyrus labels lie on the outer side of the bend ({evidence.bending:.1f} rad)",
-            "check which wall is interior; thickness does not depend on it",
-            1.0,
-        ),
-        (
-            "folded",
-            evidence.folded,
-            checks.flag_folded,
-            f"the coordinates fold in {evidence.folded:.1%} of the volume",
-            "look at the map",
-            evidence.folded,
-        ),
-        (
-            "columns-filled",
-            1 - float(sheet.valid.mean()),
-            checks.flag_filled,
-            f"{1 - sheet.valid.mean():.1%} of the columns were filled from their neighbors",
-            "look at the map",
-            middle[~sheet.valid],
-        ),
-    ]
-    return [
-        *map(describe_repair, solid.repairs),
-        *map(_whole, rows),
-        *[
-            sheet_checks.check_rival(evidence.thickness, *rival, checks)
-            for rival in evidence.rivals.items()
-        ],
-        *check_image(body),
-        *check_cavities(body, checks),
-        *check_labels(body, checks),
-        *check_cross_sections(
-            solid.field, 2 * ends.half_slice, checks, solid.touched & (solid.field.values < 0)
-        ),
-        *sheet_checks.check_rows(sheet, checks),
-        *sheet_checks.check_edges(evidence.whole, checks),
-        *coverage.check_coverage(sheet, evidence.whole, evidence.subfield, body, checks),
-        *check_bumps(sheet, checks),
-        *check_swollen_ends(sheet, checks),
-    ]
-
-
-def describe_repair(repair: Repair) -> Finding:
-    """Return the finding of a repair: its size over the limit."""
-    return Finding(
-        reason="large-repair",
-        value=repair.excess,
-        limit=1.0,
-        text=str(repair),
-        remedy="the repair is large, check the labels there",
-        points=repair.points,
-        placed=True,
-    )
-
-
-def _whole(row: tuple[str, float, float, str, str, Float | float]) -> Finding:
-    """Make a finding about the sheet as a whole, from the columns concerned or their share."""
-    reason, value, limit, text, remedy, location = row
-    finding = Finding(
-        reason=reason, value=value, limit=limit, text=text, remedy=remedy, placed=True
-    )
-    if isinstance(location, float):
-        return replace(finding, share=location)
-    return replace(finding, points=location[np.isfinite(location).all(axis=-1)])
 
 
 def quality_metrics(evidence: Evidence) -> dict[str, Any]:
@@ -337,10 +162,7 @@ def unfold(
         bending = bending_angle(sheet, settings.measures)
         if body.region != "body" and boundaries.side_rule == "bending":
             boundaries = replace(boundaries, side_rule="continuity")
-        # Labels have decided already.
-        if (boundaries.side_rule == "continuity" and is_flipped(sheet, hemi)) or (
-            boundaries.side_rule == "bending" and bending < 0
-        ):
+        if _has_other_side(sheet, hemi, boundaries, bending):
             sheet, coordinates, boundaries = _flipped(sheet, coordinates, boundaries)
             bending = -bending
         whole = sample_sheet(mesh, coordinates, whole_body(settings.sheet))
@@ -351,16 +173,8 @@ def unfold(
         if rivals and boundaries.rival is not None:
             rival = sample_sheet(mesh, lay_out(boundaries.rival), settings.sheet)
             rival_maps["medial or lateral boundary"] = measure_thickness(rival)
-        with suppress(GeometryError):
-            if rivals and solid.rival is not None:
-                rival_maps["repair"] = _thickness(solid.rival, body, settings)
-        with suppress(GeometryError):
-            if rivals and body.cavities.doubtful:
-                second = extract_body(volume, settings.body, second=True)
-                changed = np.count_nonzero(second.inside != body.inside) * body.voxel_volume
-                if changed > DOUBTFUL_CAVITY:
-                    field = resample_body(second, hemi, settings.grid, settings.slices)
-                    rival_maps["reading of a cavity"] = _thickness(field, second, settings)
+        if rivals:
+            rival_maps |= _rivals_of_labels(volume, hemi, settings, body, solid)
     return Evidence(
         body=body,
         surface=surface,
@@ -381,6 +195,31 @@ def unfold(
         folded=folded,
         rivals=rival_maps,
     )
+
+
+def _rivals_of_labels(
+    volume: LabelVolume, hemi: str, settings: Settings, body: Body, solid: SolidField
+) -> dict[str, Float]:
+    """Measure thickness after another repair, and another reading of a cavity, where as likely."""
+    maps = {}
+    with suppress(GeometryError):
+        if solid.rival is not None:
+            maps["repair"] = _thickness(solid.rival, body, settings)
+    with suppress(GeometryError):
+        if body.cavities.doubtful:
+            second = extract_body(volume, settings.body, second=True)
+            changed = np.count_nonzero(second.inside != body.inside) * body.voxel_volume
+            if changed > DOUBTFUL_CAVITY:
+                field = resample_body(second, hemi, settings.grid, settings.slices)
+                maps["reading of a cavity"] = _thickness(field, second, settings)
+    return maps
+
+
+def _has_other_side(sheet: Sheet, hemi: str, boundaries: Boundaries, bending: float) -> bool:
+    """Check whether interior and exterior are exchanged, unless labels have decided already."""
+    if boundaries.side_rule == "continuity":
+        return is_flipped(sheet, hemi)
+    return boundaries.side_rule == "bending" and bending < 0
 
 
 def make_solid(field: Field, body: Body, settings: Settings) -> SolidField:
@@ -460,36 +299,42 @@ def measure_hemisphere(
         )
         return measured
     evidence = unfold(volume, hemi, settings, clock)
-    sheet = evidence.sheet
     with clock("measures"):
-        layers, folded_layers = space_layers(sheet, settings)
-        findings = [*find_in_body(volume, hemi, evidence), *folded_layers]
-        maps = measure_maps(evidence)
-        doubtful = repairs.doubtful_columns(sheet, evidence.solid, findings)
-        return HemisphereMaps(
-            sheet=sheet,
-            layers=layers,
-            maps=maps,
-            profiles=average_profiles(maps, sheet),
-            sections=measure_sections(evidence),
-            subfield=evidence.subfield,
-            repaired=evidence.repaired,
-            doubtful=doubtful,
-            body_mask=volume.in_file(evidence.body.inside),
-            summary=summarize(evidence, for_region(volume.protocol, region).sheet),
-            qc={
-                **quality_metrics(evidence),
-                "doubtful_fraction": float(doubtful.mean()),
-                "flag_margins": flag_margins(findings),
-            },
-            repairs=(
-                *map(str, evidence.solid.repairs),
-                *describe_uncus(evidence.body, settings.checks),
-            ),
-            flags=flags_of(evidence, findings),
-            mesh=evidence.mesh,
-            coordinates=evidence.coordinates,
-        )
+        return _measure(volume, hemi, evidence)
+
+
+def _measure(volume: LabelVolume, hemi: str, evidence: Evidence) -> HemisphereMaps:
+    """Measure the maps of a sheet that is laid out, and check them."""
+    sheet = evidence.sheet
+    tissues = for_region(volume.protocol, evidence.settings.body.region).sheet
+    layers, folded_layers = space_layers(sheet, evidence.settings)
+    findings = [*find_in_body(volume, hemi, evidence), *folded_layers]
+    maps = measure_maps(evidence)
+    doubtful = repairs.doubtful_columns(sheet, evidence.solid, findings)
+    return HemisphereMaps(
+        sheet=sheet,
+        layers=layers,
+        maps=maps,
+        profiles=average_profiles(maps, sheet),
+        sections=measure_sections(evidence),
+        subfield=evidence.subfield,
+        repaired=evidence.repaired,
+        doubtful=doubtful,
+        body_mask=volume.in_file(evidence.body.inside),
+        summary=summarize(evidence, tissues),
+        qc={
+            **quality_metrics(evidence),
+            "doubtful_fraction": float(doubtful.mean()),
+            "flag_margins": flag_margins(findings),
+        },
+        repairs=(
+            *map(str, evidence.solid.repairs),
+            *describe_uncus(evidence.body, evidence.settings.checks),
+        ),
+        flags=flags_of(evidence, findings),
+        mesh=evidence.mesh,
+        coordinates=evidence.coordinates,
+    )
 
 
 def find_in_body(volume: LabelVolume, hemi: str, evidence: Evidence) -> list[Finding]:

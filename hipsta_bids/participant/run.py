@@ -194,11 +194,7 @@ def _run(
     copies: list[str] = []
     visits = [(job.result.name.subject, job.result.name.session) for job in jobs]
     with log_file(out_dir, options.verbosity, shard) as log:
-        _LOGGER.info("hipsta_bids %s, %d hemispheres", __version__, len(jobs))
-        if options.command:
-            _LOGGER.info("command: %s", options.command)
-        for note in options.notes:
-            _LOGGER.info("note: %s", note)
+        _log_start(options, len(jobs))
         table = StatusTable(out_dir, shard)
         _write_inputs(out_dir, options, ())
         plan = PagePlan(
@@ -241,6 +237,15 @@ def _run(
         )
         _LOGGER.info("done: %s, exit code %d", dict(result.counts), result.exit_code)
     return result
+
+
+def _log_start(options: RunOptions, count: int) -> None:
+    """Log what begins, and what the search for inputs noted."""
+    _LOGGER.info("hipsta_bids %s, %d hemispheres", __version__, count)
+    if options.command:
+        _LOGGER.info("command: %s", options.command)
+    for note in options.notes:
+        _LOGGER.info("note: %s", note)
 
 
 def _write_inputs(out_dir: Path, options: RunOptions, outcomes: Sequence[Outcome]) -> None:

@@ -8,7 +8,8 @@ import pytest
 
 from hipsta_bids.geometry.sheet import sample_sheet, whole_body
 from hipsta_bids.geometry.topology import Repair
-from hipsta_bids.participant.measure import Evidence, find_all, quality_metrics
+from hipsta_bids.participant.evidence import Evidence, find_all
+from hipsta_bids.participant.measure import quality_metrics
 from hipsta_bids.protocols.protocol import Tissue
 from hipsta_bids.settings import Settings
 from hipsta_bids.types import Sheet
