@@ -146,8 +146,8 @@ class GroupFit:
         inner = ("x", "y") if self.significant.ndim > _GRID else ("vertex",)
         axes = ("side", "contrast", *inner)
         variables: dict[str, Any] = {
-            name: (axes, values, {"long_name": words, "units": self.unit if own else "1"})
-            for (name, (words, own)), values in zip(
+            name: (axes, values, {"long_name": words, "units": self.unit if has_unit else "1"})
+            for (name, (words, has_unit)), values in zip(
                 _ARRAYS.items(), self.maps.values(), strict=True
             )
         }
@@ -259,8 +259,7 @@ def group(
         contrasts=tuple(contrasts),
         references=tuple((references or {}).items()),
     )
-    if isinstance(settings, str | Path) or settings is None:
-        settings = load_group_settings(None if settings is None else Path(settings))
+    settings = _loaded(settings)
     if correction is not None:
         settings = settings.changed(multiplicity={"method": correction})
     if (
@@ -418,14 +417,8 @@ def register(
     >>> hb.group(aligned.thickness, study.participants, "group + age").contrasts
     ('CN-AD',)
     """
-    if isinstance(settings, str | Path) or settings is None:
-        settings = load_group_settings(None if settings is None else Path(settings))
-    if not isinstance(maps, xr.Dataset):
-        sheets = ("participant", "x", "y")
-        maps = xr.Dataset({name: (sheets, np.asarray(maps[name], np.float64)) for name in maps})
-    axes = tuple(maps["curvature"].dims) if "curvature" in maps else ()
-    if not {"participant", "x", "y"} <= set(axes):
-        raise ValueError("registration needs curvature with the axes participant, x and y")
+    settings = _loaded(settings)
+    maps, axes = _with_axes(maps)
     rows = [axis for axis in ("participant", "session") if axis in axes]
     outer = [axis for axis in axes if axis not in {*rows, "x", "y"}]
     labeled = {
@@ -439,34 +432,68 @@ def register(
     shifts, explained = np.full(shape[:3], np.nan), np.full((2, sizes[0]), np.nan)
     has_rims = "y" in maps.coords and parts_of(maps["y"].to_numpy()) is not None
     for part in range(sizes[0]):
-        sheets_here = np.isfinite(arrays["curvature"][part]).any(axis=(1, 2))
-        if not sheets_here.any():
-            continue
-        curvature = arrays["curvature"][part, sheets_here]
-        profiles = registration.mean_profiles(curvature, settings.registration)
-        result = registration.register(profiles, settings.registration)
-        shifts[part, sheets_here] = result.shifts
-        explained[:, part] = result.explained_before, result.explained_after
-        for values in arrays.values():
-            carried = _carried(values[part, sheets_here], result.warps)
-            if has_rims and carried.dtype.kind == "f":
-                leave_rare(carried)
-            values[part, sheets_here] = carried
+        pieces = {name: values[part] for name, values in arrays.items()}
+        shifts[part], explained[:, part] = _register_part(pieces, settings, has_rims=has_rims)
     results: dict[str, Any] = {
         str(name): values.copy(data=arrays[name].reshape(values.shape)).transpose(*maps[name].dims)
         for name, values in labeled.items()
     }
-    lengths = [maps.sizes[axis] for axis in (*outer, *rows, "x")]
+    return maps.assign(results | _of_registration(maps, (*outer, *rows, "x"), shifts, explained))
+
+
+def _of_registration(
+    maps: xr.Dataset, axes: tuple[Any, ...], shifts: Float, explained: Float
+) -> dict[str, Any]:
+    """Name shifts and explained shares; axes of participants and sessions follow the outer ones."""
+    lengths = [maps.sizes[axis] for axis in axes]
+    n_outer = sum(axis not in {"participant", "session", "x"} for axis in axes)
     about = {"long_name": "registered minus original position", "units": "nodes"}
-    results["shift"] = (*outer, *rows, "x"), shifts.reshape(lengths), about
+    arrays: dict[str, Any] = {"shift": (axes, shifts.reshape(lengths), about)}
     for name, shares in zip(("explained_before", "explained_after"), explained, strict=True):
-        results[name] = outer, shares.reshape(lengths[: len(outer)])
-    return maps.assign(results)
+        arrays[name] = axes[:n_outer], shares.reshape(lengths[:n_outer])
+    return arrays
 
 
-def _carried(values: NDArray[Any], warps: Float) -> NDArray[Any]:
+def _register_part(
+    arrays: Mapping[Any, NDArray[Any]], settings: GroupSettings, *, has_rims: bool
+) -> tuple[Float, Float]:
+    """Register sheets (rows, x, points) in place; returns shifts (rows, x) and shares explained."""
+    has_sheet = np.isfinite(arrays["curvature"]).any(axis=(1, 2))
+    shifts, explained = np.full(arrays["curvature"].shape[:2], np.nan), np.full(2, np.nan)
+    if has_sheet.any():
+        curvature = arrays["curvature"][has_sheet]
+        profiles = registration.mean_profiles(curvature, settings.registration)
+        result = registration.register(profiles, settings.registration)
+        shifts[has_sheet] = result.shifts
+        explained[:] = result.explained_before, result.explained_after
+        for values in arrays.values():
+            values[has_sheet] = _carried(values[has_sheet], result.warps, has_rims=has_rims)
+    return shifts, explained
+
+
+def _loaded(settings: GroupSettings | str | Path | None) -> GroupSettings:
+    if isinstance(settings, GroupSettings):
+        return settings
+    return load_group_settings(None if settings is None else Path(settings))
+
+
+def _with_axes(maps: xr.Dataset | Mapping[str, ArrayLike]) -> tuple[xr.Dataset, tuple[Any, ...]]:
+    """Name the axes of maps; also return those of curvature, by which sheets are registered."""
+    if not isinstance(maps, xr.Dataset):
+        sheets = ("participant", "x", "y")
+        maps = xr.Dataset({name: (sheets, np.asarray(maps[name], np.float64)) for name in maps})
+    axes = tuple(maps["curvature"].dims) if "curvature" in maps else ()
+    if not {"participant", "x", "y"} <= set(axes):
+        raise ValueError("registration needs curvature with the axes participant, x and y")
+    return maps, axes
+
+
+def _carried(values: NDArray[Any], warps: Float, *, has_rims: bool) -> NDArray[Any]:
     """Carry numbers or labels (sheets, x, points) to registered nodes along x."""
     if values.dtype.kind == "f":
-        return warp_values(values, warps)
+        carried = warp_values(values, warps)
+        if has_rims:
+            leave_rare(carried)
+        return carried
     names, codes = np.unique(values, return_inverse=True)
     return np.asarray(names[warp_labels(codes.reshape(values.shape).astype(np.int8), warps)])

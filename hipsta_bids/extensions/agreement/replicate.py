@@ -1,4 +1,4 @@
-"""The published numbers of Diers et al. (2023) beside the numbers of a finished analysis."""
+"""The published numbers of Diers et al. (2023) with the numbers of a finished analysis."""
 
 import math
 import re
@@ -21,7 +21,7 @@ from hipsta_bids.types import p_text
 PUBLISHED = Path(__file__).with_name("replicate.tsv")
 #: Groups of the paper, controls first.
 GROUPS = ("CU", "MCI", "DAT")
-#: Why a row has no counterpart, by the first part of its key that no own row has.
+#: Why a row has no counterpart, by the first part of its key that no measured row has.
 _REASONS = (
     "no {0}.tsv: run the group command of the guide",
     "{0}.tsv has no {1}: add it to --measures or classification.added, if the labels have it",
@@ -38,9 +38,9 @@ _Numbers = dict[tuple[str, ...], dict[str, Any]]
 
 
 def replicate(folder: Path, out: Path, groups: Sequence[str] | None = None) -> list[dict[str, str]]:
-    """Write ``replicate.tsv`` of published and own numbers, and return its rows for print.
+    """Write ``replicate.tsv`` of published and measured numbers, and return its rows for print.
 
-    ``groups`` are the own names of ``GROUPS``. Own t has the sign of the published contrast.
+    ``groups`` are the measured names of ``GROUPS``. Own t has the sign of the published contrast.
 
     Raises
     ------
@@ -58,14 +58,14 @@ def replicate(folder: Path, out: Path, groups: Sequence[str] | None = None) -> l
         contrast = f"{row['contrast']} {row['hemi']}".removesuffix(" LR")
         titles = {"paper": paper, "quantity": row["quantity"], "contrast": contrast}
         titles = {name: text.removesuffix(f" {MISSING}") for name, text in titles.items()}
-        printed.append({**titles, "published": _words(row), "own": reason or _words(values)})
+        printed.append({**titles, "published": _words(row), "measured": reason or _words(values)})
     content = pd.DataFrame(rows, columns=[*REPLICATE_COLUMNS])
     write_table(out, "replicate", content, meaning=REPLICATE_COLUMNS)
     return printed
 
 
 def _signs(results: GroupResults, own_groups: Sequence[str]) -> dict[str, tuple[str, int]]:
-    """Return the published contrast, and the sign that turns to it, by the own contrast."""
+    """Return the published contrast, and the sign that turns to it, by the measured contrast."""
     contrasts, signs = [*(results.record.get("contrasts") or ())], dict[str, tuple[str, int]]()
     for name, title in zip(own_groups[1:], GROUPS[1:], strict=True):
         signs[f"{own_groups[0]}-{name}"] = f"{GROUPS[0]}-{title}", 1
@@ -79,7 +79,7 @@ def _signs(results: GroupResults, own_groups: Sequence[str]) -> dict[str, tuple[
 
 
 def _counterpart(row: Mapping[str, str], numbers: _Numbers) -> tuple[dict[str, Any], str]:
-    """Return the own numbers of a published row, or the reason why none are there."""
+    """Return the measured numbers of a published row, or the reason why none are there."""
     model = "with" if row["file"] == "measures" and "icv" in row["model"] else "without"
     key = row["file"], row["measure"], row["hemi"], row["contrast"], model
     lengths = range(1, len(key) + 1)

@@ -1,4 +1,4 @@
-"""Tables of volumes of other programs, beside segmentations and named (``--volumes``)."""
+"""Tables of volumes of other programs, of segmentations and named (``--volumes``)."""
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -41,10 +41,10 @@ class VolumeTable:
     """The only hemisphere to take; ``None`` for all that are there."""
 
 
-def table_beside(segmentation: Path) -> tuple[str, Path] | None:
+def table_of(segmentation: Path) -> tuple[str, Path] | None:
     """Find the table that belongs to a segmentation."""
-    for name, beside in _BESIDE.items():
-        path = beside(segmentation)
+    for name, locate in _TABLES.items():
+        path = locate(segmentation)
         if path is not None and path.is_file():
             return name, path
     return None
@@ -64,7 +64,7 @@ def _hippunfold(segmentation: Path) -> Path | None:
     return tables[0] if tables else None
 
 
-_BESIDE: Mapping[str, Callable[[Path], Path | None]] = {
+_TABLES: Mapping[str, Callable[[Path], Path | None]] = {
     "freesurfer": lambda path: volume_table(path, "freesurfer"),
     "ashs": lambda path: volume_table(path, "ashs"),
     "hippunfold": _hippunfold,
@@ -169,9 +169,9 @@ def add_volumes(
     patterns: Sequence[tuple[str, str]],
     root: Path,
 ) -> tuple[Measured, list[str]]:
-    """Add volumes found beside the segmentations, and from the user's patterns, as summaries."""
+    """Add volumes of the segmentations, and from the user's patterns, as summaries."""
     named = [name for name, _ in patterns]
-    tables = [table for table in _beside(records) if table.name not in named]
+    tables = [table for table in _tables_of(records) if table.name not in named]
     for name, pattern in patterns:
         tables += _matching(name, pattern, root, measured)
     frames, notes = join_volumes(tables, measured.table.index, strict=named)
@@ -186,22 +186,22 @@ def add_volumes(
     return replace(measured, sides=sides, units={**measured.units, **units}), notes
 
 
-def _beside(records: Sequence[SheetRecord]) -> Iterator[VolumeTable]:
+def _tables_of(records: Sequence[SheetRecord]) -> Iterator[VolumeTable]:
     paths = locate_sources([r.source for r in records], [r.result.root for r in records])
     for record, path in zip(records, paths, strict=True):
-        found = None if path is None else table_beside(path)
-        if found is not None:
-            name, table = found
-            own = record.result.name
-            visit = visit_name(own.subject, own.session)
-            yield VolumeTable(name=name, visit=visit, path=table, hemi=own.hemi)
+        entry = None if path is None else table_of(path)
+        if entry is not None:
+            name, table = entry
+            place = record.result.name
+            visit = visit_name(place.subject, place.session)
+            yield VolumeTable(name=name, visit=visit, path=table, hemi=place.hemi)
 
 
 def _matching(name: str, pattern: str, root: Path, measured: Measured) -> list[VolumeTable]:
-    matches = [(visit_name(one.subject, one.session), one) for one in scan(pattern, root)]
+    matches = [(visit_name(file.subject, file.session), file) for file in scan(pattern, root)]
     tables = [
-        VolumeTable(name=name, visit=visit, path=one.path, hemi=one.hemi)
-        for visit, one in matches
+        VolumeTable(name=name, visit=visit, path=file.path, hemi=file.hemi)
+        for visit, file in matches
         if visit in measured.table.index
     ]
     if not tables:

@@ -219,20 +219,9 @@ def _write(study: studies.Study, scoring: _Scoring, notes: Iterable[str]) -> stu
         files.write_text(folder / "methods.md", text)
         return write.write_figures(folder, _figures(scoring), prints=study.options.figures)
 
-    counts = np.bincount(people.site[people.known][is_first], minlength=len(file.sites)).tolist()
     record = {
         "hemispheres": {hemi: len(side.rows) for hemi, side in cohort.sides.items()},
-        "norms": {
-            "file": scoring.path and str(scoring.path),
-            "participants": file.participants,
-            "ages": [file.knots[0], file.knots[-1]],
-            "sites": [
-                {"site": site, "n": n, "here": counts[i], "new": i >= scoring.known}
-                for i, (site, n) in enumerate(file.sites.items())
-            ],
-            "controls": scoring.controls,
-            "folds": normative.CENTILE_FOLDS,
-        },
+        "norms": _record(scoring, people.site[people.known][is_first]),
         "among": study.among,
     }
     name = studies.folder_of(["norms" if scoring.path is None else "scores"], study.among)
@@ -244,6 +233,23 @@ def _write(study: studies.Study, scoring: _Scoring, notes: Iterable[str]) -> stu
     return study.write(
         name, notes, visits=visits, tables=scoring.tables, meaning=COLUMNS, record=record, fill=fill
     )
+
+
+def _record(scoring: _Scoring, sites: Int) -> dict[str, Any]:
+    """Record norms; ``sites`` (participants,) are positions in the sites of the file."""
+    file = scoring.file
+    counts = np.bincount(sites, minlength=len(file.sites)).tolist()
+    return {
+        "file": scoring.path and str(scoring.path),
+        "participants": file.participants,
+        "ages": [file.knots[0], file.knots[-1]],
+        "sites": [
+            {"site": site, "n": n, "here": counts[i], "new": i >= scoring.known}
+            for i, (site, n) in enumerate(file.sites.items())
+        ],
+        "controls": scoring.controls,
+        "folds": normative.CENTILE_FOLDS,
+    }
 
 
 def _protocol(study: studies.Study) -> tuple[str, str]:

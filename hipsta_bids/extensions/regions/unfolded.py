@@ -95,11 +95,7 @@ def resample(
     for each side. ``targets`` are unfolded surfaces of another density or version, to which maps
     of HippUnfold are moved instead of to the sheet. Returns one line about the result.
     """
-    if not out.name.endswith((TABLE, *METRICS, DENSE_SCALARS)):
-        ends = ", ".join((*METRICS, DENSE_SCALARS))
-        raise UsageError(f"{out}: results end with {ends} or {TABLE}")
-    if out.resolve() in {path.resolve() for path in (*paths, *surfaces, *targets)}:
-        raise UsageError(f"{out}: is an input; choose another name")
+    _check_name(out, (*paths, *surfaces, *targets))
     if targets and sheets:
         raise UsageError("--sheet: has no use between two surfaces of HippUnfold; omit it")
     surface_of, target_of = _by_side(surfaces), _by_side(targets)
@@ -125,14 +121,27 @@ def resample(
                 raise _several(f"{path}: is not on the same points as {paths[0]}")
             to_vertices = on_nodes
         moved[hemi], path_of[hemi] = replace(side, values=values), path
-    filled = np.concatenate(distances) if distances else np.zeros(0)
+    filled = np.concatenate([np.zeros(0), *distances])
     note = f"{filled.size} have the nearest value, up to {filled.max(initial=0):.2f} mm away"
     _write(out, moved, to_nodes=not to_vertices, note=note if filled.size else "")
-    missing = np.mean(np.isnan(np.concatenate([side.values.ravel() for side in moved.values()])))
     points = "vertices of HippUnfold" if to_vertices else "nodes of the whole sheet"
-    points_each = ", ".join(f"{side.values.size} {hemi}" for hemi, side in moved.items())
-    text = f"{out}: {points_each} {points}, {missing:.0%} without a value"
-    return f"{text}; {note}" if filled.size else text
+    return f"{out}: {_described(moved, points)}" + f"; {note}" * bool(filled.size)
+
+
+def _check_name(out: Path, inputs: Sequence[Path]) -> None:
+    """Refuse a name of results of another format, or of an input."""
+    if not out.name.endswith((TABLE, *METRICS, DENSE_SCALARS)):
+        ends = ", ".join((*METRICS, DENSE_SCALARS))
+        raise UsageError(f"{out}: results end with {ends} or {TABLE}")
+    if out.resolve() in {path.resolve() for path in inputs}:
+        raise UsageError(f"{out}: is an input; choose another name")
+
+
+def _described(sides: Mapping[str, PointMap], points: str) -> str:
+    """Count points by side, and the share without a value."""
+    missing = np.mean(np.isnan(np.concatenate([side.values.ravel() for side in sides.values()])))
+    counts = ", ".join(f"{side.values.size} {hemi}" for hemi, side in sides.items())
+    return f"{counts} {points}, {missing:.0%} without a value"
 
 
 def _to_other(

@@ -2,7 +2,7 @@
 
 Head and tail bend and fold, so the solid has no ends to close and is not made a ball. It has two
 faces and a rim; edges and ends are found afterwards, on the boundary of the mid-surface. In the
-body, the grid is that of the body's own sheet: the body is measured first.
+body, the grid is that of the sheet of the body: the body is measured first.
 """
 
 from collections.abc import Callable
@@ -90,8 +90,8 @@ _RIM = 0.9999
 """Beside the edges themselves, where rounding does not choose the triangle."""
 
 
-class Own(NamedTuple):
-    """The body's own sheet, and the labels of the body."""
+class BodySheet(NamedTuple):
+    """The sheet of the body, and the labels of the body."""
 
     body: Body
     mesh: types.TetMesh
@@ -99,8 +99,8 @@ class Own(NamedTuple):
     flags: tuple[types.Flag, ...]
 
 
-class Laid(NamedTuple):
-    """The sheet of head and body laid out, and the evidence of the stages before it."""
+class Layout(NamedTuple):
+    """The sheet of head and body flattened, and the evidence of the stages before it."""
 
     body: Body
     """All of the hippocampus, between end planes that are far away."""
@@ -134,15 +134,15 @@ def measure_region(
     check_fine(volume)
     body = unfold(volume, hemi, settings.changed(body={"region": "body"}), clock)
     flags = flags_of(body, find_in_body(volume, hemi, body))
-    body_alone = Own(body.body, body.mesh, body.coordinates, flags)
-    laid = lay_out(volume, hemi, settings, clock, body_alone)
+    body_alone = BodySheet(body.body, body.mesh, body.coordinates, flags)
+    layout = lay_out(volume, hemi, settings, clock, body_alone)
     with clock("measures"):
-        return _measure(volume, settings, body_alone, laid)
+        return _measure(volume, settings, body_alone, layout)
 
 
 def lay_out(
-    volume: types.LabelVolume, hemi: str, settings: Settings, clock: Clock, body_alone: Own
-) -> Laid:
+    volume: types.LabelVolume, hemi: str, settings: Settings, clock: Clock, body_alone: BodySheet
+) -> Layout:
     """Lay out the sheet of a region around ``body_alone``, the body measured alone."""
     region = settings.body.region
     with clock("body"):
@@ -177,7 +177,7 @@ def lay_out(
         edge_to_edge = (np.linspace(-_RIM, _RIM, len(axes[0])), axes[1], axes[2][::2])
         whole = _sample(disk, plane, lines_of, edge_to_edge, 0.0)
         subfield = label_sheet(sheet, body)
-    return Laid(
+    return Layout(
         body=body,
         side=side,
         surface=surface,
@@ -196,83 +196,83 @@ def lay_out(
 
 
 def _measure(
-    volume: types.LabelVolume, settings: Settings, body_alone: Own, laid: Laid
+    volume: types.LabelVolume, settings: Settings, body_alone: BodySheet, layout: Layout
 ) -> types.HemisphereMaps:
-    """Measure the maps of a sheet that is laid out, and check them."""
-    body, sheet = laid.body, laid.sheet
+    """Measure the maps of a sheet that is flattened, and check them."""
+    body, sheet = layout.body, layout.sheet
     measured = catalog.Measured(
         body=body,
-        mesh=laid.mesh,
+        mesh=layout.mesh,
         sheet=sheet,
-        subfield=laid.subfield,
-        whole=laid.whole,
+        subfield=layout.subfield,
+        whole=layout.whole,
         settings=settings,
     )
     all_maps = catalog.measure_maps(measured)
     maps = {k: np.where(sheet.valid, v, np.nan) for k, v in all_maps.items()}
     maps["distortion"] = _distortion(sheet)
-    medial_to_lateral = proximodistal(laid.disk, laid.edges)
-    maps["proximodistal"] = at_nodes(laid.disk, laid.plane, medial_to_lateral, *laid.axes[:2])
-    folded, masked = flipped_area(laid.disk, laid.plane), _masked(laid)
-    findings = [*_findings(laid.disk, laid.edges, folded, masked, body.region), *laid.folds]
+    medial_to_lateral = proximodistal(layout.disk, layout.edges)
+    maps["proximodistal"] = at_nodes(layout.disk, layout.plane, medial_to_lateral, *layout.axes[:2])
+    folded, masked = flipped_area(layout.disk, layout.plane), _masked(layout)
+    findings = [*_findings(layout.disk, layout.edges, folded, masked, body.region), *layout.folds]
     return types.HemisphereMaps(
         sheet=sheet,
         layers=sheet,
         maps=maps,
         profiles=catalog.average_profiles(all_maps, sheet),
         sections=catalog.measure_sections(measured),
-        subfield=laid.subfield,
-        repaired=np.zeros(laid.subfield.shape, dtype=bool),
-        doubtful=np.zeros(laid.subfield.shape, dtype=bool),
+        subfield=layout.subfield,
+        repaired=np.zeros(layout.subfield.shape, dtype=bool),
+        doubtful=np.zeros(layout.subfield.shape, dtype=bool),
         body_mask=volume.in_file(body.inside),
         summary=catalog.summarize(measured, volume.protocol.sheet),
         qc={
-            **_metrics(laid),
+            **_metrics(layout),
             "folded_fraction": folded,
             "masked_fraction": masked,
-            **_metrics_of_ends(laid, body_alone.body.ends),
+            **_metrics_of_ends(layout, body_alone.body.ends),
             "flag_margins": flag_margins(findings),
         },
         flags=(
             *raise_flags(findings, sheet, lambda at: name_place(at, body)),
             *(replace(f, message=f"the body alone: {f.message}") for f in body_alone.flags),
         ),
-        mesh=laid.mesh,
+        mesh=layout.mesh,
         coordinates=types.Coordinates(
-            values=np.column_stack([np.full((len(laid.u), 2), np.nan), laid.u])
+            values=np.column_stack([np.full((len(layout.u), 2), np.nan), layout.u])
         ),
     )
 
 
-def _masked(laid: Laid) -> float:
+def _masked(layout: Layout) -> float:
     """Compute the share of the sheet's area that has no values."""
-    measured_area = float(column_area(laid.sheet)[laid.sheet.valid].sum())
-    area = float(triangle_areas(laid.disk.vertices, laid.disk.triangles).sum())
+    measured_area = float(column_area(layout.sheet)[layout.sheet.valid].sum())
+    area = float(triangle_areas(layout.disk.vertices, layout.disk.triangles).sum())
     return max(0.0, 1 - measured_area / area)
 
 
-def _metrics(laid: Laid) -> dict[str, Any]:
+def _metrics(layout: Layout) -> dict[str, Any]:
     """Return numbers about the solid and its sheet."""
-    body = laid.body
+    body = layout.body
     return {
         "region": body.region,
         "experimental": True,
         "voxel_size_mm": np.linalg.norm(body.affine[:3, :3], axis=0).round(4).tolist(),
         "body_voxels": int(np.count_nonzero(body.inside)),
-        "surface_vertices": len(laid.surface.vertices),
-        "extra_smoothing": laid.smoothed,
-        "tetrahedra": len(laid.mesh.tetrahedra),
-        "tetra_quality_median": float(np.median(tetra_quality(laid.mesh))),
-        "holes_mm": [round(hole, 2) for hole in laid.disk.holes],
-        "edge_lengths_mm": _lengths(laid.disk, laid.edges),
+        "surface_vertices": len(layout.surface.vertices),
+        "extra_smoothing": layout.smoothed,
+        "tetrahedra": len(layout.mesh.tetrahedra),
+        "tetra_quality_median": float(np.median(tetra_quality(layout.mesh))),
+        "holes_mm": [round(hole, 2) for hole in layout.disk.holes],
+        "edge_lengths_mm": _lengths(layout.disk, layout.edges),
     }
 
 
-def _metrics_of_ends(laid: Laid, ends: EndPlanes) -> dict[str, Any]:
+def _metrics_of_ends(layout: Layout, ends: EndPlanes) -> dict[str, Any]:
     """Return the side, and the end planes of the body."""
-    inside = laid.body.inside_points()[1]
+    inside = layout.body.inside_points()[1]
     return {
-        "medial_offset_mm": laid.side,
+        "medial_offset_mm": layout.side,
         "posterior_end_rule": ends.posterior.rule,
         "anterior_end_rule": ends.anterior.rule,
         "posterior_plane": ends.posterior.entry(inside),
@@ -334,8 +334,8 @@ def _edges(
     return edges
 
 
-def _in_body(disk: Disk, body_alone: Own) -> Float:
-    """Coordinates (V, 2), x and y, of a disk's vertices in the body's own sheet; NaN outside.
+def _in_body(disk: Disk, body_alone: BodySheet) -> Float:
+    """Coordinates (V, 2), x and y, of a disk's vertices in the sheet of the body; NaN outside.
 
     The body goes on beyond its end planes. One vertex there belongs to it, so that the rows at the
     planes lie between known values.

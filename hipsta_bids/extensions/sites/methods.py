@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator
 
 from hipsta_bids.extensions.sites.harmonize import part_of
+from hipsta_bids.extensions.sites.planning import SitePlan
 from hipsta_bids.extensions.sites.settings import HarmonizationSettings
 from hipsta_bids.group.cohort.data import SIZES
 from hipsta_bids.group.output.citations import code, escaped
@@ -16,14 +17,11 @@ def methods(analysis: Analysis, cite: Callable[[str], str]) -> Iterator[str]:
     counts = ", ".join(f"{escaped(site)} {n}" for site, n in plan.counts.items())
     column = escaped(plan.column)
     sources = f"{cite('johnson')}, {cite('combat')}"
-    preserved = code(plan.formula) if plan.names else "no variable"
-    if plan.icv is not None:
-        preserved += f", and for {SIZES} also {escaped(plan.icv)}"
     text = (
         f"Effects of {column} ({counts} participants) on"
         f"{' registered' if analysis.registered else ''} maps and summary measures were removed by"
         f" ComBat {sources}. ComBat estimated a shift and a scale of each {column} from the"
-        f" residuals of a linear model at each point, and preserved {preserved}."
+        f" residuals of a linear model at each point, and preserved {_preserved(plan)}."
     )
     if plan.estimated and settings.of(HarmonizationSettings).pooling:
         text += (
@@ -35,11 +33,7 @@ def methods(analysis: Analysis, cite: Callable[[str], str]) -> Iterator[str]:
             " Random intercepts of participants were preserved; the scale describes variation"
             f" within participants {cite('beer')}."
         )
-    if plan.saved is not None:
-        saved_sites = sum(site in plan.saved.sites for site in plan.counts)
-        text += f" Parameters of {saved_sites} levels were taken from an earlier analysis"
-        new = escaped(", ".join(plan.estimated))
-        text += f"; parameters of {new} were estimated here." if new else "."
+    text += _earlier_parameters(plan)
     if plan.estimated and not analysis.comparison.pair:
         columns_lost = len(plan.counts) - 1
         text += (
@@ -53,3 +47,17 @@ def methods(analysis: Analysis, cite: Callable[[str], str]) -> Iterator[str]:
             " with known groups would leak group membership into the cross-validation."
         )
     yield text
+
+
+def _preserved(plan: SitePlan) -> str:
+    text = code(plan.formula) if plan.names else "no variable"
+    return text if plan.icv is None else f"{text}, and for {SIZES} also {escaped(plan.icv)}"
+
+
+def _earlier_parameters(plan: SitePlan) -> str:
+    if plan.saved is None:
+        return ""
+    count = len(plan.counts.keys() & plan.saved.sites.keys())
+    new = escaped(", ".join(plan.estimated))
+    text = f"; parameters of {new} were estimated here" if new else ""
+    return f" Parameters of {count} levels were taken from an earlier analysis{text}."

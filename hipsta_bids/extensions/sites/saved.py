@@ -72,12 +72,12 @@ class SavedEffects(TomlTable):
         for hemi, measures in nested.items():
             for measure, entry in measures.items():
                 try:
-                    own = {name: np.array(entry.get(name, ()), np.float64) for name in ARRAYS}
+                    numbers = {name: np.array(entry.get(name, ()), np.float64) for name in ARRAYS}
                 except (TypeError, ValueError) as error:
                     raise ValueError(f"no numbers of {measure}, {hemi}: {error}") from error
-                points = len(own["mean"])
-                own["slopes"] = own["slopes"].reshape(-1, points)  # without columns: (0,)
-                for name, values in own.items():
+                points = len(numbers["mean"])
+                numbers["slopes"] = numbers["slopes"].reshape(-1, points)  # without columns: (0,)
+                for name, values in numbers.items():
                     counts = rows.get(name, {len(self.sites)})
                     shapes = {(points,)} if name in _FLAT else {(row, points) for row in counts}
                     if values.shape not in shapes:
@@ -86,7 +86,7 @@ class SavedEffects(TomlTable):
                         raise ValueError(f"{name} of {measure}, {hemi}, is infinite")
                     if name in {"sd", "scale"} and (values <= 0).any():
                         raise ValueError(f"{name} of {measure}, {hemi}, is not positive")
-                effects[hemi, measure] = SiteEffects(**own)
+                effects[hemi, measure] = SiteEffects(**numbers)
         return effects
 
 

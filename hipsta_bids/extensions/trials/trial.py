@@ -313,9 +313,8 @@ def run_trial(
     """
     dataset.check_own_dataset(options.out_dir)
     if effect is not None:
-        trials.point_level(
-            settings.multiplicity, settings.of(PowerSettings)
-        )  # refuses before anything is read
+        # Refuses before anything is read.
+        trials.point_level(settings.multiplicity, settings.of(PowerSettings))
     visits = bool(effect and effect.visits)
     options = replace(options, comparison=modeling.Comparison(longitudinal=retest or visits))
     study = studies.read_study(options, settings, among)

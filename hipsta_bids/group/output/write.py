@@ -90,15 +90,13 @@ def write_results(
 ) -> None:
     """Write tables, maps and text; cohorts and analyses are by surface."""
     cohort, analysis = cohorts[SHEET], analyses[SHEET]
-    for surface, surface_cohort in cohorts.items():
-        for name, table in tables.result_tables(
-            surface, surface_cohort, analyses[surface], settings, averages
-        ):
+    for surface in cohorts:
+        tables_of_surface = tables.result_tables(
+            surface, cohorts[surface], analyses[surface], settings, averages
+        )
+        for name, table in tables_of_surface:
             write_table(folder, name, tables.with_references(table, analysis))
-        prefix = f"{surface}_" if surface else ""
-        further = blocks("tables", analysis.request, surface_cohort, analyses[surface], prefix)
-        for name, table, meaning in further:
-            write_table(folder, name, table, meaning=meaning)
+        _write_further(folder, surface, cohorts[surface], analyses[surface])
     if analysis.found:
         overview = tables.overview_table(analysis.found)
         write_table(folder, "maps", tables.with_references(overview, analysis))
@@ -137,6 +135,13 @@ def write_results(
         demographics=people,
     )
     files.write_text(folder / "methods.md", text)
+
+
+def _write_further(folder: Path, surface: str, cohort: Cohort, analysis: results.Analysis) -> None:
+    """Write the tables of extensions about the maps of one surface."""
+    prefix = f"{surface}_" if surface else ""
+    for name, table, meaning in blocks("tables", analysis.request, cohort, analysis, prefix):
+        write_table(folder, name, table, meaning=meaning)
 
 
 def write_exclusions(folder: Path, exclusions: Sequence[Exclusion]) -> None:

@@ -14,6 +14,7 @@ from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.progress import tell
 from hipsta_bids.stats import inference
 from hipsta_bids.stats.clusters import edges_of
+from hipsta_bids.stats.contrasts import Contrast
 from hipsta_bids.stats.glm import FittedMaps
 from hipsta_bids.types import BOTH_SIDES, JOINT, SIDES
 
@@ -50,16 +51,41 @@ def combine_maps(
     names, sides = settings.joint.measures, settings.joint.sides
     if not names:
         return {}
-    fits = {
-        (m, hemi): one for each in analyses for hemi, one in each.fitted.items() for m in one.fits
-    }
     cohort = next(
-        each.compared
-        for each in analyses
-        if any(names[0] in one.fits for one in each.fitted.values())
+        analysis.compared
+        for analysis in analyses
+        if any(names[0] in maps.fits for maps in analysis.fitted.values())
     )
+    groups, contrasts = _groups(analyses, names, sides=sides)
+    if not groups:
+        raise ModelError(f"--joint {' '.join(names)}: no side has them all; remove one")
+    tests_found = inference.correct_joint(
+        groups,
+        contrasts,
+        analyses[0].row_model,
+        analyses[0].compared.table,
+        settings.multiplicity,
+        combine=settings.joint.combine,
+        report=partial(tell, "permutations"),
+    )
+    return {
+        key: JointMap(key=key, parts=groups[key], cohort=cohort, test=test, found=discoveries)
+        for key, (test, discoveries) in tests_found.items()
+    }
+
+
+def _groups(
+    analyses: Sequence[results.Analysis], names: Sequence[str], *, sides: bool
+) -> tuple[dict[inference.MapKey, dict[str, tuple[FittedMaps, str]]], dict[str, Contrast]]:
+    """Find the maps that are tested together, by the key of their test; and contrasts by name."""
+    fits = {
+        (measure, hemi): maps
+        for analysis in analyses
+        for hemi, maps in analysis.fitted.items()
+        for measure in maps.fits
+    }
     groups: dict[inference.MapKey, dict[str, tuple[FittedMaps, str]]] = {}
-    contrasts = {}
+    contrasts: dict[str, Contrast] = {}
     for hemis in [("L", "R")] if sides else [("L",), ("R",), (modeling.BOTH,)]:
         if not all((name, hemi) in fits for hemi, name in product(hemis, names)):
             continue
@@ -70,7 +96,7 @@ def combine_maps(
             )
             for hemi, name in product(hemis, names)
         }
-        _check_points(names, [one for one, _ in parts.values()])
+        _check_points(names, [maps for maps, _ in parts.values()])
         for test in fits[names[0], hemis[0]].fits[names[0]].tests:
             key = inference.MapKey(
                 JOINT,
@@ -78,22 +104,7 @@ def combine_maps(
                 BOTH_SIDES if len(hemis) > 1 else hemis[0],
             )
             groups[key], contrasts[test.contrast.name] = parts, test.contrast
-    if not groups:
-        raise ModelError(f"--joint {' '.join(names)}: no side has them all; remove one")
-    model = analyses[0].row_model
-    tests_found = inference.correct_joint(
-        groups,
-        contrasts,
-        model,
-        analyses[0].compared.table,
-        settings.multiplicity,
-        combine=settings.joint.combine,
-        report=partial(tell, "permutations"),
-    )
-    return {
-        key: JointMap(key=key, parts=groups[key], cohort=cohort, test=test, found=own)
-        for key, (test, own) in tests_found.items()
-    }
+    return groups, contrasts
 
 
 def _check_points(names: Sequence[str], parts: Sequence[FittedMaps]) -> None:

@@ -9,7 +9,7 @@ from hipsta_bids.extensions.maps.volumes import (
     VolumeTable,
     join_volumes,
     read_volumes,
-    table_beside,
+    table_of,
 )
 
 FREESURFER = """\
@@ -45,9 +45,9 @@ def write(path, text):
 )
 def test_freesurfer_table_of_the_same_analysis_is_taken(tmp_path, labels, table):
     write(tmp_path / "mri" / "lh.hippoSfVolumes-T2.v22.txt", FREESURFER)
-    assert table_beside(tmp_path / "mri" / labels) is None
+    assert table_of(tmp_path / "mri" / labels) is None
     path = write(tmp_path / "mri" / table, FREESURFER)
-    assert table_beside(tmp_path / "mri" / labels) == ("freesurfer", path)
+    assert table_of(tmp_path / "mri" / labels) == ("freesurfer", path)
     (hemi,) = volumes = read_volumes(path)
     assert hemi == ("L" if table.startswith("l") else "R")
     assert volumes[hemi]["GC_ML_DG_head"] == 161.5
@@ -57,20 +57,20 @@ def test_freesurfer_table_of_the_same_analysis_is_taken(tmp_path, labels, table)
 @pytest.mark.parametrize("kind", ["heur", "corr_usegray", "corr_nogray"])
 def test_ashs_table_of_the_same_step_is_taken(tmp_path, kind):
     image = tmp_path / "final" / f"sub-01_left_lfseg_{kind}.nii.gz"
-    assert table_beside(image) is None
+    assert table_of(image) is None
     path = write(tmp_path / "final" / f"sub-01_left_{kind}_volumes.txt", ASHS)
-    assert table_beside(image) == ("ashs", path)
+    assert table_of(image) == ("ashs", path)
     assert read_volumes(path) == {"L": {"CA1": 1356.24, "SUB": 402.5, "Br35": 533.01}}
 
 
 def test_hippunfold_table_of_the_same_atlas_is_taken(tmp_path):
     name = "sub-01_hemi-L_space-cropT1w_desc-subfields_atlas-multihist7_dseg.nii.gz"
     write(tmp_path / "sub-01_space-cropT1w_desc-subfields_atlas-bigbrain_volumes.tsv", HIPPUNFOLD)
-    assert table_beside(tmp_path / name) is None
+    assert table_of(tmp_path / name) is None
     table = tmp_path / "sub-01_space-cropT1w_desc-subfields_atlas-multihist7_volumes.tsv"
-    assert table_beside(tmp_path / name) is None
+    assert table_of(tmp_path / name) is None
     write(table, HIPPUNFOLD)
-    assert table_beside(tmp_path / name) == ("hippunfold", table)
+    assert table_of(tmp_path / name) == ("hippunfold", table)
     volumes = read_volumes(table)
     assert volumes["L"] == {"Sub": 500.5, "CA1": 800.25}
     assert np.isnan(volumes["R"]["CA1"])
