@@ -18,18 +18,9 @@ EXCEPTIONS: tuple[tuple[str, str], ...] = ()
 #: Functions that still have to be split. An entry that is no longer needed is an error.
 TO_SPLIT = frozenset(
     """
-    cli/participant.py:_run group/cohort/collect.py:_judge group/cohort/collect.py:collect_sheets
-    group/cohort/external.py:add_external group/cohort/external.py:map_patterns
-    group/cohort/external.py:read_maps group/cohort/read.py:choose_measures
-    group/cohort/read.py:read_sheets group/questions/analysis.py:analyze_cohort
-    group/questions/analysis.py:combine_maps group/questions/compare.py:_analyze
-    group/questions/compare.py:_notes group/questions/harmonize.py:plan_sites
-    group/questions/models.py:register group/questions/replicate.py:replicate
-    group/questions/scores.py:score_cohort group/questions/study.py:read_study
-    participant/job.py:hash_inputs participant/job.py:measure_job participant/measure.py:find_all
-    participant/measure.py:unfold participant/pool.py:run_jobs participant/run.py:_measured
-    participant/run.py:_prepare participant/run.py:_run participant/unfolded.py:resample
-    participant/visits.py:_measure_visits participant/whole.py:measure_whole
+    cli/participant.py:_run participant/job.py:hash_inputs participant/job.py:measure_job
+    participant/pool.py:run_jobs participant/run.py:_measured participant/run.py:_prepare
+    participant/visits.py:_measure_visits
     """.split()  # noqa: SIM905  (a list would take a line per name)
 )
 

@@ -235,6 +235,7 @@ def _add_methods(parser: Parser) -> None:
         "register to the template.json of another analysis, or that in a summary.json or in a"
         " dataset of a template",
     )
+    _add_tests(add)
     add(
         "--base",
         "MEASURE...",
