@@ -125,6 +125,26 @@ class Source:
 
 
 @dataclass(frozen=True, kw_only=True)
+class SessionChoice:
+    """Which sessions of a participant can be compared, beside the first."""
+
+    names: tuple[str, ...]
+    """Names in Python of its options."""
+    hint: str
+    """How a note names them."""
+    options: str
+    """Function that adds them, by a function that adds one."""
+    settings: str
+    """Function of the parsed options; returns what they set, by table of the settings."""
+    make: str
+    """Function of the parsed options and the settings; returns the sessions
+    (`hipsta_bids.group.model.Sessions`), ``None`` for the default."""
+    page: str
+    """Function of the record of a comparison; returns the description of a row and the name of the
+    estimate that may be missing, ``None`` for the default."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Page:
     """A page that ``--reports-only`` makes again, beside the pages of analyses."""
 
@@ -147,6 +167,7 @@ class Extension:
     steps: tuple[Step, ...] = ()
     sources: tuple[Source, ...] = ()
     pages: tuple[Page, ...] = ()
+    sessions: tuple[SessionChoice, ...] = ()
     protocols: str = ""
     """Function of the options and settings of the group level, and of protocols: runs each."""
     functions: tuple[str, ...] = ()
@@ -191,6 +212,11 @@ def find_functions() -> dict[str, str]:
 def find_sources() -> tuple[Source, ...]:
     """Find what extensions read beside the sheets, in the order of reading."""
     return tuple(source for extension in find_extensions() for source in extension.sources)
+
+
+def find_sessions() -> tuple[SessionChoice, ...]:
+    """Find which sessions can be compared, beside the first of each participant."""
+    return tuple(choice for extension in find_extensions() for choice in extension.sessions)
 
 
 def find_questions() -> tuple[Question, ...]:

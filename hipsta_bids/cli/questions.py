@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from operator import attrgetter
 from typing import TYPE_CHECKING
 
+from hipsta_bids import joints
 from hipsta_bids.cli.parser import Parser, adder, factor_level
 from hipsta_bids.errors import UsageError
-from hipsta_bids.joints import find_parts, find_protocols, find_questions, find_steps, load
 
 if TYPE_CHECKING:
     from hipsta_bids.group.questions.study import GroupOptions, GroupResult
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 #: Options that only comparisons have.
 _COMPARISON_ONLY = (
-    *("longitudinal", "endpoint", "paired", "asymmetry", "model", "contrast"),
+    *("asymmetry", "model", "contrast"),
     *("permutations", "blocks", "fdr_scope", "base", "no_classification"),
     *("joint", "joint_sides"),
 )
@@ -24,15 +24,15 @@ _COMPARISON_ONLY = (
 
 def listed_questions() -> str:
     """List the options that ask questions, for the help."""
-    flags = [_flag(name) for question in find_questions() for name in question.flags]
+    flags = [_flag(name) for question in joints.find_questions() for name in question.flags]
     return f"{', '.join(flags)}: questions of their own, each in a folder of OUT_DIR/group"
 
 
 def add_questions(parser: Parser) -> None:
     """Add all options of these questions."""
-    for question in find_questions():
-        load(question.options)(parser)
-    if not find_questions():
+    for question in joints.find_questions():
+        joints.load(question.options)(parser)
+    if not joints.find_questions():
         return
     adder(parser.add_argument_group("for trials and norms"))(
         "--among",
@@ -44,7 +44,9 @@ def add_questions(parser: Parser) -> None:
 
 def is_question(parsed: argparse.Namespace) -> bool:
     """Check whether something other than a comparison is asked."""
-    return any(getattr(parsed, name) for question in find_questions() for name in question.flags)
+    return any(
+        getattr(parsed, name) for question in joints.find_questions() for name in question.flags
+    )
 
 
 def run_comparison(
@@ -53,7 +55,7 @@ def run_comparison(
     """Compare participants."""
     from hipsta_bids.group.questions.compare import run_group  # noqa: PLC0415  (heavy)
 
-    for question in find_questions():
+    for question in joints.find_questions():
         refuse(parsed, question.dependents, f"without {question.without}")
     multiplicity = settings.multiplicity
     if not settings.joint.measures and not multiplicity.method.startswith("permutation"):
@@ -69,9 +71,9 @@ def run_comparison(
     protocols = tuple(dict.fromkeys(parsed.seg))
     if len(protocols) < 2:  # noqa: PLR2004  (to compare)
         return run_group(options, settings)
-    if not find_protocols():
+    if not joints.find_protocols():
         raise UsageError("--seg: name one protocol")
-    result: GroupResult = load(find_protocols())(options, settings, protocols)
+    result: GroupResult = joints.load(joints.find_protocols())(options, settings, protocols)
     return result
 
 
@@ -79,26 +81,29 @@ def run_question(
     parsed: argparse.Namespace, options: "GroupOptions", settings: "GroupSettings"
 ) -> "GroupResult":
     """Answer the question that options ask."""
-    questions = [q for q in find_questions() if any(getattr(parsed, name) for name in q.flags)]
+    questions = [
+        q for q in joints.find_questions() if any(getattr(parsed, name) for name in q.flags)
+    ]
     flags = [_flag(name) for q in questions for name in q.flags if getattr(parsed, name)]
     if len(questions) > 1:
         raise UsageError(f"give one of {', '.join(flags)}")
-    names = [part.name for part in find_parts()]
-    names += [name for step in find_steps() for name in step.names]
-    refuse(parsed, (*_COMPARISON_ONLY, *names), f"with {' and '.join(flags)}")
+    named = [name for choice in joints.find_sessions() for name in choice.names]
+    names = [part.name for part in joints.find_parts()]
+    names += [name for step in joints.find_steps() for name in step.names]
+    refuse(parsed, (*named, *_COMPARISON_ONLY, *names), f"with {' and '.join(flags)}")
     if len(set(parsed.seg)) > 1:
         raise UsageError(f"--seg: name one protocol with {' and '.join(flags)}")
-    for setting in filter(None, (step.setting for step in find_steps())):
+    for setting in filter(None, (step.setting for step in joints.find_steps())):
         if attrgetter(setting)(settings):
             raise UsageError(
                 f"{' and '.join(flags)}: {setting} is not possible; remove it from the settings"
             )
     (question,) = questions
-    for further in find_questions():
+    for further in joints.find_questions():
         if further is not question:
             names = [name for name in further.dependents if name not in question.dependents]
             refuse(parsed, names, f"without {further.without}")
-    result: GroupResult = load(question.run)(parsed, options, settings)
+    result: GroupResult = joints.load(question.run)(parsed, options, settings)
     return result
 
 

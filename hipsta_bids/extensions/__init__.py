@@ -4,4 +4,4 @@
 """
 
 #: Folders, in the order of the help.
-NAMES = ("sites", "consortia", "trials", "norms", "agreement", "maps")
+NAMES = ("repeated", "sites", "consortia", "trials", "norms", "agreement", "maps")

@@ -39,7 +39,7 @@ def methods(analysis: Analysis, cite: Callable[[str], str]) -> Iterator[str]:
         text += f" Parameters of {saved_sites} levels were taken from an earlier analysis"
         new = escaped(", ".join(plan.estimated))
         text += f"; parameters of {new} were estimated here." if new else "."
-    if plan.estimated and not analysis.comparison.pair:
+    if plan.estimated and not analysis.comparison.sessions.later:
         columns_lost = len(plan.counts) - 1
         text += (
             f" Because shifts were estimated from the same participants, {column} was also a factor"

@@ -311,7 +311,8 @@ def run_trial(
     if effect is not None:
         trials.point_level(settings.multiplicity, settings.power)  # refuses before anything is read
     visits = bool(effect and effect.visits)
-    options = replace(options, comparison=modeling.Comparison(longitudinal=retest or visits))
+    sessions = modeling.AllSessions() if retest or visits else modeling.Sessions()
+    options = replace(options, comparison=modeling.Comparison(sessions=sessions))
     study = studies.read_study(options, settings, among)
     source: Source
     if retest:

@@ -34,15 +34,16 @@ def with_mixes(
     ``rows`` are visits or, of pairs of sessions, participants; without ``terms`` they do not count.
     ``source`` names a file of norms or effects of sites, and the segmentations that it rests on.
     """
-    table, sides, pair = study.cohort.table, study.cohort.sides, study.options.comparison.pair
+    table, sides = study.cohort.table, study.cohort.sides
+    is_change = bool(study.options.comparison.sessions.later)
     records = ((record.result.name, record.provenance) for record in study.collection.records)
     origins = {(visit_name(n.subject, n.session), n.hemi): origin for n, origin in records}
     places = [(visit, hemi) for hemi, side in sides.items() for visit in table.index[side.rows]]
     entries = [(*place, *origins[place]) for place in places if place in origins]
     frame = pd.DataFrame(entries, columns=["visit", "side", *PROVENANCE])
     frame = frame.join(table[[PARTICIPANT, SESSION]], on="visit")
-    key = PARTICIPANT if pair else "visit"
-    is_used = frame.duplicated([PARTICIPANT, "side"], keep=False) | (pair is None)
+    key = PARTICIPANT if is_change else "visit"
+    is_used = frame.duplicated([PARTICIPANT, "side"], keep=False) | (not is_change)
     complete = pd.DataFrame({t: typed(rows[t]) for t in terms if t in rows}, rows.index).dropna()
     frame = frame[is_used & frame[key].isin(complete.index)]
     frame = frame.assign(voxel_size=frame["voxel_size"].map(_sizes(Counter(frame["voxel_size"]))))

@@ -385,14 +385,15 @@ def _study(
     cohorts = {SHEET: all_visits, **surfaces}
     rows = np.concatenate([side.rows for one in cohorts.values() for side in one.sides.values()])
     has_maps = np.isin(np.arange(len(all_visits.table)), rows)
-    comparison = options.comparison
-    cohort, reasons = choose_visits(all_visits.take(has_maps), comparison)
+    sessions = options.comparison.sessions
+    cohort, reasons = choose_visits(all_visits.take(has_maps), sessions)
     keep = all_visits.table.index.isin(cohort.table.index)
     table, icv = add_icv(cohort.table, measured.sources, settings)
-    time = add_time(table, settings, comparison) if comparison.longitudinal else None
+    time = None
+    if sessions.is_repeated:
+        time = sessions.with_visits(add_time(table, settings), settings)
     cohort = replace(cohort, table=table if time is None else time.table)
-    reason = "other-session" if comparison.pair or comparison.endpoint else "later-session"
-    reasons_of = {visit: (reason, message) for visit, message in reasons.items()}
+    reasons_of = {visit: (sessions.reason, message) for visit, message in reasons.items()}
     return Study(
         options=options,
         settings=settings,
