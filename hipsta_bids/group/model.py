@@ -15,7 +15,7 @@ from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.io import files
 from hipsta_bids.stats import formula as formulas
 from hipsta_bids.stats.arrays import Bool, SideMaps
-from hipsta_bids.stats.design import AGES, Design
+from hipsta_bids.stats.design import AGES, VISIT, Design
 from hipsta_bids.stats.formula import declared_levels, folder_name
 from hipsta_bids.stats.glm import PointwiseFit, RowModel
 from hipsta_bids.stats.grammar import closed_formula
@@ -129,6 +129,9 @@ class Sessions:
     """Whether groups are classified, by the first rows of participants."""
     reason: ClassVar[str] = "later-session"
     """Of sessions that are not compared."""
+    kind: ClassVar[str] = "linear model"
+    sd: ClassVar[str] = "the residual standard deviation"
+    """Divisor of Cohen's d."""
 
     @property
     def suffix(self) -> str:
@@ -138,6 +141,11 @@ class Sessions:
     @property
     def later(self) -> str:
         """The session from which the first one is subtracted; empty without differences."""
+        return ""
+
+    @property
+    def subject(self) -> str:
+        """To what models are fitted, if not to the maps as they are."""
         return ""
 
     def record(self) -> dict[str, Any]:
@@ -177,11 +185,7 @@ class Sessions:
         return rows
 
     def row_models(
-        self,
-        table: pd.DataFrame,
-        time: str | None,
-        groups: Groups | None,
-        settings: GroupSettings,
+        self, table: pd.DataFrame, time: str | None, groups: Groups | None, settings: GroupSettings
     ) -> Callable[[Design], RowModel]:
         """Return what makes the model of the rows of a design."""
         return partial(RowModel, settings=settings.glm)
@@ -195,18 +199,9 @@ class Sessions:
         """Return contrasts of the default model: groups, and whether covariates bend."""
         return [*(groups.contrasts() if groups else ()), *bends]
 
-    def visit_contrasts(
-        self, formula: str, groups: Groups | None, visits: VisitTime | None
-    ) -> list[str] | None:
-        """Return contrasts of visits in a user's formula; ``None`` without these."""
-
-    def references(self, formula: str, visits: VisitTime | None) -> dict[str, str]:
-        """Return reference levels of factors that visits add."""
-        return {}
-
-    def words(self) -> tuple[str, str, str]:
-        """Return the kind of model, its subject if that is not the maps, and Cohen's d."""
-        return "linear model", "", "the estimate divided by the residual standard deviation"
+    def of_visits(self, groups: Sequence[str], labels: Sequence[str]) -> list[str]:
+        """Return contrasts of visits as categories, from contrasts of groups."""
+        return [*groups]
 
     def methods(
         self, model: RowModel, fits: Sequence[PointwiseFit], settings: GroupSettings, cite: Cite
@@ -294,8 +289,9 @@ def choose_model(
         request, table, groups, settings, comparison=comparison, visits=visits
     )
     model = formulas.parse_model(document)
-    sessions = (comparison or Comparison()).sessions
-    return document, model, groups, references | sessions.references(model.formula, visits)
+    if visits is not None and visits.labels and VISIT in closed_formula(model.formula).names:
+        references[VISIT] = visits.labels[0]
+    return document, model, groups, references
 
 
 def _requested_references(request: ModelRequest) -> dict[str, str]:
@@ -364,9 +360,8 @@ def _formula_contrasts(
     plain, maps = formulas.split_maps(formula)
     if groups is not None and groups.column not in plain:
         groups = None
-    of_visits = sessions.visit_contrasts(plain, groups, visits)
-    if of_visits is not None:
-        return of_visits
+    if visits is not None and visits.labels and VISIT in closed_formula(plain).names:
+        return sessions.of_visits(groups.contrasts() if groups else [], visits.labels)
     if groups is None:
         return []
     terms = (f"map({name})" for name in maps)

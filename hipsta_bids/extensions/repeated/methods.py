@@ -23,7 +23,7 @@ def random_effects(model: RowModel, cite: Cite) -> str:
     )
 
 
-def slopes(fits: Sequence[PointwiseFit], cite: Cite) -> str:
+def slopes_text(fits: Sequence[PointwiseFit], cite: Cite) -> str:
     """Return at how many points slopes vary, and at how many they were omitted."""
     p = np.concatenate([fit.slopes_p for fit in fits if fit.slopes_p is not None] or [np.empty(0)])
     tested = int(np.isfinite(p).sum())

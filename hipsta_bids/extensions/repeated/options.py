@@ -38,23 +38,22 @@ def given_settings(parsed: argparse.Namespace) -> Mapping[str, Mapping[str, Any]
 
 def choose_sessions(parsed: argparse.Namespace, settings: "GroupSettings") -> "Sessions | None":
     """Return the sessions that options name; ``None`` without these options."""
-    from hipsta_bids.extensions.repeated.longitudinal import Longitudinal  # noqa: PLC0415  (heavy)
-    from hipsta_bids.extensions.repeated.pair import Pair  # noqa: PLC0415  (heavy)
-    from hipsta_bids.extensions.repeated.visits import Trial, Visits  # noqa: PLC0415  (heavy)
+    from hipsta_bids.extensions.repeated import sessions  # noqa: PLC0415  (heavy)
 
     if parsed.endpoint and (parsed.paired or parsed.longitudinal):
         raise UsageError("give one of --longitudinal, --paired and --endpoint")
     if parsed.longitudinal and parsed.paired:
         raise UsageError("give --longitudinal (all sessions) or --paired (two), not both")
     if parsed.endpoint:
-        kind, *sessions = parsed.endpoint
-        trial = Trial(kind, tuple(f"ses-{name.removeprefix('ses-')}" for name in sessions))
+        kind, *names = parsed.endpoint
+        trial = sessions.Trial((kind, *(f"ses-{name.removeprefix('ses-')}" for name in names)))
         if parsed.asymmetry:
             raise UsageError("--endpoint: remove --asymmetry")
         return trial
     if parsed.paired:
         first, second = parsed.paired
-        return Pair(f"ses-{first}", f"ses-{second}")
+        return sessions.Pair(f"ses-{first}", f"ses-{second}")
     if parsed.longitudinal:
-        return Visits() if settings.longitudinal.random == "visits" else Longitudinal()
+        has_categories = settings.longitudinal.random == "visits"
+        return sessions.Visits() if has_categories else sessions.Longitudinal()
     return None

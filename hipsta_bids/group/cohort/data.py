@@ -81,12 +81,6 @@ def participants_with(finite: Bool, participants: NDArray[np.object_]) -> Int:
     )
 
 
-def choose_visits(cohort: Cohort, sessions: Sessions) -> tuple[Cohort, Mapping[str, str]]:
-    """Keep the visits that are compared; also why others are excluded."""
-    keep, reasons = sessions.choose(cohort.table)
-    return cohort.take(keep), dict(reasons[~keep])
-
-
 def compare_sessions(cohort: Cohort, sessions: Sessions, covariates: Sequence[str] = ()) -> Cohort:
     """Return the rows of the model, with their maps, of which some are covariates."""
     sides = sessions.compare(cohort.table, cohort.sides, covariates)

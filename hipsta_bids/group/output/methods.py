@@ -183,10 +183,9 @@ def _models(analysis: Analysis, settings: GroupSettings, cite: Callable[[str], s
     levels = escaped(", ".join(map(" ".join, analysis.design.references.items())))
     fits = [fit for one in analysis.fitted.values() for fit in one.fits.values()]
     sessions = analysis.comparison.sessions
-    kind, subject, d = sessions.words()
     text = (
-        f"A {kind}, {code(analysis.model.text)}, was fitted at each point of the sheet{subject}"
-        f"{f' (reference levels: {levels})' if levels else ''}."
+        f"A {sessions.kind}, {code(analysis.model.text)}, was fitted at each point of the sheet"
+        f"{sessions.subject}{f' (reference levels: {levels})' if levels else ''}."
     )
     if analysis.model.maps:
         text += f" Maps were covariates, with the value of each point {cite('point-covariates')}."
@@ -203,7 +202,9 @@ def _models(analysis: Analysis, settings: GroupSettings, cite: Callable[[str], s
         text += f" Contrasts of several rows were tested by F {cite('fai')}."
     text += sessions.findings(fits, cite)
     text += f" {_correction(settings.multiplicity, cite, analysis)}"
-    kinds = [f"Cohen's d ({d})"] * any(one.n_rows == 1 for one in contrasts)
+    kinds = [f"Cohen's d (the estimate divided by {sessions.sd})"] * any(
+        one.n_rows == 1 for one in contrasts
+    )
     kinds += ["partial eta squared"] * any(one.n_rows > 1 for one in contrasts)
     adjusted = any(formula != analysis.model.formula for _, formula in analysis.measures)
     sizes = f"; {SIZES} were also adjusted for intracranial volume" if adjusted else ""

@@ -18,18 +18,13 @@ EXCLUDED: Mapping[str, Sequence[str]] = {"map() in the formula": ("summary measu
 def plan_steps(request: Request) -> Request:
     """Plan the steps that are asked; ModelError if two of them exclude each other."""
     steps = [step for step in find_steps() if load(step.condition)(request)]
+    flags = {*_flags(request), *(step.flag for step in steps)}
     excluded = {**EXCLUDED, **request.comparison.sessions.excludes()}
-    _check_flags({*_flags(request), *(step.flag for step in steps)}, excluded)
-    plans = {step.name: load(step.plan)(request) for step in steps}
-    return replace(request, plans=plans)
-
-
-def _check_flags(flags: set[str], excluded: Mapping[str, Sequence[str]]) -> None:
-    """Refuse flags of which one excludes another."""
-    excluded = {**excluded, **{step.flag: step.excludes for step in find_steps()}}
-    for flag, rivals in excluded.items():
+    for flag, rivals in (excluded | {step.flag: step.excludes for step in steps}).items():
         if flag in flags and (problems := [name for name in rivals if name in flags]):
             raise ModelError(f"{flag}: not with {listed(problems)}; remove one of them")
+    plans = {step.name: load(step.plan)(request) for step in steps}
+    return replace(request, plans=plans)
 
 
 def _flags(request: Request) -> Iterator[str]:
