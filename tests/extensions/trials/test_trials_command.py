@@ -275,7 +275,7 @@ def test_harmonization_of_the_settings_is_refused(dataset, tmp_path, capsys):
     data, out = dataset
     asked = ["--power", "thinning=5%", "--settings", str(settings)]
     assert main([str(data), str(out), "group", *asked]) == 64
-    assert "harmonization is not possible" in capsys.readouterr().err
+    assert "harmonization.column is not possible" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
