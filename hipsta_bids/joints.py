@@ -127,6 +127,26 @@ class Source:
 
 
 @dataclass(frozen=True, kw_only=True)
+class SessionChoice:
+    """Which sessions of a participant can be compared, beside the first."""
+
+    names: tuple[str, ...]
+    """Names in Python of its options."""
+    hint: str
+    """How a note names them."""
+    options: str
+    """Function that adds them, by a function that adds one."""
+    settings: str
+    """Function of the parsed options; returns what they set, by table of the settings."""
+    make: str
+    """Function of the parsed options and the settings; returns the sessions
+    (`hipsta_bids.group.model.Sessions`), ``None`` for the default."""
+    page: str
+    """Function of the record of a comparison; returns the description of a row and the name of the
+    estimate that may be missing, ``None`` for the default."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Page:
     """A page that ``--reports-only`` makes again, beside the pages of analyses."""
 
@@ -162,6 +182,7 @@ class Extension:
     group_settings: tuple[tuple[str, str], ...] = ()
     """Tables of the settings of the group level: name, and class as ``module:name``."""
     pages: tuple[Page, ...] = ()
+    sessions: tuple[SessionChoice, ...] = ()
     protocols: str = ""
     """Function of the options and settings of the group level, and of protocols: runs each."""
     functions: tuple[str, ...] = ()
@@ -248,7 +269,14 @@ def find_sources() -> tuple[Source, ...]:
 
 def find_settings() -> dict[str, str]:
     """Find tables of settings by name; two extensions may share one."""
-    return {name: place for one in find_extensions() for name, place in one.group_settings}
+    return {
+        name: place for extension in find_extensions() for name, place in extension.group_settings
+    }
+
+
+def find_sessions() -> tuple[SessionChoice, ...]:
+    """Find which sessions can be compared, beside the first of each participant."""
+    return tuple(choice for extension in find_extensions() for choice in extension.sessions)
 
 
 def find_questions() -> tuple[Question, ...]:

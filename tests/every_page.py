@@ -107,16 +107,19 @@ COMMANDS = [
         )
     ]
     * AGREEMENT,
-    (
-        f"{TRIAL} --longitudinal --no-classification --settings quick.toml --name slopes",
-        0,
-        ["visits/out/group/slopes.html"],
-    ),
-    (
-        f"{TRIAL} --paired 1 3 --no-classification --settings quick.toml --name pairs",
-        0,
-        ["visits/out/group/pairs.html"],
-    ),
+    *[
+        (
+            f"{TRIAL} --longitudinal --no-classification --settings quick.toml --name slopes",
+            0,
+            ["visits/out/group/slopes.html"],
+        ),
+        (
+            f"{TRIAL} --paired 1 3 --no-classification --settings quick.toml --name pairs",
+            0,
+            ["visits/out/group/pairs.html"],
+        ),
+    ]
+    * ("repeated" in PRESENT),
     *[
         (f"{TRIAL} --retest --name again", 0, ["visits/out/group/again.html"]),
         (f"{TRIAL} --power thinning=5% --name sizes", 0, ["visits/out/group/sizes.html"]),

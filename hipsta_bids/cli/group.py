@@ -203,21 +203,8 @@ def _add_model(parser: Parser) -> None:
 
 def _add_comparison(parser: Parser) -> None:
     add = adder(parser.add_argument_group("sessions and sides (default: first sessions)"))
-    add(
-        "--longitudinal",
-        "",
-        "all sessions: mixed model with intercepts or slopes (default: slopes from 10 "
-        "participants with three visits), or visits as categories",
-        nargs="?",
-        const="auto",
-        choices=["auto", "intercept", "slope", "visits"],
-    )
-    add(
-        "--endpoint",
-        "MODEL...",
-        "a trial: ancova, mmrm or clda, the session of the baseline, and later sessions",
-    )
-    add("--paired", "SES1 SES2", "the second session minus the first", type=bids_label("ses-"))
+    for choice in joints.find_sessions():
+        joints.load(choice.options)(add)
     add("--asymmetry", "", "also maps of left minus right")
 
 
@@ -369,7 +356,7 @@ def _run(parsed: argparse.Namespace, arguments: Sequence[str]) -> ExitCode:
         answer = (
             questions.run_question if questions.is_question(parsed) else questions.run_comparison
         )
-        result = answer(parsed, _options(parsed, arguments), settings)
+        result = answer(parsed, _options(parsed, arguments, settings), settings)
     for warning in result.warnings:
         warn(f"warning: {warning}")
     for note in result.notes:
@@ -424,16 +411,15 @@ def _settings(parsed: argparse.Namespace) -> "GroupSettings":
         },
         "design": {"mixed": tuple(parsed.mixed) or None},
         "model": {"age": parsed.age_model},
-        "longitudinal": {"random": parsed.longitudinal},
         "classification": {
             "base": tuple(parsed.base) or None,
             "added": () if parsed.no_classification else None,
         },
         "joint": {"measures": tuple(parsed.joint) or None, "sides": parsed.joint_sides or None},
     }
-    for question in joints.find_questions():
-        if question.settings:
-            choices |= joints.load(question.settings)(parsed)
+    places = [choice.settings for choice in joints.find_sessions()]
+    for place in (*places, *(question.settings for question in joints.find_questions())):
+        choices |= joints.load(place)(parsed) if place else {}
     settings = load_group_settings(parsed.settings)
     settings = settings.changed(**given_settings(choices))
     for step in joints.find_steps():
@@ -442,9 +428,11 @@ def _settings(parsed: argparse.Namespace) -> "GroupSettings":
     return settings
 
 
-def _options(parsed: argparse.Namespace, arguments: Sequence[str]) -> "GroupOptions":
+def _options(
+    parsed: argparse.Namespace, arguments: Sequence[str], settings: "GroupSettings"
+) -> "GroupOptions":
     from hipsta_bids.group.cohort.collect import GroupRequest  # noqa: PLC0415  (heavy)
-    from hipsta_bids.group.model import Comparison, ModelRequest  # noqa: PLC0415  (heavy)
+    from hipsta_bids.group.model import Comparison, ModelRequest, Sessions  # noqa: PLC0415  (heavy)
     from hipsta_bids.group.questions.study import GroupOptions  # noqa: PLC0415  (heavy)
 
     sheets = from_namespace(
@@ -464,26 +452,17 @@ def _options(parsed: argparse.Namespace, arguments: Sequence[str]) -> "GroupOpti
         contrasts=tuple(parsed.contrast),
         references=tuple(parsed.reference),
     )
-    pair = parsed.paired and (f"ses-{parsed.paired[0]}", f"ses-{parsed.paired[1]}")
-    if parsed.endpoint and (pair or parsed.longitudinal):
-        raise UsageError("give one of --longitudinal, --paired and --endpoint")
-    named = [f"ses-{name.removeprefix('ses-')}" for name in parsed.endpoint[1:]]
-    comparison = from_namespace(
-        Comparison,
-        parsed,
-        longitudinal=parsed.longitudinal is not None or bool(parsed.endpoint),
-        endpoint=(*parsed.endpoint[:1], *named),
-        pair=pair,
-    )
+    choices = (joints.load(choice.make)(parsed, settings) for choice in joints.find_sessions())
+    sessions = next(filter(None, choices), Sessions())
     return from_namespace(
         GroupOptions,
         parsed,
         out_dir=parsed.output_dir,
         sheets=sheets,
         model=model,
-        comparison=comparison,
+        comparison=Comparison(sessions=sessions, asymmetry=parsed.asymmetry),
         sources=tuple(
-            one for source in joints.find_sources() for one in joints.load(source.make)(parsed)
+            data for source in joints.find_sources() for data in joints.load(source.make)(parsed)
         ),
         measures=tuple(dict.fromkeys(parsed.measures)),
         reports=not parsed.no_reports,

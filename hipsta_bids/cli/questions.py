@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 #: Options that only comparisons have.
 _COMPARISON_ONLY = (
-    *("longitudinal", "endpoint", "paired", "asymmetry", "model", "contrast"),
+    *("asymmetry", "model", "contrast"),
     *("permutations", "blocks", "fdr_scope", "base", "no_classification"),
     *("joint", "joint_sides"),
 )
@@ -97,9 +97,10 @@ def _check_alone(
     parsed: argparse.Namespace, question: joints.Question, flags: str, settings: "GroupSettings"
 ) -> None:
     """Refuse options and settings that a question does not take."""
+    named = [name for choice in joints.find_sessions() for name in choice.names]
     names = [part.name for part in joints.find_parts()]
     names += [name for step in joints.find_steps() for name in step.names]
-    refuse(parsed, (*_COMPARISON_ONLY, *names), f"with {flags}")
+    refuse(parsed, (*named, *_COMPARISON_ONLY, *names), f"with {flags}")
     if len(set(parsed.seg)) > 1:
         raise UsageError(f"--seg: name one protocol with {flags}")
     for setting in filter(None, (step.setting for step in joints.find_steps())):

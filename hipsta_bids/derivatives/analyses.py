@@ -39,6 +39,11 @@ class GroupResults:
         return self.folder.name
 
     @property
+    def is_change(self) -> bool:
+        """Whether values are differences of two sessions."""
+        return bool((self.record.get("comparison") or {}).get("pair"))
+
+    @property
     def levels(self) -> tuple[str, ...]:
         """Groups that are compared, from least to most affected; may be empty."""
         return tuple(str(level) for level in (self.record.get("groups") or {}).get("levels", ()))

@@ -5,6 +5,6 @@
 
 #: Folders, in the order of the help.
 NAMES = (
-    *("sites", "consortia", "trials", "norms", "agreement", "maps"),
+    *("repeated", "sites", "consortia", "trials", "norms", "agreement", "maps"),
     *("regions", "surrogate", "export"),
 )

@@ -1,25 +1,30 @@
 """Which model is fitted: the user's, or the paper's default."""
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
+import numpy as np
 import pandas as pd
 
 from hipsta_bids.errors import ModelError, UsageError
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.io import files
 from hipsta_bids.stats import formula as formulas
-from hipsta_bids.stats.design import AGES
+from hipsta_bids.stats.arrays import Bool, SideMaps
+from hipsta_bids.stats.design import AGES, VISIT, Design
 from hipsta_bids.stats.formula import declared_levels, folder_name
+from hipsta_bids.stats.glm import PointwiseFit, RowModel
 from hipsta_bids.stats.grammar import closed_formula
 from hipsta_bids.stats.marginal import NONLINEAR
 from hipsta_bids.stats.references import choose_reference
-from hipsta_bids.stats.visits import VISIT, check_endpoint, visit_contrasts
 from hipsta_bids.types import PARTICIPANT, SESSION
 
+#: Cites a reference by its key.
+Cite = Callable[[str], str]
 #: Both sides of a participant, in names of hemispheres.
 BOTH = "LR"
 
@@ -92,27 +97,6 @@ def default_formula(
     return " + ".join(terms)
 
 
-def default_contrasts(
-    groups: Groups | None, time: str | None, nonlinear: Sequence[str] = ()
-) -> list[str]:
-    """Contrasts of the default model.
-
-    Groups, changes over time in each, their differences, and whether covariates bend.
-    """
-    bends = [f"{name} nonlinear = {NONLINEAR}({name})" for name in nonlinear]
-    if groups is None:
-        return [*([time] if time else []), *bends]
-    contrasts = [*groups.contrasts(), *bends]
-    if time is None:
-        return contrasts
-    slopes = {level: f"{groups.column}[T.{level}]:{time}" for level in groups.levels[1:]}
-    contrasts.append(f"{time} in {groups.reference} = {time}")
-    for level, slope in slopes.items():
-        contrasts.append(f"{time} in {level} = {time} + {slope}")
-        contrasts.append(f"{time} in {groups.reference}-{level} = -1*{slope}")
-    return contrasts
-
-
 def empty_covariates(table: pd.DataFrame, settings: GroupSettings) -> list[str]:
     """Name covariates of the default model whose column holds nothing."""
     names = {name.casefold() for name in settings.model.covariates}
@@ -133,40 +117,120 @@ class VisitTime:
     """Visits in their order, if they are categories."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Comparison:
-    """Which sessions and sides of a participant are compared; by default the first session."""
+@dataclass(frozen=True)
+class Sessions:
+    """Which sessions are compared: the first of each participant. Extensions have others."""
 
-    longitudinal: bool = False
-    """All sessions, or those of ``endpoint``, by a model of repeated visits."""
-    endpoint: tuple[str, ...] = ()
-    """``ancova``, ``mmrm`` or ``clda``, the baseline's session, and later ones, with ``ses-``."""
-    pair: tuple[str, str] | None = None
-    """Two sessions, with ``ses-``: the second minus the first is analyzed."""
-    asymmetry: bool = False
-    """Also left minus right."""
+    is_repeated: ClassVar[bool] = False
+    """Whether rows are visits, of which a participant may have several."""
+    has_changes: ClassVar[bool] = False
+    """Whether the default model tests changes, also without groups."""
+    is_classified: ClassVar[bool] = True
+    """Whether groups are classified, by the first rows of participants."""
+    reason: ClassVar[str] = "later-session"
+    """Of sessions that are not compared."""
+    kind: ClassVar[str] = "linear model"
+    sd: ClassVar[str] = "the residual standard deviation"
+    """Divisor of Cohen's d."""
 
     @property
     def suffix(self) -> str:
         """The part of names that distinguishes folders of results of one formula."""
-        if self.pair:
-            return f"_change-{'-'.join(label.removeprefix('ses-') for label in self.pair)}"
-        if self.endpoint:
-            return f"_{'-'.join(label.removeprefix('ses-') for label in self.endpoint)}"
-        return "_longitudinal" if self.longitudinal else ""
+        return ""
 
     @property
-    def adjusted(self) -> str | None:
-        """Session of the baseline, if it is a covariate."""
-        return self.endpoint[1] if self.endpoint and self.endpoint[0] != "clda" else None
+    def later(self) -> str:
+        """The session from which the first one is subtracted; empty without differences."""
+        return ""
 
-    def __post_init__(self) -> None:
-        if self.longitudinal and self.pair:
-            raise UsageError("give --longitudinal (all sessions) or --paired (two), not both")
-        if self.endpoint:
-            check_endpoint(self.endpoint)
-            if self.asymmetry:
-                raise UsageError("--endpoint: remove --asymmetry")
+    @property
+    def subject(self) -> str:
+        """To what models are fitted, if not to the maps as they are."""
+        return ""
+
+    def record(self) -> dict[str, Any]:
+        """Return the entries of the record."""
+        return {"longitudinal": self.is_repeated, "endpoint": (), "pair": None}
+
+    def excludes(self) -> Mapping[str, Sequence[str]]:
+        """Return flags, and the flags beside which they are refused."""
+        return {}
+
+    def choose(self, table: pd.DataFrame) -> tuple[Bool, pd.Series]:
+        """Choose rows of a table of visits, and return why each is excluded if it is."""
+        message = "the first session of each participant is analyzed"
+        return ~table[PARTICIPANT].duplicated().to_numpy(), pd.Series(message, index=table.index)
+
+    def with_visits(self, time: VisitTime, settings: GroupSettings) -> VisitTime:
+        """Add visits as categories."""
+        return time
+
+    def rows(self, table: pd.DataFrame) -> pd.DataFrame:
+        """Return the rows of the model from the visits that were chosen."""
+        return table
+
+    def compare(
+        self, table: pd.DataFrame, sides: Mapping[str, SideMaps], covariates: Sequence[str]
+    ) -> Mapping[str, SideMaps]:
+        """Return maps of the rows of the model; some of them are covariates."""
+        if not covariates:
+            return sides
+        return {
+            hemi: replace(side, covariates={name: side.maps[name] for name in covariates})
+            for hemi, side in sides.items()
+        }
+
+    def described(self, rows: pd.DataFrame, table: pd.DataFrame) -> pd.DataFrame:
+        """Return visits, of which the first of each participant is described."""
+        return rows
+
+    def row_models(
+        self, table: pd.DataFrame, time: str | None, groups: Groups | None, settings: GroupSettings
+    ) -> Callable[[Design], RowModel]:
+        """Return what makes the model of the rows of a design."""
+        return partial(RowModel, settings=settings.glm)
+
+    def check_default(self, table: pd.DataFrame, time: str | None, settings: GroupSettings) -> None:
+        """Refuse visits that the default model cannot have."""
+
+    def contrasts(
+        self, groups: Groups | None, visits: VisitTime | None, bends: Sequence[str]
+    ) -> list[str]:
+        """Return contrasts of the default model: groups, and whether covariates bend."""
+        return [*(groups.contrasts() if groups else ()), *bends]
+
+    def of_visits(self, groups: Sequence[str], labels: Sequence[str]) -> list[str]:
+        """Return contrasts of visits as categories, from contrasts of groups."""
+        return [*groups]
+
+    def methods(
+        self, model: RowModel, fits: Sequence[PointwiseFit], settings: GroupSettings, cite: Cite
+    ) -> str:
+        """Return sentences of the methods on models of visits; contrasts follow."""
+        return ""
+
+    def findings(self, fits: Sequence[PointwiseFit], cite: Cite) -> str:
+        """Return sentences on how participants differ in their changes, after the contrasts."""
+        return ""
+
+
+class AllSessions(Sessions):
+    """All sessions, each a row."""
+
+    is_repeated = True
+
+    def choose(self, table: pd.DataFrame) -> tuple[Bool, pd.Series]:
+        """Choose all visits."""
+        return np.ones(len(table), dtype=np.bool_), pd.Series("", index=table.index)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Comparison:
+    """Which sessions and sides of a participant are compared; by default the first session."""
+
+    sessions: Sessions = Sessions()
+    asymmetry: bool = False
+    """Also left minus right."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -253,6 +317,7 @@ def model_document(
     visits: VisitTime | None = None,
 ) -> Mapping[str, Any]:
     """Give the model as a BIDS Stats Model."""
+    comparison = comparison or Comparison()
     if request.file is not None:
         if request.formula or request.contrasts:
             raise UsageError("give --model or --formula, not both")
@@ -262,33 +327,29 @@ def model_document(
             raise UsageError("--formula is empty; write it as group + age")
         formula = request.formula
         contrasts = list(request.contrasts) or _formula_contrasts(
-            formula, groups, comparison, visits
+            formula, groups, comparison.sessions, visits
         )
         return formulas.model_from_shortcut(
             formula, contrasts, request.name or folder_name(formula)
         )
-    comparison = comparison or Comparison()
-    _check_default(table, groups, settings, comparison, visits)
-    covariates = visits.covariates if visits else settings.model.covariates
-    time = visits.column if visits else None
-    formula = default_formula(table, groups, settings, covariates=covariates, time=time)
-    contrasts = list(request.contrasts) or _default_contrasts(
-        formula, groups, settings, comparison, visits
+    formula, contrasts = _default_model(
+        table, groups, settings, comparison=comparison, visits=visits
     )
+    contrasts = list(request.contrasts) or contrasts
     return formulas.model_from_shortcut(formula, contrasts, request.name or folder_name(formula))
 
 
-def _check_default(
+def _default_model(
     table: pd.DataFrame,
     groups: Groups | None,
     settings: GroupSettings,
+    *,
     comparison: Comparison,
     visits: VisitTime | None,
-) -> None:
-    """Refuse data without the groups or the times that the default model needs."""
-    has_changes = comparison.longitudinal and not comparison.endpoint
-    within = has_changes or comparison.pair or comparison.asymmetry
-    if groups is None and not within:
+) -> tuple[str, list[str]]:
+    """Return formula and contrasts; ModelError without groups or changes to test."""
+    sessions = comparison.sessions
+    if groups is None and not (sessions.has_changes or comparison.asymmetry):
         columns = [str(name) for name in table.columns if name not in {PARTICIPANT, SESSION}]
         available = (
             f"there are {formulas.listed(columns)}"
@@ -299,46 +360,25 @@ def _check_default(
             f"no column has two groups ({', '.join(settings.model.group_columns)}); "
             f'{available}; or give --formula "age + sex" --contrast age'
         )
-    if has_changes and not table[PARTICIPANT].duplicated().any():
-        raise ModelError(
-            "longitudinal model: no participant has a second session; remove --longitudinal"
-        )
-    if has_changes and (visits is None or visits.column is None):
-        raise ModelError(
-            "the default longitudinal model needs the time of each session: a column"
-            f" {', '.join(settings.longitudinal.time_columns)}, acq_time or age in sessions.tsv"
-        )
-
-
-def _default_contrasts(
-    formula: str,
-    groups: Groups | None,
-    settings: GroupSettings,
-    comparison: Comparison,
-    visits: VisitTime | None,
-) -> list[str]:
-    """Return the contrasts of the default model."""
     time = visits.column if visits else None
+    sessions.check_default(table, time, settings)
+    covariates = visits.covariates if visits else settings.model.covariates
+    formula = default_formula(table, groups, settings, covariates=covariates, time=time)
     bent = [name for name in closed_formula(formula).names if name.casefold() in AGES]
     bent = [] if settings.model.age == "linear" else bent
-    contrasts = list[str]()
-    if visits is not None and time == VISIT:
-        pairs = groups.contrasts() if groups else []
-        contrasts = visit_contrasts(pairs, visits.labels, comparison.endpoint)
-        time, groups = None, None if contrasts else groups
-    return contrasts + default_contrasts(groups, time, bent)
+    bends = [f"{name} nonlinear = {NONLINEAR}({name})" for name in bent]
+    return formula, sessions.contrasts(groups, visits, bends)
 
 
 def _formula_contrasts(
-    formula: str, groups: Groups | None, comparison: Comparison | None, visits: VisitTime | None
+    formula: str, groups: Groups | None, sessions: Sessions, visits: VisitTime | None
 ) -> list[str]:
     """Contrasts of a formula that a user wrote without any."""
     plain, maps = formulas.split_maps(formula)
-    endpoint = comparison.endpoint if comparison else ()
     if groups is not None and groups.column not in plain:
         groups = None
     if visits is not None and visits.labels and VISIT in closed_formula(plain).names:
-        return visit_contrasts(groups.contrasts() if groups else [], visits.labels, endpoint)
+        return sessions.of_visits(groups.contrasts() if groups else [], visits.labels)
     if groups is None:
         return []
     terms = (f"map({name})" for name in maps)

@@ -6,7 +6,7 @@ from typing import Any
 
 import pandas as pd
 
-from hipsta_bids.group.cohort.data import Cohort, Measures, modeled_table
+from hipsta_bids.group.cohort.data import Cohort, Measures
 from hipsta_bids.group.model import Comparison, Groups
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.stats.formula import ModelSpec
@@ -43,12 +43,6 @@ class Request:
     """Whether a fit of unregistered maps has a meaning."""
 
     @property
-    def has_categories(self) -> bool:
-        """Whether visits are categories."""
-        is_chosen = self.comparison.longitudinal and self.settings.longitudinal.random == "visits"
-        return bool(self.comparison.endpoint) or is_chosen
-
-    @property
     def table(self) -> pd.DataFrame:
         """Rows of the model: visits, or participants of whom two sessions are compared."""
-        return modeled_table(self.cohort.table, self.comparison)
+        return self.comparison.sessions.rows(self.cohort.table)

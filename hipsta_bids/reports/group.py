@@ -41,13 +41,13 @@ def design(results: GroupResults) -> Mapping[str, Any] | None:
     table = results.table("design")
     columns = [str(name) for name in record.get("columns") or ()]
     measures = results.table("maps")
-    comparison, sided = record.get("comparison") or {}, record.get("one_sided") or {}
+    sided = record.get("one_sided") or {}
     return {
         "formula": record.get("formula"),
         "measures": [m for m in measures["measure"].unique() if m != JOINT]
         if len(measures)
         else [],
-        "what": _what(comparison),
+        "what": group_tables.describe_rows(results)[0],
         "references": record.get("references") or {},
         "columns": columns,
         "contrasts": [
@@ -56,26 +56,6 @@ def design(results: GroupResults) -> Mapping[str, Any] | None:
         ],
         "picture": _matrix_picture(table, columns) if len(table) else None,
     }
-
-
-def _what(comparison: Mapping[str, Any]) -> str:
-    """Describe what a row of the model is."""
-    if endpoint := comparison.get("endpoint"):
-        kinds = {
-            "ancova": "adjusted for the value at {}",
-            "mmrm": "adjusted for the value at {}; visits have any covariance",
-            "clda": "arms are equal at {}; visits have any covariance",
-        }
-        return f"A row is a visit: {kinds[endpoint[0]].format(endpoint[1])}."
-    if comparison.get("longitudinal"):
-        return (
-            "A row is a visit; the model has random effects, or a covariance of visits (see the "
-            "methods paragraph)."
-        )
-    if comparison.get("pair"):
-        first, second = comparison["pair"]
-        return f"A row is a participant's change from {first} to {second}."
-    return "A row is a participant."
 
 
 def _matrix_picture(table: pd.DataFrame, columns: list[str]) -> dict[str, Any]:

@@ -10,6 +10,7 @@ import pandas as pd
 from scipy import stats
 
 from hipsta_bids.derivatives.analyses import GroupResults, records, short_contrast, without_effects
+from hipsta_bids.joints import find_sessions, load
 from hipsta_bids.reports import cells
 from hipsta_bids.types import DIFFERENCE, FAMILY, JOINT, SIDES, p_text
 
@@ -30,10 +31,9 @@ _TESTS = {
 
 def direction(results: GroupResults, contrast: str, hemi: str, sign: float) -> str:
     """Describe what a contrast above or below zero means."""
-    comparison = results.record.get("comparison") or {}
     if contrast == "mean" and hemi == DIFFERENCE:
         return "larger on the left" if sign > 0 else "larger on the right"
-    if contrast == "mean" and comparison.get("pair"):
+    if contrast == "mean" and results.is_change:
         return "with an increase" if sign > 0 else "with a decrease"
     short = short_contrast(contrast)
     for first in results.levels:
@@ -82,7 +82,7 @@ def findings(results: GroupResults) -> Mapping[str, Any] | None:
         "tested": len(tests),
         "contrasts": tests["contrast"].nunique() if len(tests) else 0,
         "unknown": [f"{name}, {sides}" for name, sides in _names_and_sides(unknown)],
-        "covariance": _has_covariance(results),
+        "estimated": describe_rows(results)[1],
         "sites": "sites" in results.record,
         "signed": set(results.record["contrasts"]) > set(sided) or not sided,
         "margins": [(str(name), side_words(text)) for name, text in sided.items()],
@@ -104,10 +104,11 @@ def estimated(measures: pd.DataFrame) -> pd.DataFrame:
     return tests
 
 
-def _has_covariance(results: GroupResults) -> bool:
-    """Check whether the model has a covariance of visits as categories."""
-    endpoint = (results.record.get("comparison") or {}).get("endpoint") or [""]
-    return endpoint[0] in {"mmrm", "clda"}
+def describe_rows(results: GroupResults) -> tuple[str, str]:
+    """Describe a row of the model, and name the estimate that may be missing."""
+    comparison = results.record.get("comparison") or {}
+    texts = (load(one.page)(comparison) for one in find_sessions())
+    return next(filter(None, texts), ("A row is a participant.", "the model"))
 
 
 def _names_and_sides(rows: Sequence[Mapping[str, Any]]) -> Iterator[tuple[str, str]]:

@@ -24,6 +24,8 @@ from hipsta_bids.types import PARTICIPANT, Float, Int64
 DEPENDENCE = 1e-9
 #: Age at the first visit, where that of each visit is known.
 FIRST_AGE = "age_first"
+#: Visits as categories, by the labels of sessions.
+VISIT = "visit"
 #: Columns of ages, which the default model may bend.
 AGES = ("age", FIRST_AGE)
 _HEADS = DefaultModelSettings.model_fields["icv_columns"].default

@@ -1,5 +1,5 @@
 """Small studies, and settings that keep their analysis short."""
 
-from study_fixtures import quick, study, without_figures, written
+from study_fixtures import quick, sessions, study, without_figures, written
 
-__all__ = ["quick", "study", "without_figures", "written"]
+__all__ = ["quick", "sessions", "study", "without_figures", "written"]

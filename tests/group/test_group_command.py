@@ -3,7 +3,7 @@
 from typing import get_args
 
 import pytest
-from extension_marks import PRESENT
+from extension_marks import PRESENT, needs
 
 from hipsta_bids.cli.group import group_parser, is_group_level
 from hipsta_bids.cli.main import main
@@ -44,7 +44,7 @@ def test_settings_are_printed_and_read_back(tmp_path, capsys):
         ("--align", "registration", "align"),
         ("--correction", "multiplicity", "method"),
         ("--fdr-scope", "multiplicity", "scope"),
-        ("--longitudinal", "longitudinal", "random"),
+        pytest.param("--longitudinal", "longitudinal", "random", marks=needs("repeated")),
     ],
 )
 def test_options_and_settings_know_the_same_choices(option, group, name):

@@ -5,6 +5,7 @@ import re
 
 import pandas as pd
 import pytest
+from extension_marks import needs
 
 from hipsta_bids.derivatives.analyses import GroupResults
 from hipsta_bids.reports.cells import MINUS
@@ -80,7 +81,12 @@ def test_uncorrected_p_above_the_level_is_written_beside_the_count(tmp_path, len
 
 @pytest.mark.parametrize(
     ("endpoint", "reason"),
-    [(["clda", "ses-1", "ses-2"], "the covariance of visits"), ([], "the model")],
+    [
+        pytest.param(
+            ["clda", "ses-1", "ses-2"], "the covariance of visits", marks=needs("repeated")
+        ),
+        ([], "the model"),
+    ],
 )
 def test_models_that_cannot_be_estimated_are_noted_and_not_counted(tmp_path, endpoint, reason):
     rows = [test_row("thickness_mean", MISSING, contrast=name) for name in ("A-B", "B-A")]

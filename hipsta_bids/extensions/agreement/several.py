@@ -54,7 +54,7 @@ def run_protocols(
         notes=(*_of_each(results, "notes"), *notes),
         warnings=_of_each(results, "warnings"),
         page=folder.with_name(f"{folder.name}.html") if options.reports else None,
-        problem="; ".join(one.problem for one in results.values() if one.problem) or None,
+        problem="; ".join(result.problem for result in results.values() if result.problem) or None,
     )
 
 

@@ -239,7 +239,7 @@ def _contrast_rows(
         {k.hemi: e.maps[k][0] for k in keys if k in e.maps and _comparable(first[k], e.maps[k])}
         for e, *_ in lines
     ]
-    every_test = [test for own in tests for test in own.values()]
+    every_test = [test for by_side in tests for test in by_side.values()]
     kind = every_test[0].kind
     reach = display.effect_reach(
         [display.Effects(t.kind, t.effect, t.statistic, t.df) for t in every_test]
@@ -252,12 +252,12 @@ def _contrast_rows(
             title=f"{contrast}: {entry.name} (n = {entry.results.record['participants']}){end}",
             label=EFFECT_NAMES[kind],
             scale={"cmap": colors, "vmin": low * reach, "vmax": reach},
-            values={hemi: test.effect for hemi, test in own.items()},
-            survive={hemi: test.rejected for hemi, test in own.items()},
+            values={hemi: test.effect for hemi, test in by_side.items()},
+            survive={hemi: test.rejected for hemi, test in by_side.items()},
             grounds=sides,
         )
-        for (entry, sides, end), own in zip(lines, tests, strict=True)
-        if own
+        for (entry, sides, end), by_side in zip(lines, tests, strict=True)
+        if by_side
     ]
 
 

@@ -330,6 +330,7 @@ def _summarize(
     for model in models:
         model["units"] = [cohort.units.get(name, "1") for name in model["measures"]]
         notes += _missing_note(model)
+    is_change = bool(analysis.comparison.sessions.later)
     numbers = {
         name: typed(table[name]).astype(np.float64)
         for name in closed_formula(analysis.model.formula).names
@@ -345,8 +346,8 @@ def _summarize(
         "axes": _AXES,
         "x": cohort.x.tolist(),
         "y": cohort.y.tolist(),
-        "asymmetry": [] if analysis.comparison.pair else list(settings.asymmetry.relative),
-        "change": analysis.comparison.pair is not None,
+        "asymmetry": [] if is_change else list(settings.asymmetry.relative),
+        "change": is_change,
         "align": settings.registration.align,
         "template": files.plain(templates_of(analysis.registrations)),
         "participants": len(rows),
@@ -371,7 +372,7 @@ def _counts(values: pd.Series, first: str) -> dict[str, int]:
 def _check_model(analysis: Analysis, settings: GroupSettings) -> None:
     """Refuse models whose coefficients other sites could not use."""
     problem = None
-    if analysis.comparison.longitudinal:
+    if analysis.comparison.sessions.is_repeated:
         problem = "of --longitudinal cannot be combined; use --paired"
     elif analysis.model.maps:
         problem = "with map() cannot be combined; remove the term"

@@ -156,7 +156,7 @@ def read_maps(
                 "--maps-surface"
             )
         shape = nodes if mesh is None else (points, 1)
-        values = np.stack([one.values.reshape(shape) for one in maps])  # noqa: PD011  (no table)
+        values = np.stack([data.values.reshape(shape) for data in maps])  # noqa: PD011  (no table)
         sides[hemi] = SideMaps(
             rows=np.array([row_of[visit] for visit in keys], dtype=np.int64),
             maps={name: values},
@@ -197,9 +197,9 @@ def sign_notes(name: str, hemi: str, paths: Iterable[Path]) -> list[str]:
 
 
 def _refuse_mixed(name: str, hemi: str, paths: Sequence[Path], maps: Sequence[PointMap]) -> None:
-    counts = Counter(len(one.values) for one in maps)
+    counts = Counter(len(data.values) for data in maps)
     if len(counts) > 1:
-        examples = {len(one.values): path for path, one in zip(paths, maps, strict=True)}
+        examples = {len(data.values): path for path, data in zip(paths, maps, strict=True)}
         parts = [f"{n} with {points} ({examples[points]})" for points, n in counts.most_common()]
         raise InputError(
             f"--maps {name}, hemisphere {hemi}: maps have different numbers of points:"
@@ -212,7 +212,7 @@ def _mesh(source: ExternalFiles, hemi: str, points: int) -> Mesh | None:
     if source.request.surface is not None:
         return _named_surface(source, hemi, points)
     paths = source.files[hemi].values()
-    meshes = (read_surface(one) for path in paths for one in surfaces_beside(path, hemi))
+    meshes = (read_surface(surface) for path in paths for surface in surfaces_beside(path, hemi))
     return next((mesh for mesh in meshes if len(mesh.points) == points), None)
 
 

@@ -24,7 +24,7 @@ from hipsta_bids.extensions.norms.settings import NormSettings
 from hipsta_bids.extensions.norms.sites import with_sums
 from hipsta_bids.extensions.norms.wscores import NormativeScores, ScoredMaps
 from hipsta_bids.group.cohort.data import SHEET, Cohort, layers
-from hipsta_bids.group.model import BOTH, Comparison
+from hipsta_bids.group.model import BOTH, AllSessions, Comparison
 from hipsta_bids.group.output import write
 from hipsta_bids.group.output.citations import escaped
 from hipsta_bids.group.output.ground import grounds_of
@@ -119,7 +119,7 @@ def _score_people(
     file, norms = load_norms(path)
     n_sites = len(file.sites)
     measures = options.measures or tuple({m: 0 for _, m in norms})
-    comparison = Comparison(longitudinal=True)  # each visit has a score
+    comparison = Comparison(sessions=AllSessions())  # each visit has a score
     options = replace(options, measures=measures, comparison=comparison)
     settings = settings.changed(registration=file.registration)
     study = studies.read_study(options, settings, among)

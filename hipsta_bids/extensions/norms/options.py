@@ -46,7 +46,7 @@ def add_normative(parser: Parser) -> None:
 
 def check_normative(parsed: argparse.Namespace, settings: "GroupSettings") -> "GroupSettings":
     """Refuse scores of visits of a trial."""
-    if parsed.endpoint and parsed.normative:
+    if parsed.normative and getattr(parsed, "endpoint", None):
         raise UsageError("--endpoint: not with --normative; remove one of them")
     return settings
 

@@ -57,7 +57,7 @@ def choose_classified(analysis: Analysis, plan: SitePlan) -> Analysis:  # noqa: 
     if request.groups is None or not harmonization.leaks(request.groups.column):
         return analysis
     cohort = replace(request.cohort, sides=analysis.registered or request.cohort.sides)
-    return replace(analysis, classified=compare_sessions(cohort, request.comparison))
+    return replace(analysis, classified=compare_sessions(cohort, request.comparison.sessions))
 
 
 def part_of(analysis: Analysis) -> Harmonization:

@@ -34,7 +34,7 @@ def methods(analysis: Analysis, cite: Callable[[str], str]) -> Iterator[str]:
             f" within participants {cite('beer')}."
         )
     text += _earlier_parameters(plan)
-    if plan.estimated and not analysis.comparison.pair:
+    if plan.estimated and not analysis.comparison.sessions.later:
         columns_lost = len(plan.counts) - 1
         text += (
             f" Because shifts were estimated from the same participants, {column} was also a factor"

@@ -76,7 +76,7 @@ def plan_sites(request: Request) -> SitePlan:
     column = saved.column if saved else settings.of(HarmonizationSettings).column
     formulas.check_names([column], cohort.table.columns)
     _check_terms(model, column)
-    if request.comparison.pair:
+    if request.comparison.sessions.later:
         _check_constant(cohort.table, column)
     levels: Mapping[str, Sequence[str]]
     if saved:
@@ -151,7 +151,7 @@ def _own_columns(
 
     Returns columns, names, levels of factors, and whether other people's can be made from these.
     """
-    table, comparison, visits = request.table, request.comparison, request.cohort.table
+    table, visits, session = request.table, request.cohort.table, request.comparison.sessions.later
     variables = closed_formula(spec.formula).names
     levels = {name: text for name, text in request.references.items() if name in variables}
     design = build_design(table, spec, request.settings.design, levels)
@@ -159,9 +159,8 @@ def _own_columns(
     names = tuple(design.columns[i] for i in positions)
     values = np.full((len(table), len(names)), np.nan)
     values[design.rows] = design.matrix[:, positions]
-    portable = not comparison.pair and _is_portable(table, spec.formula, design)
-    if comparison.pair:
-        session = comparison.pair[1]
+    portable = not session and _is_portable(table, spec.formula, design)
+    if session:
         values = values[table.index.get_indexer(pd.Index(visits[PARTICIPANT]))]
         is_later = (visits[SESSION] == session).to_numpy(np.float64)[:, None]
         values = np.hstack([values, is_later, is_later * values])
@@ -278,7 +277,7 @@ def without_tests_of_sites(analysis: Analysis, plan: SitePlan) -> Analysis:
     # Effects of sites from a file are those of registered nodes.
     request = replace(analysis.request, has_unregistered=plan.saved is None)
     analysis, design = replace(analysis, request=request), analysis.design
-    if request.comparison.pair or not plan.estimated:
+    if request.comparison.sessions.later or not plan.estimated:
         return analysis
     member = np.eye(len(plan.sites))[plan.visits.site[design.rows]]
     joined = np.hstack([design.matrix, member])

@@ -39,8 +39,9 @@ def surrogate_table(
     Participants weigh the same; a slice's mean is over the points of its axis. Empty where there
     are no tables, or where rows of the model are no single visits.
     """
-    comparison, people = analysis.comparison, analysis.compared.table.iloc[analysis.design.rows]
-    if comparison.pair or comparison.longitudinal:
+    people = analysis.compared.table.iloc[analysis.design.rows]
+    sessions = analysis.comparison.sessions
+    if sessions.later or sessions.is_repeated:
         return pd.DataFrame()
     parts = list[pd.DataFrame]()
     for record in records:

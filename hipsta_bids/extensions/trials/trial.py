@@ -316,7 +316,8 @@ def run_trial(
         # Refuses before anything is read.
         trials.point_level(settings.multiplicity, settings.of(PowerSettings))
     visits = bool(effect and effect.visits)
-    options = replace(options, comparison=modeling.Comparison(longitudinal=retest or visits))
+    sessions = modeling.AllSessions() if retest or visits else modeling.Sessions()
+    options = replace(options, comparison=modeling.Comparison(sessions=sessions))
     study = studies.read_study(options, settings, among)
     source: Source
     if retest:
@@ -351,11 +352,8 @@ def run_trial(
         files.write_text(folder / "methods.md", _methods(study, source, modeled, results, effect))
         return write.write_figures(folder, _figures(cohorts, results), prints=options.figures)
 
-    name = ["retest"] if retest else []
-    if effect is not None:
-        name.append(f"power-{effect.kind}-{100 * effect.share:g}".replace(".", "p"))
     return study.write(
-        studies.folder_of(name, among),
+        _folder(effect, among, retest=retest),
         _notes(source, results, study, effect),
         visits=modeled,
         tables=tables,
@@ -363,6 +361,15 @@ def run_trial(
         record=_record(study, source, modeled, effect) | {"among": among},
         fill=fill,
     )
+
+
+def _folder(
+    effect: trials.TrialEffect | None, among: tuple[str, str] | None, *, retest: bool
+) -> str:
+    words = ["retest"] if retest else []
+    if effect is not None:
+        words.append(f"power-{effect.kind}-{100 * effect.share:g}".replace(".", "p"))
+    return studies.folder_of(words, among)
 
 
 def _sample_sizes(effect: trials.TrialEffect, result: Described, settings: GroupSettings) -> Tables:

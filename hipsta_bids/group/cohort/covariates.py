@@ -4,7 +4,6 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
 from functools import cache
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -15,7 +14,7 @@ import pandas as pd
 from hipsta_bids.derivatives.dataset import linked_path, read_links
 from hipsta_bids.derivatives.names import natural_order
 from hipsta_bids.errors import InputError, MissingFileError, ModelError
-from hipsta_bids.group.model import Comparison, VisitTime
+from hipsta_bids.group.model import VisitTime
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.io import files
 from hipsta_bids.io.files import MISSING, is_missing
@@ -23,7 +22,6 @@ from hipsta_bids.io.labels import match_labels
 from hipsta_bids.opening import SETTINGS, read_bounded
 from hipsta_bids.stats.design import FIRST_AGE
 from hipsta_bids.stats.formula import as_factor, check_numbers, level_name, listed, typed
-from hipsta_bids.stats.visits import VISIT
 from hipsta_bids.types import PARTICIPANT, SESSION
 
 
@@ -402,15 +400,13 @@ def _named_time(
     return next(varying, (None, None))
 
 
-def add_time(
-    table: pd.DataFrame, settings: GroupSettings, comparison: Comparison | None = None
-) -> VisitTime:
+def add_time(table: pd.DataFrame, settings: GroupSettings) -> VisitTime:
     """Find the time of each visit, or make it from dates or ages.
 
     A column of ``longitudinal.time_columns`` that varies between sessions of a participant; else
     ``acq_time``, in years since the participant's first session; else age, likewise. If age
     varies between sessions, the age at the first one is added, since age itself would explain part
-    of the change. If visits are categories in a comparison, their column ``visit`` is the time.
+    of the change.
     """
     covariates = tuple(settings.model.covariates)
     by_name = {str(column).casefold(): str(column) for column in table.columns}
@@ -434,24 +430,7 @@ def add_time(
             column, values = TIME, (times - first) / unit
     if column is not None:
         columns[column] = values
-    time = VisitTime(table.assign(**columns), column, covariates)
-    if comparison and (comparison.endpoint or settings.longitudinal.random == "visits"):
-        return _with_visits(time, settings, comparison)
-    return time
-
-
-def _with_visits(time: VisitTime, settings: GroupSettings, comparison: Comparison) -> VisitTime:
-    """Make a factor of the sessions, in the column ``visit``; a single one is none."""
-    labels = (
-        time.table[SESSION].astype(object).map(lambda name: str(name or "").removeprefix("ses-"))
-    )
-    named = comparison.endpoint[1:] or order_sessions(time.table, settings)
-    order = [name.removeprefix("ses-") for name in named]
-    if "" in set(labels) or len(order) < 2:  # noqa: PLR2004 -- visits to compare
-        raise ModelError("visits as categories need two sessions, with labels (ses-LABEL)")
-    table = time.table.assign(**{VISIT: pd.Categorical(labels, categories=order)})
-    after = tuple(order[1:] if comparison.adjusted else order)
-    return replace(time, table=table, column=VISIT if len(after) > 1 else None, labels=after)
+    return VisitTime(table.assign(**columns), column, covariates)
 
 
 def _varies(values: pd.Series, people: pd.Series) -> bool:

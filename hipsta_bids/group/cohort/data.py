@@ -8,12 +8,9 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from hipsta_bids.derivatives.names import natural_order
 from hipsta_bids.errors import ModelError
-from hipsta_bids.group.model import BOTH, Comparison, asymmetry_name
-from hipsta_bids.stats.arrays import Bool, Float, Int, SideMaps, some_sheets
-from hipsta_bids.stats.formula import listed
-from hipsta_bids.types import PARTICIPANT, SESSION
+from hipsta_bids.group.model import BOTH, Sessions, asymmetry_name
+from hipsta_bids.stats.arrays import Bool, Float, Int, SideMaps
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,139 +81,16 @@ def participants_with(finite: Bool, participants: NDArray[np.object_]) -> Int:
     )
 
 
-def choose_visits(cohort: Cohort, comparison: Comparison) -> tuple[Cohort, Mapping[str, str]]:
-    """Keep the visits that are compared."""
-    table = cohort.table
-    named = comparison.pair or comparison.endpoint[1:]
-    sessions = sorted(table[SESSION].dropna().unique(), key=natural_order)
-    if unknown := sorted(set(named) - set(sessions)):
-        option = "--paired" if comparison.pair else "--endpoint"
-        if not sessions:
-            raise ModelError(f"{option}: no sessions in this dataset; remove it")
-        raise ModelError(
-            f"{option}: there is no session {listed(unknown)}, only {listed(sessions)}"
-        )
-    if comparison.endpoint:
-        in_trial = table[SESSION].isin(named).to_numpy()
-        first = table[PARTICIPANT][table[SESSION] == comparison.adjusted]
-        keep = in_trial & (table[PARTICIPANT].isin(first).to_numpy() | (not comparison.adjusted))
-        reasons = pd.Series("the session of the baseline is missing", index=table.index)
-        reasons[~in_trial] = f"sessions {' and '.join(named)} are compared"
-    elif comparison.longitudinal:
-        return cohort, {}
-    elif comparison.pair is None:
-        keep = ~table[PARTICIPANT].duplicated().to_numpy()
-        reasons = pd.Series("the first session of each participant is analyzed", index=table.index)
-    else:
-        in_pair = table[SESSION].isin(comparison.pair)
-        complete = in_pair.groupby(table[PARTICIPANT]).transform("sum") == len(comparison.pair)
-        keep = (in_pair & complete).to_numpy()
-        reasons = pd.Series("the other session of the pair is missing", index=table.index)
-        reasons[~in_pair] = f"sessions {' and '.join(comparison.pair)} are compared"
-        if not keep.any():
-            raise ModelError(
-                f"no participant has both sessions {' and '.join(comparison.pair)}; choose"
-                " two other sessions"
-            )
-    return cohort.take(keep), dict(reasons[~keep])
-
-
-def modeled_table(table: pd.DataFrame, comparison: Comparison) -> pd.DataFrame:
-    """Rows of the model: visits, or participants with the covariates of their first session.
-
-    Without the baseline, if that is a covariate.
-    """
-    if comparison.adjusted:
-        return table[(table[SESSION] != comparison.adjusted).to_numpy()]
-    if comparison.pair is None:
-        return table
-    first = table[table[SESSION] == comparison.pair[0]]
-    return first.set_axis(first[PARTICIPANT])
-
-
-def compare_sessions(
-    cohort: Cohort, comparison: Comparison, covariates: Sequence[str] = ()
-) -> Cohort:
-    """Take differences of two sessions, if these are compared.
-
-    Maps that are covariates are of the first session, as other covariates are.
-    """
-    if comparison.adjusted:
-        return _after_baseline(cohort, comparison)
-    if comparison.pair is None:
-        sides = {
-            hemi: replace(side, covariates={name: side.maps[name] for name in covariates})
-            for hemi, side in cohort.sides.items()
-        }
-        return replace(cohort, sides=sides) if covariates else cohort
-    table = modeled_table(cohort.table, comparison)
-    if not cohort.sides:
-        return replace(cohort, table=table)
-    row_of = {participant: row for row, participant in enumerate(table.index)}
-    sides = {}
-    for hemi, side in cohort.sides.items():
-        visits = cohort.table.iloc[side.rows]
-        rows = np.array([row_of[participant] for participant in visits[PARTICIPANT]])
-        first, second = (
-            np.flatnonzero((visits[SESSION] == session).to_numpy()) for session in comparison.pair
-        )
-        common, a, b = np.intersect1d(rows[first], rows[second], return_indices=True)
-        if len(common):
-            changes = _change(side, common, first[a], second[b])
-            baseline = {name: side.maps[name][first[a]] for name in covariates}
-            sides[hemi] = replace(changes, covariates=baseline)
-    if not sides:
-        raise ModelError(
-            f"no hemisphere was measured in both sessions {' and '.join(comparison.pair)}"
-        )
-    return replace(cohort, table=table, sides=sides)
-
-
-def _after_baseline(cohort: Cohort, comparison: Comparison) -> Cohort:
-    """Keep later sessions, with the values of the baseline in ``first``."""
-    table = modeled_table(cohort.table, comparison)
-    row_of = {visit: row for row, visit in enumerate(table.index)}
-    sides = {}
-    for hemi, side in cohort.sides.items():
-        visits = cohort.table.iloc[side.rows]
-        is_first = (visits[SESSION] == comparison.adjusted).to_numpy()
-        sheet_of = dict(zip(visits[PARTICIPANT][is_first], np.flatnonzero(is_first), strict=True))
-        has_first = ~is_first & visits[PARTICIPANT].isin(sheet_of).to_numpy()
-        if has_first.any():
-            rows = np.array([row_of[visit] for visit in visits.index[has_first]])
-            sheets = np.array(
-                [sheet_of[participant] for participant in visits[PARTICIPANT][has_first]]
-            )
-            first = replace(
-                side,
-                rows=rows,
-                maps=some_sheets(side.maps, sheets),
-                subfield=side.subfield[sheets],
-                unmasked=None,
-                summary=side.summary.iloc[sheets].reset_index(drop=True),
-            )
-            sides[hemi] = replace(side.sheets(has_first), rows=rows, first=first)
-    if cohort.sides and not sides:
-        raise ModelError(f"no hemisphere was measured in {comparison.adjusted} and later")
-    return replace(cohort, table=table, sides=sides)
+def compare_sessions(cohort: Cohort, sessions: Sessions, covariates: Sequence[str] = ()) -> Cohort:
+    """Return the rows of the model, with their maps, of which some are covariates."""
+    sides = sessions.compare(cohort.table, cohort.sides, covariates)
+    return replace(cohort, table=sessions.rows(cohort.table), sides=sides)
 
 
 def baselines(cohort: Cohort) -> Cohort | None:
     """Return values of the baseline instead of the later values; ``None`` without these."""
     sides = {hemi: side.first for hemi, side in cohort.sides.items() if side.first is not None}
     return replace(cohort, sides=sides) if sides else None
-
-
-def _change(side: SideMaps, rows: Int, first: Int, second: Int) -> SideMaps:
-    summary = side.summary.iloc[second].to_numpy() - side.summary.iloc[first].to_numpy()
-    return replace(
-        side,
-        rows=rows,
-        maps={name: m[second] - m[first] for name, m in side.maps.items()},
-        subfield=side.subfield[first],
-        unmasked=None,
-        summary=pd.DataFrame(summary, columns=side.summary.columns),
-    )
 
 
 def asymmetry_maps(cohort: Cohort, measures: Sequence[str], relative: Sequence[str]) -> SideMaps:

@@ -14,11 +14,10 @@ from hipsta_bids.group.cohort.quality import exact_p
 from hipsta_bids.group.model import Groups
 from hipsta_bids.group.output.results import ALL, Analysis
 from hipsta_bids.group.settings import GroupSettings
-from hipsta_bids.stats.design import FIRST_AGE
+from hipsta_bids.stats.design import FIRST_AGE, VISIT
 from hipsta_bids.stats.formula import in_order, level_labels, typed
 from hipsta_bids.stats.grammar import closed_formula
-from hipsta_bids.stats.visits import VISIT
-from hipsta_bids.types import PARTICIPANT, SESSION
+from hipsta_bids.types import PARTICIPANT
 
 #: Variables that are described even if they do not vary.
 _ALWAYS = ("age", "sex")
@@ -30,12 +29,10 @@ _COLUMNS = ("variable", "level", "group", "n", "missing", "mean", "sd", "count",
 
 def demographics_of(cohort: Cohort, analysis: Analysis, settings: GroupSettings) -> pd.DataFrame:
     """Describe the participants of an analysis, by its groups."""
-    visits, comparison = analysis.compared.table.iloc[analysis.design.rows], analysis.comparison
-    if comparison.adjusted:  # rows of the model are later visits
-        visits = cohort.table[cohort.table[PARTICIPANT].isin(visits[PARTICIPANT])]
+    rows = analysis.compared.table.iloc[analysis.design.rows]
+    visits = analysis.comparison.sessions.described(rows, cohort.table)
     formulas = [analysis.model.formula, *(formula for _, formula in analysis.measures)]
-    baseline = next(iter(comparison.endpoint[1:]), "")
-    return demographics_table(visits, settings, formulas, analysis.groups, baseline)
+    return demographics_table(visits, settings, formulas, analysis.groups)
 
 
 def _variables(formulas: Iterable[str]) -> tuple[set[str], set[str]]:
@@ -49,16 +46,14 @@ def demographics_table(
     settings: GroupSettings,
     formulas: Iterable[str],
     groups: Groups | None = None,
-    baseline: str = "",
 ) -> pd.DataFrame:
     """Describe each participant once: one row per variable, level of a factor, and group.
 
     Variables are age and sex, and covariates of the default model and of ``formulas`` if they vary.
-    Values are of the session ``baseline``, or else of the first visit. Without groups, all
-    participants are one group, and there is no test.
+    Values are of the first of their ``visits``. Without groups, all participants are one group, and
+    there is no test.
     """
-    order = np.argsort(visits[SESSION].ne(baseline).to_numpy(), kind="stable")
-    people = visits.iloc[order].drop_duplicates(PARTICIPANT)
+    people = visits.drop_duplicates(PARTICIPANT)
     parts = {ALL: people}
     if groups is not None:
         parts = {level: people[people[groups.column] == level] for level in groups.levels}

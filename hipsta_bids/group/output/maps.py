@@ -137,8 +137,7 @@ def mean_rows(results: GroupResults, measure: str) -> Iterator[Row]:
     means = means[means["measure"] == measure] if len(means) else means
     if not len(means):
         return
-    comparison = results.record.get("comparison") or {}
-    change, unit = bool(comparison.get("pair")), map_unit(results, measure)
+    change, unit = results.is_change, map_unit(results, measure)
     is_difference = means["hemi"] == DIFFERENCE
     for part, difference in ((means[~is_difference], False), (means[is_difference], True)):
         scale = _mean_scale(measure, part, change=change or difference)

@@ -22,12 +22,8 @@ from hipsta_bids.stats.clusters import TFCE_EXTENT, TFCE_HEIGHT
 from hipsta_bids.stats.contrasts import Contrast
 from hipsta_bids.stats.exchangeability import exchange_text, spans_constant
 from hipsta_bids.stats.formula import interactions
-from hipsta_bids.stats.mmrm import VisitRows
 from hipsta_bids.stats.settings import MultiplicitySettings
 from hipsta_bids.types import PARTICIPANT
-
-#: Level at which slopes are said to differ.
-_LEVEL = 0.05
 
 #: Points that are one family of tests.
 _FAMILIES = {
@@ -193,18 +189,11 @@ def _rims(analysis: Analysis) -> str:
 def _models(analysis: Analysis, settings: GroupSettings, cite: Callable[[str], str]) -> str:
     contrasts = analysis.design.contrasts
     levels = escaped(", ".join(map(" ".join, analysis.design.references.items())))
-    kind, subject, d = "linear model", "", "the estimate divided by the residual standard deviation"
-    if analysis.comparison.pair:
-        first, second = analysis.comparison.pair
-        subject = f" to the change from {first} to {second}, with the covariates of {first}"
-    if isinstance(analysis.row_model, VisitRows):
-        d = "the estimate divided by the root of the mean variance of visits"
-    elif analysis.comparison.longitudinal:
-        kind = "linear mixed model"
-        d = "the estimate divided by the standard deviation of single visits"
+    fits = [fit for maps in analysis.fitted.values() for fit in maps.fits.values()]
+    sessions = analysis.comparison.sessions
     text = (
-        f"A {kind}, {code(analysis.model.text)}, was fitted at each point of the sheet{subject}"
-        f"{f' (reference levels: {levels})' if levels else ''}."
+        f"A {sessions.kind}, {code(analysis.model.text)}, was fitted at each point of the sheet"
+        f"{sessions.subject}{f' (reference levels: {levels})' if levels else ''}."
     )
     if analysis.model.maps:
         text += f" Maps were covariates, with the value of each point {cite('point-covariates')}."
@@ -215,23 +204,21 @@ def _models(analysis: Analysis, settings: GroupSettings, cite: Callable[[str], s
         )
     if settings.glm.covariance == "hc3":
         text += f" Standard errors allowed for unequal variances (HC3) {cite('hc3')}."
-    if analysis.comparison.longitudinal:
-        text += _visits(analysis, settings, cite)
+    text += sessions.methods(analysis.row_model, fits, settings, cite)
     text += _tests(contrasts)
     if "Satterthwaite" in text and any(contrast.n_rows > 1 for contrast in contrasts):
         text += f" Contrasts of several rows were tested by F {cite('fai')}."
-    text += _slopes(analysis, cite) if analysis.comparison.longitudinal else ""
+    text += sessions.findings(fits, cite)
     text += f" {_correction(settings.multiplicity, cite, analysis)}"
-    text += _effect_sizes(analysis, settings, d, cite)
+    text += _effect_sizes(analysis, settings, cite)
     return f"{text}{_nonlinear(analysis, settings)}"
 
 
-def _effect_sizes(
-    analysis: Analysis, settings: GroupSettings, d: str, cite: Callable[[str], str]
-) -> str:
+def _effect_sizes(analysis: Analysis, settings: GroupSettings, cite: Callable[[str], str]) -> str:
     """Return the definitions of effect sizes, and how summary measures were tested."""
     contrasts = analysis.design.contrasts
-    kinds = [f"Cohen's d ({d})"] * any(contrast.n_rows == 1 for contrast in contrasts)
+    d = f"Cohen's d (the estimate divided by {analysis.comparison.sessions.sd})"
+    kinds = [d] * any(contrast.n_rows == 1 for contrast in contrasts)
     kinds += ["partial eta squared"] * any(contrast.n_rows > 1 for contrast in contrasts)
     adjusted = any(formula != analysis.model.formula for _, formula in analysis.measures)
     sizes = f"; {SIZES} were also adjusted for intracranial volume" if adjusted else ""
@@ -257,63 +244,6 @@ def _tests(contrasts: Sequence[Contrast]) -> str:
     if sided := [f"{escaped(c.name)} ({c.hypothesis})" for c in contrasts if c.side]:
         text += f" Tests were one-sided, with this alternative and margin: {joined(sided)}."
     return text
-
-
-def _visits(analysis: Analysis, settings: GroupSettings, cite: Callable[[str], str]) -> str:
-    """Return how repeated visits, and the baseline, were modeled."""
-    if not isinstance(analysis.row_model, VisitRows):
-        visits = analysis.row_model.visits
-        effects = "intercepts and slopes" if visits is not None and visits.slopes else "intercepts"
-        return (
-            f" It had random {effects} of participants, and was estimated by restricted maximum"
-            f" likelihood. Degrees of freedom were Satterthwaite's {cite('mixed')}."
-        )
-    kind, first, *_ = map(escaped, (*(analysis.comparison.endpoint or ()), "", ""))
-    if kind == "ancova":
-        text = f" The value at {first} was a covariate at each point (analysis of covariance)."
-    else:
-        text = (
-            " Visits were categories with an unstructured covariance, estimated by restricted"
-            f" maximum likelihood {cite('mmrm')}."
-        )
-    if kind == "mmrm":
-        text += f" The value at {first} was a covariate at each point, with a slope for each visit."
-    if kind == "clda":
-        text += (
-            f" {first} was one of the visits, with the same mean in all arms (constrained"
-            f" longitudinal data analysis) {cite('clda')}."
-        )
-    if kind != "ancova" and settings.longitudinal.freedom == "kenward-roger":
-        text += (
-            " Standard errors and degrees of freedom followed Kenward and Roger"
-            f" {cite('kenward-roger')}."
-        )
-    elif kind != "ancova":
-        text += f" Degrees of freedom were Satterthwaite's {cite('mixed')}."
-    fits = [fit for side in analysis.fitted.values() for fit in side.fits.values()]
-    n_missing = sum(int((np.isnan(fit.sigma) & (fit.n > 0)).sum()) for fit in fits)
-    return f"{text} The model could not be fitted at {n_missing} points." if n_missing else text
-
-
-def _slopes(analysis: Analysis, cite: Callable[[str], str]) -> str:
-    """Return at how many points slopes vary, and at how many they were omitted."""
-    fits = [fit for side in analysis.fitted.values() for fit in side.fits.values()]
-    p = np.concatenate([fit.slopes_p for fit in fits if fit.slopes_p is not None] or [np.empty(0)])
-    tested = int(np.isfinite(p).sum())
-    if not tested:
-        return ""
-    share = np.sum(p == 1) / tested
-    omitted = (
-        f" Slopes were omitted at {share:.0%} of the points, where their variance was zero."
-        if share
-        else ""
-    )
-    return (
-        f" Slopes differed between participants at {np.sum(p < _LEVEL) / tested:.0%} of the points"
-        f" (p < {_LEVEL:g}, uncorrected). The test was the ratio of restricted likelihoods, with an"
-        f" equal mixture of chi-squared distributions with 1 and 2 degrees of freedom"
-        f" {cite('mixture')}.{omitted}"
-    )
 
 
 def _nonlinear(analysis: Analysis, settings: GroupSettings) -> str:
@@ -410,7 +340,7 @@ def _joint(settings: GroupSettings, cite: Callable[[str], str]) -> str:
 
 def _asymmetry(analysis: Analysis, settings: GroupSettings, cite: Citations) -> str:
     definition = "The asymmetry of each map was left minus right, in the unit of the measure."
-    if (relative := settings.asymmetry.relative) and not analysis.comparison.pair:
+    if (relative := settings.asymmetry.relative) and not analysis.comparison.sessions.later:
         definition = (
             f"The asymmetry of {joined(relative)} was (L - R) / ((L + R) / 2) {cite('asymmetry')};"
             " the asymmetry of other maps was L - R, in the unit of the measure."

@@ -1,6 +1,6 @@
 """Steps that extensions add to the line of an analysis, and what they add to its results."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -11,42 +11,33 @@ from hipsta_bids.joints import Step, find_steps, load
 from hipsta_bids.stats.formula import listed
 from hipsta_bids.stats.inference import PERMUTATIONS
 
-#: Flags of the core, and those that they exclude; steps of extensions have their own.
-EXCLUDED: Mapping[str, tuple[str, ...]] = {
-    "map() in the formula": ("summary measures alone",),
-    "--endpoint": ("--correction by permutation", "--joint", "map() in the formula"),
-    "--longitudinal visits": ("--correction by permutation", "--joint", "map() in the formula"),
-}
+#: Flags of the core, and those that they exclude; extensions have their own.
+EXCLUDED: Mapping[str, Sequence[str]] = {"map() in the formula": ("summary measures alone",)}
 
 
 def plan_steps(request: Request) -> Request:
     """Plan the steps that are asked; ModelError if two of them exclude each other."""
     steps = [step for step in find_steps() if load(step.condition)(request)]
-    check_flags({*_flags(request), *(step.flag for step in steps)})
+    flags = {*_flags(request), *(step.flag for step in steps)}
+    excluded = {**EXCLUDED, **request.comparison.sessions.excludes()}
+    for flag, rivals in (excluded | {step.flag: step.excludes for step in steps}).items():
+        if flag in flags and (problems := [name for name in rivals if name in flags]):
+            raise ModelError(f"{flag}: not with {listed(problems)}; remove one of them")
     plans = {step.name: load(step.plan)(request) for step in steps}
     return replace(request, plans=plans)
 
 
-def check_flags(flags: set[str]) -> None:
-    """Refuse flags of which one excludes another."""
-    excluded = {**EXCLUDED, **{step.flag: step.excludes for step in find_steps()}}
-    for flag, rivals in excluded.items():
-        if flag in flags and (problems := [name for name in rivals if name in flags]):
-            raise ModelError(f"{flag}: not with {listed(problems)}; remove one of them")
-
-
 def _flags(request: Request) -> Iterator[str]:
     """Name what the core is asked beyond the default."""
-    settings, comparison = request.settings, request.comparison
+    settings = request.settings
     is_asked = {
         "map() in the formula": bool(request.model.maps),
         "summary measures alone": not request.measures.maps,
         "--correction by permutation": settings.multiplicity.method in PERMUTATIONS,
         "--joint": bool(settings.joint.measures),
-        "--endpoint": bool(comparison.endpoint),
-        "--longitudinal visits": request.has_categories and not comparison.endpoint,
     }
-    return (flag for flag, answer in is_asked.items() if answer)
+    yield from (flag for flag, answer in is_asked.items() if answer)
+    yield from request.comparison.sessions.excludes()
 
 
 def _active(request: Request) -> Iterator[Step]:

@@ -213,12 +213,13 @@ def write_table(
         lines += map("\t".join, rows)
     files.write_text(folder / f"{name}.tsv", "\n".join(lines) + "\n")
     if described:
-        meanings = {
-            column: meaning.get(column)
-            or f"registered coordinate of node {column.removeprefix('node_')}, 0..1"
+        nodes = {
+            column: f"registered coordinate of node {column.removeprefix('node_')}, 0..1"
             for column in columns
+            if column.startswith("node_")
         }
-        sidecar = {column: {"Description": meaning} for column, meaning in meanings.items()}
+        texts = {column: text for column in columns if (text := {**nodes, **meaning}.get(column))}
+        sidecar = {column: {"Description": text} for column, text in texts.items()}
         files.write_json(folder / f"{name}.json", sidecar)
 
 
@@ -287,7 +288,7 @@ def _about_tests(analysis: results.Analysis, settings: GroupSettings) -> _About:
             "Contrast": key.contrast,
             "ContrastWeights": dict(zip(names, test.contrast.weights.T.tolist(), strict=True)),
             "Model": analysis.model.text,
-            "Mixed": analysis.comparison.longitudinal,
+            "Mixed": analysis.comparison.sessions.is_repeated,
             "DegreesOfFreedom": [float(df.min()), float(df.max())] if len(df) else None,
             "DegreesOfFreedomNumerator": test.contrast.n_rows if test.kind == "F" else None,
             "NumberOfParticipants": analysis.n_participants,

@@ -17,8 +17,6 @@ from hipsta_bids.stats import inference
 from hipsta_bids.stats.design import Design, build_design
 from hipsta_bids.stats.formula import listed
 from hipsta_bids.stats.glm import RowModel, fit_maps, with_mean
-from hipsta_bids.stats.mixed import longitudinal_model
-from hipsta_bids.stats.mmrm import visit_model
 from hipsta_bids.types import PARTICIPANT
 
 
@@ -63,7 +61,7 @@ def design(request: Request) -> Analysis:
         classified=cohort,
     )
     matrix = extend("design", analysis).design
-    if request.comparison.pair or not matrix.contrasts:
+    if request.comparison.sessions.later or not matrix.contrasts:
         matrix = replace(matrix, contrasts=with_mean(matrix))
     rows = _row_models(request)(matrix)
     _check_margins(rows.design, cohort, request.measures)
@@ -102,14 +100,14 @@ def fit(analysis: Analysis) -> Analysis:
     """Fit each hemisphere, and left minus right if asked for, and correct for many points."""
     request, analysis = analysis.request, extend("adjust", analysis)
     maps, comparison, rows = request.measures.maps, request.comparison, analysis.row_model
-    compared = data.compare_sessions(analysis.cohort, comparison, request.model.maps)
+    compared = data.compare_sessions(analysis.cohort, comparison.sessions, request.model.maps)
     fitted = {
         hemi: fit_maps(hemi, side.only(maps), rows)
         for hemi, side in each("models", list(compared.sides.items()) if maps else [])
     }
     if comparison.asymmetry and maps:
         # A change may be zero or of any sign: nothing to divide by.
-        relative = () if comparison.pair else request.settings.asymmetry.relative
+        relative = () if comparison.sessions.later else request.settings.asymmetry.relative
         difference = data.asymmetry_maps(compared, maps, relative)
         contrasts = with_mean(rows.design)
         fitted[modeling.BOTH] = fit_maps(modeling.BOTH, difference, rows, contrasts=contrasts)
@@ -172,7 +170,7 @@ def summarize(analysis: Analysis) -> Analysis:
 def classify(analysis: Analysis) -> Analysis:
     """Compare classifiers of each pair of groups, by the first visits of participants."""
     groups, settings = analysis.groups, analysis.request.settings.classification
-    if groups is None or analysis.comparison.endpoint:
+    if groups is None or not analysis.comparison.sessions.is_classified:
         return analysis
     is_first = ~analysis.request.table[PARTICIPANT].duplicated().to_numpy()
     cohort = extend("classify", analysis).classified.take(is_first)
@@ -192,32 +190,17 @@ LINE: tuple[Callable[[Analysis], Analysis], ...] = (
 
 
 def _row_models(request: Request) -> Callable[[Design], RowModel]:
-    """Choose the model of the rows: linear, or of repeated visits."""
-    settings, comparison = request.settings, request.comparison
-    if request.has_categories:
-        groups = request.groups if comparison.endpoint[:1] == ("clda",) else None
-        return partial(
-            visit_model,
-            table=request.table,
-            settings=settings.glm,
-            longitudinal=settings.longitudinal,
-            arms=groups.column if groups else None,
-        )
-    if comparison.longitudinal:
-        return partial(
-            longitudinal_model,
-            table=request.table,
-            time=request.time,
-            settings=settings.glm,
-            longitudinal=settings.longitudinal,
-        )
-    return partial(RowModel, settings=settings.glm)
+    """Choose the model of the rows."""
+    sessions = request.comparison.sessions
+    return sessions.row_models(request.table, request.time, request.groups, request.settings)
 
 
 def _check_covariates(request: Request) -> None:
     """Refuse a map that explains itself."""
     maps, measures = request.model.maps, request.measures.maps
-    if request.comparison.pair is None and (outcomes := [m for m in maps if m in measures]):
+    if request.comparison.sessions.later:
+        return
+    if outcomes := [m for m in maps if m in measures]:
         raise ModelError(
             f"map({outcomes[0]}) in the formula explains itself; choose other maps by --measures"
         )

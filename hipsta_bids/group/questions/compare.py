@@ -103,7 +103,7 @@ def _request(study: studies.Study) -> tuple[Mapping[str, Any], Request]:
 
 def _with_labels(study: studies.Study, request: Request) -> studies.Study:
     """Find in what labels differ, also from those that plans of extensions rest on."""
-    rows = request.cohort.table if request.comparison.adjusted else request.table
+    rows = request.table if request.comparison.sessions.later else request.cohort.table
     source: tuple[str, Mapping[str, Sequence[str]]]
     source = next(plan_blocks("source", request), ("", {}))
     return with_mixes(study, rows, closed_formula(request.model.formula).names, source=source)
@@ -165,7 +165,7 @@ def _write(
 
     measures = modeling.wanted_measures(options.model, options.measures)
     return study.write_folder(
-        folder_name(analysis.model.formula, measures) + options.comparison.suffix,
+        folder_name(analysis.model.formula, measures) + options.comparison.sessions.suffix,
         notes=notes,
         counts=(analysis.n_participants, len(exclusions)),
         fill=fill,
@@ -181,7 +181,7 @@ def _parts(study: studies.Study, analysis: Analysis) -> tuple[list[Writer], list
 
 def _record(analysis: Analysis, ratings: Mapping[str, int] | None) -> dict[str, Any]:
     """Record what was fitted to what."""
-    steps, options = find_steps(), analysis.request.options
+    steps, options, compared = find_steps(), analysis.request.options, analysis.comparison
     choices = {name: options.get(name) for step in steps for name in step.comparison}
     return {
         **{key: None for step in steps for key in step.records},
@@ -192,7 +192,7 @@ def _record(analysis: Analysis, ratings: Mapping[str, int] | None) -> dict[str, 
         "references": analysis.design.references,
         "contrasts": {c.name: c.weights.tolist() for c in analysis.design.contrasts},
         "one_sided": {c.name: c.hypothesis for c in analysis.design.contrasts if c.side},
-        "comparison": {**asdict(analysis.comparison), **choices},
+        "comparison": {**compared.sessions.record(), "asymmetry": compared.asymmetry, **choices},
         "groups": None if analysis.groups is None else asdict(analysis.groups),
         "participants": analysis.n_participants,
         "rows": len(analysis.design.rows),

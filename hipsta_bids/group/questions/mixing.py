@@ -34,9 +34,9 @@ def with_mixes(
     ``rows`` are visits or, of pairs of sessions, participants; without ``terms`` they do not count.
     ``source`` names a file of norms or effects of sites, and the segmentations that it rests on.
     """
-    frame, pair = _origins(study), study.options.comparison.pair
-    key = PARTICIPANT if pair else "visit"
-    is_used = frame.duplicated([PARTICIPANT, "side"], keep=False) | (pair is None)
+    frame, is_change = _origins(study), bool(study.options.comparison.sessions.later)
+    key = PARTICIPANT if is_change else "visit"
+    is_used = frame.duplicated([PARTICIPANT, "side"], keep=False) | (not is_change)
     complete = pd.DataFrame({t: typed(rows[t]) for t in terms if t in rows}, rows.index).dropna()
     frame = frame[is_used & frame[key].isin(complete.index)]
     frame = frame.assign(voxel_size=frame["voxel_size"].map(_sizes(Counter(frame["voxel_size"]))))

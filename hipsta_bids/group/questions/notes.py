@@ -9,6 +9,7 @@ from hipsta_bids.group import model as modeling
 from hipsta_bids.group.output import results
 from hipsta_bids.group.output.tables import opposite_notes
 from hipsta_bids.group.questions.study import Study
+from hipsta_bids.joints import find_sessions
 from hipsta_bids.stats import arrays
 from hipsta_bids.stats.grammar import closed_formula
 from hipsta_bids.stats.settings import GlmSettings
@@ -40,7 +41,8 @@ def _of_cohort(study: Study) -> Iterator[str]:
                 "differences"
             )
     if n_later := sum(entry.reason == "later-session" for entry in study.exclusions):
-        yield f"{n_later} later sessions are not in it; --longitudinal takes all, --paired two"
+        hints = "".join(f"; {one.hint}" for one in find_sessions())
+        yield f"{n_later} later sessions are not in it{hints}"
     if doubtful := sum(record.doubtful for record in study.collection.records):
         yield (
             f"{doubtful} hemispheres to look at first are included without a rating; exclude "
@@ -77,7 +79,7 @@ def unequal_spread(analysis: results.Analysis, settings: GlmSettings) -> Iterato
     """
     groups, worst = analysis.groups, dict[str, tuple[float, str]]()
     named = groups is not None and groups.column in closed_formula(analysis.model.formula).names
-    if not named or settings.covariance != "ordinary" or analysis.comparison.longitudinal:
+    if not named or settings.covariance != "ordinary" or analysis.comparison.sessions.is_repeated:
         return
     for hemi, fitted in analysis.fitted.items():
         members = results.members_of(analysis, results.rows_of(analysis, fitted))

@@ -15,7 +15,7 @@ from hipsta_bids.errors import InputError, ModelError
 from hipsta_bids.group import model as modeling
 from hipsta_bids.group.cohort import collect, read
 from hipsta_bids.group.cohort.covariates import add_icv, add_time, read_covariates, spelled_note
-from hipsta_bids.group.cohort.data import SHEET, Cohort, Measures, choose_visits
+from hipsta_bids.group.cohort.data import SHEET, Cohort, Measures
 from hipsta_bids.group.cohort.order import read_in_order
 from hipsta_bids.group.cohort.sources import Reading, Remark, Search, Source
 from hipsta_bids.group.output import write
@@ -387,14 +387,18 @@ def _study(
     cohorts = {SHEET: all_visits, **surfaces}
     rows = np.concatenate([side.rows for one in cohorts.values() for side in one.sides.values()])
     has_maps = np.isin(np.arange(len(all_visits.table)), rows)
-    comparison = options.comparison
-    cohort, reasons = choose_visits(all_visits.take(has_maps), comparison)
+    sessions = options.comparison.sessions
+    cohort = all_visits.take(has_maps)
+    is_compared, messages = sessions.choose(cohort.table)
+    cohort = cohort.take(is_compared)
     keep = all_visits.table.index.isin(cohort.table.index)
     table, icv = add_icv(cohort.table, measured.sources, settings)
-    time = add_time(table, settings, comparison) if comparison.longitudinal else None
+    time = None
+    if sessions.is_repeated:
+        time = sessions.with_visits(add_time(table, settings), settings)
     cohort = replace(cohort, table=table if time is None else time.table)
-    reason = "other-session" if comparison.pair or comparison.endpoint else "later-session"
-    reasons_of = {visit: (reason, message) for visit, message in reasons.items()}
+    reasons = messages[~is_compared].items()
+    reasons_of = {str(visit): (sessions.reason, message) for visit, message in reasons}
     return Study(
         options=options,
         settings=settings,

@@ -7,6 +7,7 @@ from pathlib import Path
 import nibabel as nib
 import numpy as np
 import pytest
+from extension_marks import needs
 from hippunfold_like import (
     PATTERNS,
     cifti_name,
@@ -322,6 +323,7 @@ def test_refused_in_one_line(study, capsys, spoil, options, code, words):  # noq
     assert not list((study / "out").glob("group/*"))
 
 
+@needs("repeated")
 def test_change_between_sessions_of_other_maps(study):
     data = study / "bids" / "two"
     for subject in subjects():

@@ -198,6 +198,7 @@ def test_other_people_of_known_and_new_sites(results, tmp_path, quick):
     assert main([str(data), str(out), "group", *given, *quick]) == 65
 
 
+@needs("repeated")
 def test_repeated_sessions(tmp_path, quick, capsys):
     data, out = write_study(tmp_path, sessions=("1", "2"))
     for row in read_participants(data):

@@ -217,10 +217,15 @@ def visits(tmp_path_factory):
 @pytest.mark.parametrize(
     ("options", "groups"),
     [
-        (["--longitudinal"], 2),
-        (["--paired", "1", "3"], 2),
-        (["--endpoint", "ancova", "1", "3"], 2),
-        (["--endpoint", "clda", "1", "2", "3"], 2),
+        *(
+            pytest.param(options.split(), 2, marks=needs("repeated"))
+            for options in (
+                "--longitudinal",
+                "--paired 1 3",
+                "--endpoint ancova 1 3",
+                "--endpoint clda 1 2 3",
+            )
+        ),
         pytest.param(["--retest"], 1, marks=needs("trials")),
     ],
 )
@@ -240,6 +245,7 @@ def test_each_participant_counts_once_at_the_baseline(visits, options, groups, m
     assert age["n"].sum() == len(ages)
 
 
+@needs("repeated")
 def test_the_baseline_of_an_end_point_is_the_one_named(tmp_path):
     """By their names, sessions without times have the baseline last."""
     data, out = begin_dataset(tmp_path)

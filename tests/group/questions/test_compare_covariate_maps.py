@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import statsmodels.api as sm
 import statsmodels.formula.api as smf
+from extension_marks import needs
 from small_cohorts import (
     NODES,
     PLAN,
@@ -98,6 +99,7 @@ def test_permutations_and_asymmetry_have_the_map(study):
     np.testing.assert_allclose(joint["statistic"], combine_evidence(p, "fisher"), rtol=1e-4)
 
 
+@needs("repeated")
 def test_change_by_the_map_at_baseline(tmp_path):
     """A change that depends on the baseline is found where it does; other maps have no effect."""
     data, out = begin_dataset(tmp_path)

@@ -257,8 +257,12 @@ def test_sides_of_different_kinds(tmp_path, call):
 @pytest.mark.parametrize(
     ("options", "term"),
     [
-        (["--paired", "1", "2", "--formula", "thickness_mean ~ 1"], "session"),
-        (
+        pytest.param(
+            ["--paired", "1", "2", "--formula", "thickness_mean ~ 1"],
+            "session",
+            marks=needs("repeated"),
+        ),
+        pytest.param(
             [
                 "--longitudinal",
                 "--formula",
@@ -267,6 +271,7 @@ def test_sides_of_different_kinds(tmp_path, call):
                 "years",
             ],
             "years",
+            marks=needs("repeated"),
         ),
         pytest.param(["--retest"], "session", marks=needs("trials")),
         pytest.param(
@@ -290,6 +295,7 @@ def test_visits_of_different_kinds(tmp_path, call, options, term):
     assert line.removeprefix("warning: ") in result.methods
 
 
+@needs("repeated")
 def test_pairs_count_what_was_measured_in_both_sessions(tmp_path, call):
     data, out = make(
         tmp_path,

@@ -67,6 +67,7 @@ def study(request, tmp_path):
     return write_visits(tmp_path, sessions, dates), sessions
 
 
+@needs("repeated")
 def test_categories_are_compared_with_the_first_session(study):
     folders, sessions = study
     folder = run(folders, "--longitudinal", "visits", "--formula", "visit")
@@ -87,6 +88,7 @@ def test_the_first_session_is_analyzed_by_default(study):
     assert set(left_out.reason) == {"later-session"}
 
 
+@needs("repeated")
 def test_tables_have_visits_in_order(study):
     folders, sessions = study
     folder = run(folders, "--longitudinal", "visits", "--formula", "visit")

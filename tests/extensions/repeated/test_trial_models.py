@@ -17,10 +17,10 @@ from small_cohorts import (
 from statsmodels.formula.api import ols
 
 from hipsta_bids.cli.main import main
+from hipsta_bids.extensions.repeated.mmrm import fit_visits
 from hipsta_bids.io import files
 from hipsta_bids.reports.group import group_page
 from hipsta_bids.stats.contrasts import Contrast
-from hipsta_bids.stats.mmrm import fit_visits
 from hipsta_bids.stats.settings import LongitudinalSettings
 
 SESSIONS = ("base", "m06", "m12")

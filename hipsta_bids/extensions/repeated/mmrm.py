@@ -17,10 +17,9 @@ from hipsta_bids.errors import ModelError
 from hipsta_bids.stats import glm
 from hipsta_bids.stats.arrays import Bool, Float, Int
 from hipsta_bids.stats.contrasts import Contrast, split_name
-from hipsta_bids.stats.design import Design
+from hipsta_bids.stats.design import VISIT, Design
 from hipsta_bids.stats.mixed import denominator
 from hipsta_bids.stats.settings import GlmSettings, LongitudinalSettings
-from hipsta_bids.stats.visits import VISIT
 from hipsta_bids.types import PARTICIPANT
 
 #: Most visits; V visits have V (V + 1) / 2 variances and covariances.

@@ -10,9 +10,9 @@ from formulaic import model_matrix
 from scipy import optimize, stats
 
 from hipsta_bids.errors import ModelError
+from hipsta_bids.extensions.repeated.mmrm import fit_visits
 from hipsta_bids.stats.contrasts import Contrast
 from hipsta_bids.stats.glm import fit_points
-from hipsta_bids.stats.mmrm import fit_visits
 from hipsta_bids.stats.settings import GlmSettings, LongitudinalSettings
 
 DATA = Path(__file__).with_name("fev.tsv")
