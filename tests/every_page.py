@@ -55,15 +55,19 @@ COMMANDS = [
     # With tables of single slices beside the sheets, as after the command surrogate.
     (f"{GROUP} --name default", 0, ["cohort/out/group/default.html"]),
     (
-        f"{GROUP} --name sides --asymmetry --normative group=CN --no-classification",
+        f"{GROUP} --name sides --asymmetry --no-classification"
+        + " --normative group=CN" * ("norms" in PRESENT),
         0,
         ["cohort/out/group/sides.html"],
     ),
-    (
-        f"{GROUP} --name sites --covariates site.tsv --harmonize site --no-classification",
-        0,
-        ["cohort/out/group/sites.html"],
-    ),
+    *[
+        (
+            f"{GROUP} --name sites --covariates site.tsv --harmonize site --no-classification",
+            0,
+            ["cohort/out/group/sites.html"],
+        )
+    ]
+    * ("sites" in PRESENT),
     *(
         (
             (

@@ -24,6 +24,7 @@ from browsing import (
     violations,
     watched,
 )
+from extension_marks import PRESENT
 from page_outline import Outline
 from selenium import webdriver
 from selenium.webdriver.common.keys import Keys
@@ -59,7 +60,8 @@ def dataset(tmp_path_factory):
         excluded, ["participant_id", "hemi", "reason"], [["sub-30", "L", "moved <b>much</b>"]]
     )
     given = ["--settings", str(folder / "group.toml"), "--exclude", str(excluded)]
-    given += ["--asymmetry", "--normative", "group=CN", "--name", MODEL]
+    given += ["--asymmetry", "--name", MODEL]
+    given += ["--normative", "group=CN"] * ("norms" in PRESENT)
     with pytest.MonkeyPatch.context() as patch:
         # Figures take longer than all else: those of maps alone.
         patch.setattr(write, "draw_figures", only_maps)

@@ -31,7 +31,8 @@ CASES = [
     ("s.toml", ["--settings", "s.toml"]),
     ("model.json", ["--model", "model.json"]),
     ("template.json", ["--template", "template.json"]),
-    ("sites.json", ["--harmonize", "sex", "--harmonize-model", "sites.json"]),
+    *[("sites.json", ["--harmonize", "sex", "--harmonize-model", "sites.json"])]
+    * ("sites" in PRESENT),
     *[("norms.json", ["--norms", "norms.json"])] * ("norms" in PRESENT),
     ("fs/sub-01/stats/aseg.stats", SEGMENTATIONS),
     ("fs/sub-01/mri/sub-01_icv.txt", SEGMENTATIONS),

@@ -9,6 +9,7 @@ import nibabel as nib
 import numpy as np
 import pandas as pd
 import pytest
+from extension_marks import needs
 from page_outline import Outline
 from small_cohorts import (
     PLAN,
@@ -260,6 +261,7 @@ def test_small_counts_of_earlier_summaries_are_not_shown(plain, tmp_path):
     assert "48 participants at 2 sites" in methods
 
 
+@needs("sites")
 def test_harmonized_values_are_refused(cohort, tmp_path, capsys):
     loose = tmp_path / "loose.toml"
     loose.write_text("[harmonization]\nleast_participants = 5\n")

@@ -255,10 +255,11 @@ def test_equivalence_has_two_sides_of_one_difference(trial, capsys):
             "one-sided tests are not permuted",
         ),
         (["--contrast", "age > 0.1", "--measures", "curvature"], 65, "a margin has one unit"),
-        (
+        pytest.param(
             ["--endpoint", "mmrm", *SESSIONS, "--harmonize", "arm"],
             65,
             "--harmonize: not with --endpoint",
+            marks=needs("sites"),
         ),
         pytest.param(
             ["--endpoint", "mmrm", "base", "m12", "--retest"],

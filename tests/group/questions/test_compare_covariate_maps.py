@@ -150,8 +150,18 @@ def test_change_by_the_map_at_baseline(tmp_path):
         (["thickness ~ group + map(curvatur)"], 65, "did you mean curvature?"),
         (["thickness ~ group + map(volume)"], 65, "map(volume) in the formula: it is no map"),
         (["volume ~ group + map(curvature)"], 65, "not with summary measures alone"),
-        (["thickness ~ group + map(curvature)", "--normative", "group=CN"], 65, "--normative"),
-        (["thickness ~ group + map(curvature)", "--harmonize", "sex"], 65, "--harmonize: not with"),
+        pytest.param(
+            ["thickness ~ group + map(curvature)", "--normative", "group=CN"],
+            65,
+            "--normative: not with map()",
+            marks=needs("norms"),
+        ),
+        pytest.param(
+            ["thickness ~ group + map(curvature)", "--harmonize", "sex"],
+            65,
+            "--harmonize: not with map()",
+            marks=needs("sites"),
+        ),
     ],
 )
 def test_what_maps_cannot_do_is_one_line(study, capsys, options, code, said):

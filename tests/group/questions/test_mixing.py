@@ -349,6 +349,7 @@ def test_norms_and_scores(tmp_path, capsys):
     assert "version: v21, but v22 in" in said(capsys)
 
 
+@needs("sites")
 def test_effects_of_sites_of_another_kind(tmp_path, capsys):
     """Effects of sites that were estimated from other segmentations are refused."""
     data, out = write_people(tmp_path / "sites", {"A": 12, "B": 12}, 1)
