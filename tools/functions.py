@@ -26,7 +26,7 @@ TO_SPLIT = frozenset(
     group/questions/compare.py:_notes group/questions/harmonize.py:plan_sites
     group/questions/models.py:register group/questions/replicate.py:replicate
     group/questions/scores.py:score_cohort group/questions/study.py:read_study
-    participant/job.py:hash_inputs participant/job.py:measure_job participant/measure.py:find_all
+    participant/measure.py:find_all
     participant/measure.py:unfold participant/pool.py:run_jobs participant/run.py:_measured
     participant/run.py:_prepare participant/run.py:_run participant/unfolded.py:resample
     participant/visits.py:_measure_visits participant/whole.py:measure_whole
