@@ -168,6 +168,29 @@ class Region:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Measurement:
+    """What an option of the participant level adds to each measured hemisphere."""
+
+    name: str
+    """Of the option in Python, and of its stage."""
+    options: str
+    """Function that adds the option to a group of the parser."""
+    after: str
+    """Function of a job, its labels and its maps; returns the maps, notes, and a function that
+    writes further files."""
+    is_complete: str
+    """Function of a job and its quality record: whether its files exist as the option asks."""
+    cost: str
+    """Function of the option's value: how many times as long a hemisphere takes."""
+    tables: tuple[str, ...]
+    """Keys of tables with further maps, a row per node."""
+    columns: str
+    """Function of a hemisphere of a page; returns further maps of its sheet, by name."""
+    pictures: str
+    """Function of measured hemispheres of a page; returns pictures, and lines below them."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Extension:
     """What a folder adds to the program."""
 
@@ -188,6 +211,7 @@ class Extension:
     functions: tuple[str, ...] = ()
     """Functions of the Python interface, as ``module:name``."""
     regions: tuple[Region, ...] = ()
+    measurements: tuple[Measurement, ...] = ()
     participant_settings: tuple[tuple[str, str], ...] = ()
     """Tables of the settings of the participant level: name and class."""
     columns: str = ""
@@ -244,6 +268,13 @@ def is_present(name: str) -> bool:
 def find_regions() -> dict[str, Region]:
     """Find the regions of extensions, by name."""
     return {region.name: region for extension in find_extensions() for region in extension.regions}
+
+
+def find_measurements() -> tuple[Measurement, ...]:
+    """Find what options of extensions add to measured hemispheres."""
+    return tuple(
+        measurement for extension in find_extensions() for measurement in extension.measurements
+    )
 
 
 def find_parts() -> tuple[Part, ...]:

@@ -274,25 +274,6 @@ class MapSettings(tables.SettingsTable):
     """Flag if a larger share of the points lies outside the volume's field of view."""
 
 
-class UncertaintySettings(tables.SettingsTable):
-    """Perturbed copies of the labels; their spread is the uncertainty of maps (--uncertainty)."""
-
-    relabeling: NonNegativeFloat = 0.3
-    """Boundaries are drawn elsewhere by this in all, mm: SD along each axis."""
-    correlation: tables.Lengths = (1.0, 3.0)
-    """Distances over which these errors correlate by 1/e, mm, in equal shares of the variance that
-    ``jitter`` leaves."""
-    end_shift: NonNegativeFloat = 0.5
-    """End planes are placed elsewhere by this, slices: SD along the normal. An end without a label
-    moves by its standard error if that is larger."""
-    jitter: NonNegativeFloat = 0.5
-    """Part of these errors is independent between voxels: even, up to this, in voxels along each
-    axis. With 0, and ``relabeling`` 0, labels have no errors."""
-    rotation: Annotated[float, Field(ge=0, le=45)] = 5.0
-    """Rotation of the voxels about each axis, up to this, degrees, with a shift up to half a voxel.
-    It simulates another position in the scanner."""
-
-
 #: Settings of ``--method published``: what Diers et al. 2023 describe. Topology is repaired in any
 #: case, where the original stops.
 PUBLISHED: Mapping[str, Mapping[str, str | float]] = MappingProxyType(
@@ -318,7 +299,6 @@ class Settings(tables.SettingsTable):
     measures: MeasureSettings = Field(default_factory=MeasureSettings)
     checks: CheckSettings = Field(default_factory=CheckSettings)
     maps: MapSettings = Field(default_factory=MapSettings)
-    uncertainty: UncertaintySettings = Field(default_factory=UncertaintySettings)
 
     def table(self, kind: type[_Table]) -> _Table:
         """Return the table of an extension."""

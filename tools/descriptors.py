@@ -10,6 +10,7 @@ from hipsta_bids import __version__
 from hipsta_bids.cli.group import group_parser
 from hipsta_bids.cli.participant import build_parser
 from hipsta_bids.errors import EXIT_MEANINGS, ExitCode
+from hipsta_bids.joints import is_present
 
 Entry = dict[str, Any]
 
@@ -198,8 +199,10 @@ _HEMISPHERE = {
     "meshes": ("_desc-tet_mesh.vtu", "tetrahedral meshes (write_meshes)"),
     "other_maps": ("_desc-*_map.tsv", "other images on the sheet (map)"),
     "regions": ("_desc-roi_morph.tsv", "maps summed up in regions (roi)"),
-    "uncertainties": ("_desc-*uncertainty_morph.tsv", "SD over perturbed labels (uncertainty)"),
 }
+if is_present("uncertainty"):
+    text = "SD over perturbed labels (uncertainty)"
+    _HEMISPHERE["uncertainties"] = ("_desc-*uncertainty_morph.tsv", text)
 
 #: Files of one model of the group level: name, description, written whatever the model. Models of
 #: volumes have no maps; those without groups, of one session or not registered lack others.

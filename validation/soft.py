@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from hipsta_bids.extensions.uncertainty.copies import estimate_uncertainty
 from hipsta_bids.geometry.body import extract_body
 from hipsta_bids.inputs.search import HemisphereInput
-from hipsta_bids.participant.uncertainty import estimate_uncertainty
 from hipsta_bids.phantom import Phantom, PhantomSpec
 from hipsta_bids.settings import Settings
 from hipsta_bids.types import Decision, Float, HemisphereMaps, LabelVolume

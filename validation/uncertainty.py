@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import spearmanr
 
+from hipsta_bids.extensions.uncertainty.copies import Uncertainty, estimate_uncertainty
 from hipsta_bids.geometry.body import extract_body
 from hipsta_bids.inputs.labels import read_label_volume
 from hipsta_bids.inputs.search import HemisphereInput
-from hipsta_bids.participant.uncertainty import Uncertainty, estimate_uncertainty
 from hipsta_bids.phantom import Phantom, PhantomSpec
 from hipsta_bids.settings import Settings
 from hipsta_bids.types import Float, HemisphereMaps, LabelVolume

@@ -18,12 +18,13 @@ from numpy.typing import NDArray
 from hipsta_bids.api.maps import attributes, measure, node_axes
 from hipsta_bids.derivatives.dataset import counts_text
 from hipsta_bids.derivatives.measures import identify, origin
-from hipsta_bids.derivatives.results import POSITION, STATE, list_results, read_sheet
+from hipsta_bids.derivatives.results import NODES, POSITION, STATE, list_results, read_sheet
 from hipsta_bids.errors import MissingFileError, NothingToDoError, in_python
 from hipsta_bids.geometry.catalog import MAPS
 from hipsta_bids.group.cohort.collect import grid_of
 from hipsta_bids.io import files
 from hipsta_bids.io.xarrays import make_dataset, read_later
+from hipsta_bids.joints import find_measurements
 from hipsta_bids.phantom import Phantom, PhantomSpec, encode
 from hipsta_bids.phantom.cohort import CohortPlan, make_cohort
 from hipsta_bids.protocols.load import load_protocol
@@ -196,15 +197,22 @@ def _lazy_dataset(root: Path, hemispheres: list[Hemisphere], table: pd.DataFrame
 def _further_maps(measured: list[Hemisphere]) -> dict[str, tuple[tuple[str, ...], dict[str, str]]]:
     """Columns of tables of SDs and of sampled maps: their table, and what they are."""
     maps = {entry["name"] for h in measured for entry in h.record.get("maps") or ()}
+    added = [(key,) for measurement in find_measurements() for key in measurement.tables]
     variables = {}
-    for key in (("uncertainty",), *(("map_table", name) for name in sorted(maps))):
-        paths = (hemisphere.result.path(*key).with_suffix(".json") for hemisphere in measured)
-        path = next((path for path in paths if path.is_file()), None)
-        for name, about in files.read_json(path).items() if path else ():
-            if name.endswith("_sd") if key == ("uncertainty",) else name.partition("_")[0] in maps:
+    for key in (*added, *(("map_table", name) for name in sorted(maps))):
+        for name, about in _read_sidecar(measured, key).items():
+            is_map = name not in NODES if key in added else name.partition("_")[0] in maps
+            if is_map and isinstance(about, dict):
                 unit = {"units": about["Units"]} if "Units" in about else {}
                 variables[name] = key, {"long_name": about["Description"], **unit}
     return variables
+
+
+def _read_sidecar(measured: list[Hemisphere], key: tuple[str, ...]) -> dict[str, Any]:
+    """Read the sidecar of a table of the first hemisphere that has it; empty without one."""
+    paths = (hemisphere.result.path(*key).with_suffix(".json") for hemisphere in measured)
+    path = next((path for path in paths if path.is_file()), None)
+    return files.read_json(path) if path else {}
 
 
 class Example(NamedTuple):

@@ -25,7 +25,7 @@ from hipsta_bids.cli.parser import (
     subject_label,
 )
 from hipsta_bids.errors import ExitCode, NothingToDoError, OutputError, UsageError, did_you_mean
-from hipsta_bids.joints import find_regions
+from hipsta_bids.joints import find_measurements, find_regions, load
 from hipsta_bids.participant.cluster import Cluster, Shard, check_cluster, parse_shard
 from hipsta_bids.participant.pool import pin_threads, processors
 from hipsta_bids.protocols import EXPERIMENTAL
@@ -129,7 +129,8 @@ def _add_processing(parser: Parser) -> None:
     add("--probabilities", "auto|never|DIR", type=_probabilities, default="auto")
     add("--longitudinal", "", nargs="?", const="auto", choices=["auto", "shared"])
     add("--write-meshes")
-    add("--uncertainty", "K", type=_copies, default=0)
+    for measurement in find_measurements():
+        load(measurement.options)(group)
     add("--force")
     add_pages = adder(group.add_mutually_exclusive_group(), _HELP)
     add_pages("--no-reports")
@@ -181,13 +182,6 @@ def _choice(*values: str) -> Callable[[str], tuple[str | None, str]]:
         return name or None, value
 
     return convert
-
-
-def _copies(text: str) -> int:
-    """Read a number of copies: an SD takes two."""
-    if not text.isascii() or not text.isdigit() or int(text) == 1:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number of copies; use 0, or 2 or more")
-    return int(text)
 
 
 def _probabilities(text: str) -> str | Path:
@@ -334,9 +328,20 @@ def _settings(options: "Namespace") -> "Settings":
         body={"region": options.region} if options.region else {},
         sheet={name: value for name, value in sheet.items() if value},
     )
-    if settings.sheet.frame != "visit" and (settings.body.region != "body" or options.uncertainty):
-        raise UsageError("--longitudinal measures the body; omit --region and --uncertainty")
+    if settings.sheet.frame != "visit" and (settings.body.region != "body" or _further(options)):
+        flags = " and ".join(
+            ["--region", *(f"--{measurement.name}" for measurement in find_measurements())]
+        )
+        raise UsageError(f"--longitudinal measures the body; omit {flags}")
     return settings
+
+
+def _further(options: "Namespace") -> dict[str, object]:
+    """Collect the options of extensions that were given, by name."""
+    values = {
+        measurement.name: getattr(options, measurement.name) for measurement in find_measurements()
+    }
+    return {name: value for name, value in values.items() if value}
 
 
 def _find(
@@ -478,6 +483,7 @@ def _run_options(
         mem_gb=options.mem,
         verbosity=options.verbose,
         cluster=cluster,
+        further=_further(options),
         reports=not options.no_reports,
         anatomy=not options.no_anatomy,
         # The home folder names a person.

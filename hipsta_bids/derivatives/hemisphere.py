@@ -60,7 +60,7 @@ def format_column(values: Float, digits: int) -> list[str]:
     return [f"{v:.{digits}f}" if np.isfinite(v) else files.MISSING for v in rounded.tolist()]
 
 
-def _write_table(
+def write_table(
     result: ResultPlace,
     key: str,
     columns: Mapping[str, Sequence[str]],
@@ -80,32 +80,33 @@ def _write_sheet(result: ResultPlace, maps: HemisphereMaps, protocol: Protocol) 
     labels = sheet_labels(protocol)
     short = {int(tissue): label.abbreviation for tissue, label in labels.items()}
     columns = {
-        **_numbers(NODES, (nx, ny)),
+        **number_nodes(NODES, (nx, ny)),
         **_positions(points[:, :, nz // 2]),
-        **_formatted(MAPS, maps.maps),
+        **format_measures(MAPS, maps.maps),
         "subfield": [short.get(code, files.MISSING) for code in maps.subfield.ravel().tolist()],
         "valid": _truths(maps.sheet.valid),
         "repaired": _truths(maps.repaired),
         "doubtful": _truths(maps.doubtful),
     }
     definitions = describe_columns(NODES | POSITION)
-    definitions |= {row.name: _measure(row) for row in MAPS} | describe_columns(STATE)
+    definitions |= {row.name: define_measure(row) for row in MAPS} | describe_columns(STATE)
     definitions["subfield"]["Levels"] = {
         label.abbreviation: label.name for label in labels.values()
     }
     if "x_coordinate" in maps.qc:
         definitions["x"]["Coordinate"] = maps.qc["x_coordinate"]
-    _write_table(result, "sheet", columns, definitions)
+    write_table(result, "sheet", columns, definitions)
 
 
 def _write_summary(result: ResultPlace, summary: Mapping[str, float]) -> None:
     """Write one row of summary measures: those of the catalog, then those of subfields."""
     names = dict.fromkeys((*_SUMMARY_ROWS, *summary))
-    columns = {name: _summary_cell(name, summary.get(name, np.nan)) for name in names}
-    _write_table(result, "summary", columns, {name: summary_definition(name) for name in names})
+    columns = {name: summary_cell(name, summary.get(name, np.nan)) for name in names}
+    write_table(result, "summary", columns, {name: summary_definition(name) for name in names})
 
 
-def _summary_cell(name: str, value: float) -> list[str]:
+def summary_cell(name: str, value: float) -> list[str]:
+    """Write the value of a summary measure as the one cell of its column."""
     row = _SUMMARY_ROWS.get(name)
     return format_column(np.array([value]), row.digits if row else _MILLIMETER_DIGITS)
 
@@ -114,9 +115,9 @@ def _write_profile(result: ResultPlace, maps: HemisphereMaps) -> None:
     """Write the means along x, then those along y."""
     parts = []
     for axis, profile in maps.profiles.items():
-        measures = _formatted(MAPS, profile)
+        measures = format_measures(MAPS, profile)
         count = len(measures[MAPS[0].name])
-        parts.append({"axis": [axis] * count, **_numbers(("node",), (count,)), **measures})
+        parts.append({"axis": [axis] * count, **number_nodes(("node",), (count,)), **measures})
     columns = {name: [cell for part in parts for cell in part[name]] for name in parts[0]}
     definitions: dict[str, object] = {
         "axis": {
@@ -129,17 +130,17 @@ def _write_profile(result: ResultPlace, maps: HemisphereMaps) -> None:
         "node": {"Description": "node number along that axis, from 1"},
     }
     wording = "{}; mean over the area of the columns measured directly"
-    definitions |= {row.name: _measure(row, wording) for row in MAPS}
-    _write_table(result, "profile", columns, definitions)
+    definitions |= {row.name: define_measure(row, wording) for row in MAPS}
+    write_table(result, "profile", columns, definitions)
 
 
 def _write_sections(result: ResultPlace, sections: Mapping[str, Float]) -> None:
     """Write one row per cross-section, from posterior to anterior."""
-    measures = _formatted(SECTIONS, sections)
+    measures = format_measures(SECTIONS, sections)
     count = len(measures[SECTIONS[0].name])
     text = "number of the section, from the posterior to the anterior end"
-    definitions = {"y": {"Description": text}} | {row.name: _measure(row) for row in SECTIONS}
-    _write_table(result, "sections", {**_numbers(("y",), (count,)), **measures}, definitions)
+    definitions = {"y": {"Description": text}} | {row.name: define_measure(row) for row in SECTIONS}
+    write_table(result, "sections", {**number_nodes(("y",), (count,)), **measures}, definitions)
 
 
 def _write_layers(result: ResultPlace, layers: Sheet) -> None:
@@ -147,15 +148,15 @@ def _write_layers(result: ResultPlace, layers: Sheet) -> None:
     depth = layer_depth(layers)
     length = np.where(depth[:, :, -1:] > 0, depth[:, :, -1:], np.nan)
     columns = {
-        **_numbers(("x", "y", "layer"), depth.shape),
+        **number_nodes(("x", "y", "layer"), depth.shape),
         "depth": format_column(depth, _MILLIMETER_DIGITS),
         "relative_depth": format_column(depth / length, _MILLIMETER_DIGITS),
         **_positions(layers.points),
     }
-    _write_table(result, "layers", columns, describe_columns(LAYERS))
+    write_table(result, "layers", columns, describe_columns(LAYERS))
 
 
-def _numbers(axes: Iterable[str], shape: tuple[int, ...]) -> dict[str, list[str]]:
+def number_nodes(axes: Iterable[str], shape: tuple[int, ...]) -> dict[str, list[str]]:
     """Node numbers of all points of a grid, from 1, last axis fastest."""
     numbers = (index.ravel() + 1 for index in np.indices(shape))
     return {axis: [str(n) for n in v.tolist()] for axis, v in zip(axes, numbers, strict=True)}
@@ -171,24 +172,24 @@ def _truths(values: Bool) -> list[str]:
     return ["true" if value else "false" for value in values.ravel().tolist()]
 
 
-def _formatted(rows: Sequence[Column], values: Mapping[str, Float]) -> dict[str, list[str]]:
+def format_measures(rows: Sequence[Column], values: Mapping[str, Float]) -> dict[str, list[str]]:
     """Format columns in the catalog's order, each with its number of decimals."""
     return {row.name: format_column(values[row.name], row.digits) for row in rows}
 
 
-def _measure(row: Column, wording: str = "{}") -> dict[str, object]:
-    """Define the column of a measure, with where its formula comes from."""
+def define_measure(row: Column, wording: str = "{}") -> dict[str, object]:
+    """Define the column of a measure, with the source of its formula."""
     return {"Description": wording.format(row.definition), "Units": row.unit, "Source": row.source}
 
 
 def summary_definition(column: str) -> dict[str, object]:
     """Define a summary measure; the name of a subfield's begins with the measure's."""
     if column in _SUMMARY_ROWS:
-        return _measure(_SUMMARY_ROWS[column])
+        return define_measure(_SUMMARY_ROWS[column])
     for row in PER_SUBFIELD:
         if column.startswith(f"{row.name}_"):
             subfield = column.removeprefix(f"{row.name}_")
-            return _measure(row) | {"Description": row.definition.format(subfield)}
+            return define_measure(row) | {"Description": row.definition.format(subfield)}
     return {"Description": column.replace("_", " ")}
 
 
@@ -241,41 +242,6 @@ def write_sources(result: ResultPlace, record: Mapping[str, Any]) -> None:
         if any(result.path(image.key).exists() for image in row.images):
             about = {} if row in SHARED else describe(row)
             files.write_json(result.path(row.key), {**about, "Sources": sources(record)})
-
-
-def spread_name(measure: str) -> str:
-    """Name of the column with the SD of a measure over perturbed copies."""
-    return f"{measure}_sd"
-
-
-def write_spread(
-    result: ResultPlace, maps: Mapping[str, Float], summary: Mapping[str, float], copies: int
-) -> None:
-    """Write SDs over perturbed copies: of maps (Nx, Ny), as table and GIFTI, and of the summary.
-
-    Arguments are by name of the measure, ``copies`` is the number that SDs rest on.
-    """
-    wording = f"SD over {copies} perturbed copies of the labels: {{}}"
-    nodes = {spread_name(name): column for name, column in _formatted(MAPS, maps).items()}
-    definitions = {spread_name(row.name): _measure(row, wording) for row in MAPS}
-    _write_table(
-        result,
-        "uncertainty",
-        {**_numbers(NODES, maps["thickness"].shape), **nodes},
-        describe_columns(NODES) | definitions,
-    )
-    columns, definitions = {}, {}
-    for name, value in summary.items():
-        about = summary_definition(name)
-        about["Description"] = wording.format(about["Description"])
-        definitions[spread_name(name)] = about
-        columns[spread_name(name)] = _summary_cell(name, value)
-    _write_table(result, "summaryuncertainty", columns, definitions)
-    name, unit = spread_name("thickness"), "mm"
-    content = gifti.shape_bytes(
-        maps["thickness"].ravel(), hemi=result.name.hemi, name=name, unit=unit
-    )
-    files.write_bytes(result.path("thickness_sd"), content)
 
 
 def _flag_entry(flag: Flag) -> dict[str, Any]:

@@ -177,7 +177,6 @@ OUTPUTS: tuple[Output, ...] = (
     _output("qc", "metrics", ".json", desc="qc"),
 )
 
-_SPREAD = _output("thickness_sd", "morph", ".shape.gii", unit="mm", desc="thicknessSd")
 _CHANGE = _output("change", "morph", ".shape.gii", unit="mm", desc="thicknessChange")
 #: Of the sheet that all visits of a participant share, in the folder of the participant.
 _TEMPLATE = (
@@ -217,10 +216,6 @@ def _of_extensions() -> Iterator[Output]:
 EXTRA_OUTPUTS: tuple[Output, ...] = (
     *(_output(f"map_{key}", "map", end, desc="*") for key, end in _SAMPLED.items()),
     *_table("roi", called="the region table"),
-    *_table("uncertainty", called="that table"),
-    *_table("summaryuncertainty", called="that table"),
-    _SPREAD,
-    *_sidecars([_SPREAD]),
     _CHANGE,
     *_sidecars([_CHANGE]),
     *_TEMPLATE,

@@ -9,8 +9,9 @@ import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import psutil
@@ -24,6 +25,7 @@ from hipsta_bids.errors import GeometryError, HipstaError, InputError, OutputErr
 from hipsta_bids.geometry.sampling import Regions
 from hipsta_bids.inputs.scan import HemisphereInput
 from hipsta_bids.io import files
+from hipsta_bids.joints import find_measurements, load
 from hipsta_bids.participant.maps import (
     Mapped,
     add_signals,
@@ -34,9 +36,6 @@ from hipsta_bids.participant.maps import (
 from hipsta_bids.protocols.load import for_region
 from hipsta_bids.settings import Settings
 from hipsta_bids.types import BodyMask, Decision, HemisphereMaps, LabelVolume
-
-if TYPE_CHECKING:
-    from hipsta_bids.participant.uncertainty import Uncertainty
 
 INTERNAL = "internal-error"
 """Reason of a failure that is a bug."""
@@ -57,8 +56,8 @@ class Job:
     write_meshes: bool
     visits: tuple[HemisphereInput, ...] = ()
     """All visits that share a sheet, this one included; none if it has its own sheet."""
-    copies: int = 0
-    """Perturbed copies from which uncertainty is estimated; 0 for none."""
+    further: Mapping[str, Any] = field(default_factory=dict)
+    """Options of extensions that were given, by name in Python."""
     force: bool = False
     """Redo it even if an earlier run has done the same."""
     memory_gb: float | None = None
@@ -116,7 +115,7 @@ def recorded(job: Job) -> Outcome | None:
     whole = decision == Decision.FAILED or (
         all(path.exists() for path in job.result.paths(optional=job.write_meshes))
         and is_complete(job.result, record)
-        and has_spread(job.result, record, job.copies)
+        and all(load(measurement.is_complete)(job, record) for measurement in find_measurements())
         and (not job.visits or job.result.path("change").exists())
     )
     if not (is_current and whole):
@@ -182,7 +181,6 @@ def base_record(job: Job) -> dict[str, Any]:
 def hash_inputs(job: Job, record: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
     """Hash the input files and how they are read; return entries of a record with hashes, too."""
     item = job.item
-    region = for_region(item.protocol, job.settings.body.region)
     inputs = [
         entry | {"sha256": files.sha256_of(path)}
         for entry, path in zip(record["inputs"], item.files, strict=True)
@@ -191,7 +189,30 @@ def hash_inputs(job: Job, record: Mapping[str, Any]) -> tuple[str, dict[str, Any
         entry | {"sha256": files.sha256_of(edit.path)}
         for entry, edit in zip(record["edited"], item.edits, strict=True)
     ]
-    reading = [
+    entries = {"inputs": inputs, "edited": edited}
+    reading = _describe_reading(job, inputs, edited)
+    if item.probabilities:
+        entries["probabilities"] = [
+            entry | {"sha256": files.sha256_of(path)}
+            for entry, path in zip(record["probabilities"], item.probability_files, strict=True)
+        ]
+        reading.append([entry["sha256"] for entry in entries["probabilities"]])
+        reading.append([list(map(int, tissues)) for _, tissues in item.probabilities.files])
+    if job.visits:
+        entries["visits"] = list(_hash_visits(job))
+        reading.append([entry["sha256"] for entry in entries["visits"]])
+        reading.append([[asdict(end) for end in visit.ends] for visit in job.visits])
+    digest = hashlib.sha256(json.dumps(reading).encode()).hexdigest()
+    return digest, entries
+
+
+def _describe_reading(
+    job: Job, inputs: Sequence[Mapping[str, Any]], edited: Sequence[Mapping[str, Any]]
+) -> list[Any]:
+    """List what decides how labels are read, with the hashes of input files and edits."""
+    item = job.item
+    region = for_region(item.protocol, job.settings.body.region)
+    return [
         [entry["sha256"] for entry in inputs],
         # The wording of the protocols (titles, citations) does not change what is read.
         [
@@ -209,20 +230,6 @@ def hash_inputs(job: Job, record: Mapping[str, Any]) -> tuple[str, dict[str, Any
         *([[asdict(end) for end in item.ends]] if item.ends else []),
         *signal_hash(item),
     ]
-    entries = {"inputs": inputs, "edited": edited}
-    if item.probabilities:
-        entries["probabilities"] = [
-            entry | {"sha256": files.sha256_of(path)}
-            for entry, path in zip(record["probabilities"], item.probability_files, strict=True)
-        ]
-        reading.append([entry["sha256"] for entry in entries["probabilities"]])
-        reading.append([list(map(int, tissues)) for _, tissues in item.probabilities.files])
-    if job.visits:
-        entries["visits"] = list(_hash_visits(job))
-        reading.append([entry["sha256"] for entry in entries["visits"]])
-        reading.append([[asdict(end) for end in visit.ends] for visit in job.visits])
-    digest = hashlib.sha256(json.dumps(reading).encode()).hexdigest()
-    return digest, entries
 
 
 def _hash_visits(job: Job) -> Iterator[dict[str, Any]]:
@@ -342,44 +349,17 @@ Measure = Callable[[LabelVolume, str, Settings, CostClock], HemisphereMaps]
 
 def measure_job(job: Job, measure: Measure | None = None) -> Outcome:
     """Measure a hemisphere, by default on a sheet of its own, and write its results."""
-    from hipsta_bids.geometry.label_checks import naming_causes, note_position  # noqa: PLC0415  (workers only)
-    from hipsta_bids.inputs.labels import read_label_volume  # noqa: PLC0415  (likewise)
-    from hipsta_bids.io.volumes import limit_memory  # noqa: PLC0415  (likewise)
+    from hipsta_bids.io.volumes import limit_memory  # noqa: PLC0415  (workers only)
     from hipsta_bids.participant.measure import find_body, measure_hemisphere  # noqa: PLC0415
 
     limit_memory(job.memory_gb)
     clock = CostClock()
     record = base_record(job)
-    hashed, volume = None, None
+    volume = None
     try:
         with clock("read"):
-            hashed, entries = hash_inputs(job, record)
-            record |= {"input_hash": hashed} | entries
-            volume = read_label_volume(job.item, job.settings.body.region)
-            edges = np.linalg.norm(volume.affine[:3, :3], axis=0)
-            record["provenance"]["voxel_size"] = " x ".join(f"{edge:.3g}" for edge in edges)
-        noted = (*volume.notes, *note_position(volume, job.item.hemi))
-        record["notes"] = [*record["notes"], *noted]
-        with naming_causes(volume):
-            maps = (measure or measure_hemisphere)(volume, job.item.hemi, job.settings, clock)
-        mapped: list[Mapped] = []
-        regions = None
-        if job.item.maps or job.item.regions:
-            with clock("maps"):
-                maps, mapped, regions, entries = add_signals(
-                    job.item, maps, job.settings.maps, dict(job.sources)
-                )
-                record |= entries
-        spread = None
-        if job.copies:
-            from hipsta_bids.participant import uncertainty  # noqa: PLC0415  (heavy)
-
-            with clock("uncertainty"):
-                spread = uncertainty.estimate_uncertainty(
-                    volume, job.item.hemi, job.settings, job.copies
-                )
-                maps = uncertainty.add_uncertainty(maps, spread)
-                record["notes"] = [*record["notes"], *spread.notes]
+            volume = _read(job, record)
+        maps, writers = _measure(job, volume, measure or measure_hemisphere, record, clock)
         with clock("write"):
             hemisphere.write_results(
                 job.result,
@@ -387,7 +367,7 @@ def measure_job(job: Job, measure: Measure | None = None) -> Outcome:
                 for_region(job.item.protocol, job.settings.body.region),
                 record,
                 write_meshes=job.write_meshes,
-                write_more=lambda: _write_more(job.result, maps, mapped, regions, spread),
+                write_more=lambda: _call_all(writers),
             )
     except Exception as error:  # noqa: BLE001  (one hemisphere's bug must not end the others)
         explained = _explain(error, job.result.root)
@@ -404,20 +384,65 @@ def measure_job(job: Job, measure: Measure | None = None) -> Outcome:
         message=message,
         repairs=len(maps.repairs),
         notes=_added_notes(job, record),
-        input_hash=hashed,
+        input_hash=record["input_hash"],
         thickness=maps.summary.get("thickness_mean"),
         **clock.spent(),
     )
 
 
-def _write_more(
-    result: ResultPlace,
-    maps: HemisphereMaps,
-    mapped: Sequence[Mapped],
-    regions: Regions | None,
-    spread: "Uncertainty | None",
+def _read(job: Job, record: dict[str, Any]) -> LabelVolume:
+    """Read the labels; add hashes and the size of voxels to the record."""
+    from hipsta_bids.inputs.labels import read_label_volume  # noqa: PLC0415  (workers only)
+
+    hashed, entries = hash_inputs(job, record)
+    record |= {"input_hash": hashed} | entries
+    volume = read_label_volume(job.item, job.settings.body.region)
+    edges = np.linalg.norm(volume.affine[:3, :3], axis=0)
+    record["provenance"]["voxel_size"] = " x ".join(f"{edge:.3g}" for edge in edges)
+    return volume
+
+
+def _measure(
+    job: Job, volume: LabelVolume, measure: Measure, record: dict[str, Any], clock: CostClock
+) -> tuple[HemisphereMaps, list[Callable[[], None]]]:
+    """Measure a hemisphere and what options ask for; return what writes the latter, too.
+
+    Notes and sources are added to the record.
+    """
+    from hipsta_bids.geometry.label_checks import naming_causes, note_position  # noqa: PLC0415  (workers only)
+
+    noted = (*volume.notes, *note_position(volume, job.item.hemi))
+    record["notes"] = [*record["notes"], *noted]
+    with naming_causes(volume):
+        maps = measure(volume, job.item.hemi, job.settings, clock)
+    mapped: list[Mapped] = []
+    regions = None
+    if job.item.maps or job.item.regions:
+        with clock("maps"):
+            maps, mapped, regions, entries = add_signals(
+                job.item, maps, job.settings.maps, dict(job.sources)
+            )
+            record |= entries
+    writers: list[Callable[[], None]]
+    writers = [partial(_write_maps, job.result, maps, mapped, regions)]
+    for measurement in find_measurements():
+        if measurement.name in job.further:
+            with clock(measurement.name):
+                maps, notes, write = load(measurement.after)(job, volume, maps)
+            record["notes"] = [*record["notes"], *notes]
+            writers.append(write)
+    return maps, writers
+
+
+def _call_all(writers: Sequence[Callable[[], None]]) -> None:
+    for write in writers:
+        write()
+
+
+def _write_maps(
+    result: ResultPlace, maps: HemisphereMaps, mapped: Sequence[Mapped], regions: Regions | None
 ) -> None:
-    """Write what options asked for."""
+    """Write maps of other volumes, and those of a region."""
     write_signals(result, maps, mapped, regions)
     for name in maps.maps.keys() & ADDED_MAPS.keys():
         from hipsta_bids.io import gifti  # noqa: PLC0415  (workers only)
@@ -425,21 +450,6 @@ def _write_more(
         values, unit = maps.maps[name].ravel(), ADDED_MAPS[name].unit or ""
         content = gifti.shape_bytes(values, hemi=result.name.hemi, name=name, unit=unit)
         files.write_bytes(result.path(name), content)
-    if spread is not None and spread.known:
-        measured = spread.copies - spread.failed
-        finite = {name: np.isfinite(values) for name, values in maps.maps.items()}
-        sd = {name: np.where(finite[name], sds, np.nan) for name, sds in spread.maps.items()}
-        hemisphere.write_spread(result, sd, spread.summary, measured)
-
-
-def has_spread(result: ResultPlace, record: Mapping[str, Any], copies: int) -> bool:
-    """Return whether the files of a record's uncertainty exist, and are of as many copies."""
-    metrics = record.get("metrics") or {}
-    measured_copies = metrics.get("uncertainty_copies", 0)
-    if not measured_copies or metrics.get("uncertainty_thickness_mm") is None:
-        return measured_copies == copies or not copies
-    keys = ("uncertainty", "summaryuncertainty", "thickness_sd")
-    return copies in {0, measured_copies} and all(result.path(key).exists() for key in keys)
 
 
 def fail(

@@ -5,9 +5,10 @@ import logging
 import math
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import timedelta
 from pathlib import Path
+from typing import Any
 
 from hipsta_bids import __version__
 from hipsta_bids.derivatives import dataset, hemisphere
@@ -18,6 +19,7 @@ from hipsta_bids.derivatives.results import ResultPlace, read_record
 from hipsta_bids.errors import ExitCode, HipstaError, InputError, OutputError, ProtocolError
 from hipsta_bids.inputs.scan import HemisphereInput
 from hipsta_bids.io import files
+from hipsta_bids.joints import find_measurements, load
 from hipsta_bids.participant.cluster import Cluster, Shard, run_on_cluster
 from hipsta_bids.participant.job import (
     INTERNAL,
@@ -62,8 +64,8 @@ class RunOptions:
     force: bool = False
     """Redo hemispheres that are up to date."""
     write_meshes: bool = False
-    uncertainty: int = 0
-    """Perturbed copies per hemisphere from which uncertainty is estimated; 0 for none."""
+    further: Mapping[str, Any] = field(default_factory=dict)
+    """Options of extensions that were given, by name in Python."""
     timeout: float = 600.0
     """Seconds per hemisphere."""
     shard: Shard | None = None
@@ -326,7 +328,7 @@ def _prepare(
             settings_hash=digest,
             sources=tuple(sources.items()),
             write_meshes=options.write_meshes,
-            copies=options.uncertainty,
+            further=options.further,
             force=options.force,
             memory_gb=memory,
         )
@@ -407,7 +409,9 @@ def _tell_titles(units: list[Job | tuple[Job, ...]]) -> None:
 
 def _expected(table: StatusTable, plan: WorkerPlan, jobs: Sequence[Job]) -> timedelta:
     """Guess how long jobs take, from what others in the same folder took."""
-    seconds = table.usual_seconds() * (1 + jobs[0].copies if jobs else 1)
+    further = jobs[0].further if jobs else {}
+    costs = (load(m.cost)(further[m.name]) for m in find_measurements() if m.name in further)
+    seconds = table.usual_seconds() * math.prod(costs)
     return timedelta(seconds=round(seconds * math.ceil(len(jobs) / plan.n_workers)))
 
 

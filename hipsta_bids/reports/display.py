@@ -87,16 +87,6 @@ CURVATURE = MapKind(
     percentiles=(4, 96),
 )
 MAP_KINDS = (THICKNESS, CURVATURE)
-#: Drawn where it was estimated (``--uncertainty``); in phantoms it is about 0.1 mm.
-UNCERTAINTY = MapKind(
-    column="thickness_sd",
-    title="SD of thickness",
-    unit="mm",
-    colors="magma",
-    centered=False,
-    digits=2,
-    limits=(0.0, 0.3),
-)
 #: At visits that share a sheet (``--longitudinal``); noise is about 0.1 mm.
 THICKNESS_CHANGE = MapKind(
     column="thickness_change",

@@ -4,18 +4,19 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cached_property
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hipsta_bids.joints import find_measurements, load
 from hipsta_bids.protocols import EXPERIMENTAL
 from hipsta_bids.reports.cohort import MEASURES, SMALLEST_COHORT, Cohort, card_of, correction_of
 from hipsta_bids.reports.display import (
     MAP_KINDS,
     THICKNESS,
-    UNCERTAINTY,
     colors_of,
     palette,
     scale_of,
@@ -382,27 +383,15 @@ def _sheets(series: Series) -> Mapping[str, Any] | None:
     measured = series.measured
     if not measured:
         return None
-    uncertain = [h for h in measured if UNCERTAINTY.column in h.sheet.columns]
     pictures = [draw_map(kind, measured) for kind in MAP_KINDS if kind != THICKNESS]
-    pictures += [draw_map(UNCERTAINTY, uncertain)] if uncertain else []
+    added = [load(measurement.pictures)(measured) for measurement in find_measurements()]
     return {
-        "pictures": pictures,
-        "uncertainty": [_uncertainty(h) for h in uncertain],
+        "pictures": [*pictures, *chain.from_iterable(further for further, _ in added)],
+        "lines": list(chain.from_iterable(lines for _, lines in added)),
         "whole": series.whole,
         "doubtful": any(h.sheet.doubtful.any() for h in measured),
         "invalid": any(not h.sheet.valid.all() for h in measured),
     }
-
-
-def _uncertainty(hemisphere: Hemisphere) -> str:
-    """Say how certain the maps of a hemisphere are."""
-    metrics = hemisphere.metrics
-    copies = metrics["uncertainty_copies"] - metrics["uncertainty_failed"]
-    return (
-        f"{hemisphere.side}: SD of thickness over {copies} perturbed copies: "
-        f"{metrics['uncertainty_thickness_mm']:.2f} mm at a point (median), "
-        f"{metrics['uncertainty_mean_mm']:.3f} mm of the mean"
-    )
 
 
 def _visits(series: Series) -> Mapping[str, Any] | None:

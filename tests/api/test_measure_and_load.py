@@ -6,6 +6,7 @@ import meshio
 import nibabel as nib
 import numpy as np
 import pytest
+from extension_marks import needs
 from matplotlib.figure import Figure
 from measured_phantoms import measured, spiral
 
@@ -13,7 +14,7 @@ import hipsta_bids as hb
 from hipsta_bids.api import datasets
 from hipsta_bids.api import maps as api_maps
 from hipsta_bids.derivatives import dataset
-from hipsta_bids.derivatives.hemisphere import write_failure, write_results, write_spread
+from hipsta_bids.derivatives.hemisphere import write_failure, write_results
 from hipsta_bids.derivatives.names import HemisphereName
 from hipsta_bids.derivatives.results import ResultPlace
 from hipsta_bids.errors import (
@@ -186,7 +187,10 @@ class TestLoad:
         assert maps.thickness.attrs["units"] == "mm"
         assert maps.x.to_numpy()[-1] == 0.9
 
+    @needs("uncertainty")
     def test_uncertainty_and_sampled_maps_are_beside_them(self, tmp_path):
+        from hipsta_bids.extensions.uncertainty.files import write_spread  # noqa: PLC0415  (may be absent)
+
         dataset.settle_settings(tmp_path, Settings())
         write(tmp_path, "01", "L")
         write(tmp_path, "02", "L")

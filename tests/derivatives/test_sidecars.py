@@ -4,6 +4,7 @@ import json
 
 import pytest
 from bids import BIDSLayout
+from extension_marks import needs
 from stand_ins import NAME, make_maps, make_scheme
 
 from hipsta_bids.cli.main import main
@@ -95,6 +96,7 @@ def test_sidecars_that_were_lost_come_back(data, measured):
     assert place.path("sheet").read_bytes() == before
 
 
+@needs("uncertainty")
 def test_sources_are_of_what_is_there(tmp_path):
     place = ResultPlace(root=tmp_path, name=NAME)
     maps = make_maps()

@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from extension_marks import needs
 from scipy import ndimage
 from scipy.stats import norm
 
 from hipsta_bids.geometry.body import extract_body
 from hipsta_bids.geometry.shares import sheet_share, softness, wall_sd
-from hipsta_bids.participant.uncertainty import estimate_uncertainty, perturb
 from hipsta_bids.phantom import Phantom, PhantomSpec
 from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.protocols.protocol import Tissue
@@ -181,7 +181,10 @@ def test_probabilities_that_contradict_labels_are_flagged(volume):
     assert "probabilities-unlike" in {flag.reason for flag in maps.flags}
 
 
+@needs("uncertainty")
 def test_copies_move_more_where_probabilities_are_broad(volume):
+    from hipsta_bids.extensions.uncertainty.copies import estimate_uncertainty  # noqa: PLC0415  (may be absent)
+
     broad = {kind: ndimage.gaussian_filter(share, 1.0) for kind, share in volume.shares.items()}
     spreads = [
         estimate_uncertainty(replace(volume, shares=shares), "L", Settings(), 3).maps["thickness"]
@@ -191,7 +194,10 @@ def test_copies_move_more_where_probabilities_are_broad(volume):
     assert wide > 2 * sharp
 
 
+@needs("uncertainty")
 def test_copies_have_shares(volume):
+    from hipsta_bids.extensions.uncertainty.copies import perturb  # noqa: PLC0415  (may be absent)
+
     ends = extract_body(volume, Settings().body).ends
     copy = perturb(volume, ends, Settings().uncertainty, 0)
     assert copy.shares.keys() == volume.shares.keys()

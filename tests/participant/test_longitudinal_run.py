@@ -7,6 +7,7 @@ import shutil
 import nibabel as nib
 import numpy as np
 import pytest
+from extension_marks import needs
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
@@ -330,7 +331,10 @@ def test_the_command_for_corrections_is_accepted_by_its_folder(data, out, tmp_pa
     assert words.keys() <= set(command.split())
 
 
-@pytest.mark.parametrize("option", [("--region", "extended"), ("--uncertainty", "2")])
+@pytest.mark.parametrize(
+    "option",
+    [("--region", "extended"), pytest.param(("--uncertainty", "2"), marks=needs("uncertainty"))],
+)
 def test_what_longitudinal_maps_do_not_have_is_refused(data, tmp_path, option, capsys):
     assert run(data, tmp_path / "out", *option) == ExitCode.USAGE
     assert "--longitudinal measures the body" in capsys.readouterr().err

@@ -14,6 +14,7 @@ from bosh_cases import (
     read_descriptor,
     simulate,
 )
+from extension_marks import PRESENT
 
 from descriptors import DESCRIPTORS
 from hipsta_bids.cli.group import group_parser
@@ -217,7 +218,7 @@ def test_participant_level_leaves_all_outputs(dataset):
         map_interpolation=["codes=nearest"],
         roi="roi.tsv",
         write_meshes=True,
-        uncertainty=2,
+        **({"uncertainty": 2} if "uncertainty" in PRESENT else {}),
         n_procs=1,
     )
     assert "Exit code\n0\n" in done.stdout, done.stdout

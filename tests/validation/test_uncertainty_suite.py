@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from hipsta_bids.participant.uncertainty import Uncertainty
+from hipsta_bids.extensions.uncertainty.copies import Uncertainty
 from hipsta_bids.phantom import PhantomSpec
 from validation import uncertainty
 from validation.cases import Measured, Refusal

@@ -15,22 +15,24 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from hipsta_bids.cli.main import main
 from hipsta_bids.derivatives.names import EXTRA_OUTPUTS
 from hipsta_bids.errors import GeometryError
-from hipsta_bids.geometry.body import extract_body
-from hipsta_bids.geometry.catalog import MAPS
-from hipsta_bids.geometry.ends import EndPlane, EndPlanes
-from hipsta_bids.participant import measure, uncertainty
-from hipsta_bids.participant.uncertainty import (
+from hipsta_bids.extensions.uncertainty import copies as uncertainty
+from hipsta_bids.extensions.uncertainty.copies import (
     add_uncertainty,
     estimate_uncertainty,
     find_modes,
     perturb,
 )
+from hipsta_bids.extensions.uncertainty.settings import UncertaintySettings
+from hipsta_bids.geometry.body import extract_body
+from hipsta_bids.geometry.catalog import MAPS
+from hipsta_bids.geometry.ends import EndPlane, EndPlanes
+from hipsta_bids.participant import measure
 from hipsta_bids.phantom import Hemisphere, Phantom, PhantomSpec, write_dataset
 from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.protocols.protocol import Tissue
 from hipsta_bids.reports.cohort import read_cohort
 from hipsta_bids.reports.participant import participant_page
-from hipsta_bids.settings import Settings, UncertaintySettings
+from hipsta_bids.settings import Settings
 from hipsta_bids.types import Decision, EditedMask, LabelVolume
 
 SCHEME = load_protocol("freesurfer")

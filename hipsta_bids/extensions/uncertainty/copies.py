@@ -28,6 +28,7 @@ from scipy.spatial.distance import pdist, squareform
 from scipy.spatial.transform import Rotation
 
 from hipsta_bids.errors import GeometryError
+from hipsta_bids.extensions.uncertainty.settings import UncertaintySettings
 from hipsta_bids.geometry.body import extract_body
 from hipsta_bids.geometry.catalog import measure_maps, summarize
 from hipsta_bids.geometry.checks import check_thickness, raise_flags
@@ -41,7 +42,7 @@ from hipsta_bids.participant.measure import measure_hemisphere, unfold
 from hipsta_bids.protocols import EXPERIMENTAL
 from hipsta_bids.protocols.load import for_region
 from hipsta_bids.protocols.protocol import Tissue
-from hipsta_bids.settings import CheckSettings, Settings, UncertaintySettings
+from hipsta_bids.settings import CheckSettings, Settings
 from hipsta_bids.types import EditedMask, Finding, Float, GivenEnd, HemisphereMaps, LabelVolume
 
 _Codes = NDArray[np.int64]
@@ -116,7 +117,7 @@ def estimate_uncertainty(
     ends = extract_body(volume, settings.body.changed(region="body")).ends
     for number in range(copies):
         try:
-            copy = perturb(volume, ends, settings.uncertainty, number)
+            copy = perturb(volume, ends, settings.table(UncertaintySettings), number)
             measured.append(_measure(copy, hemi, settings))
         except GeometryError:
             continue
