@@ -15,7 +15,8 @@ import pandas as pd
 import xarray as xr
 from numpy.typing import NDArray
 
-from hipsta_bids.api.maps import attributes, measure, node_axes
+from hipsta_bids.api.maps import measure
+from hipsta_bids.api.variables import attributes, node_axes
 from hipsta_bids.derivatives.dataset import counts_text
 from hipsta_bids.derivatives.measures import identify, origin
 from hipsta_bids.derivatives.results import NODES, POSITION, STATE, list_results, read_sheet

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hipsta_bids.api.maps import attributes, check_choice, node_axes
+from hipsta_bids.api.variables import attributes, check_choice, node_axes
 from hipsta_bids.derivatives.analyses import GroupResults, read_group
 from hipsta_bids.errors import ArgumentError, NothingToDoError, did_you_mean
 from hipsta_bids.geometry.catalog import MAPS

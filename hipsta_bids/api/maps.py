@@ -16,16 +16,16 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from hipsta_bids import __version__
+from hipsta_bids.api.variables import attributes, check_choice, node_axes
 from hipsta_bids.derivatives import dataset as folders
 from hipsta_bids.derivatives import hemisphere as outputs
 from hipsta_bids.derivatives.measures import write_measures
 from hipsta_bids.derivatives.names import HemisphereName, output_name, write_shared
-from hipsta_bids.derivatives.results import POSITION, STATE, ResultPlace
+from hipsta_bids.derivatives.results import POSITION, ResultPlace
 from hipsta_bids.errors import ArgumentError, InputError, in_python
 from hipsta_bids.geometry.catalog import MAPS, SUMMARY
 from hipsta_bids.geometry.label_checks import naming_causes
 from hipsta_bids.geometry.sheet import is_left_handed, layer_depth
-from hipsta_bids.group.cohort.read import node_coordinates
 from hipsta_bids.inputs.labels import MARGIN, label_volume
 from hipsta_bids.inputs.shares import Layer, add_shares, read_layers
 from hipsta_bids.io import files
@@ -38,21 +38,12 @@ from hipsta_bids.protocols.load import for_region, load_protocol
 from hipsta_bids.protocols.protocol import Protocol, Tissue
 from hipsta_bids.reports.cells import card, with_unit, wrapped
 from hipsta_bids.reports.results import SIDES, SheetTable
-from hipsta_bids.settings import Settings, SheetSettings, load_settings
+from hipsta_bids.settings import Settings, load_settings
 from hipsta_bids.types import Flag, Float, HemisphereMaps, LabelVolume, Mesh
 
 #: Surfaces of the sheet, by their position among its layers.
 _LEVELS = {"interior": 0.0, "midthickness": 0.5, "exterior": 1.0}
 _TEXT_ROWS = 8  # summary measures in the text of a measurement
-#: What is no column of the sheet's table: definition and unit.
-_EXTRA_VARIABLES = {
-    "position": ["position, scanner RAS", "mm"],
-    "depth": ["distance from the interior wall along the column", "mm"],
-}
-_NODES = {
-    "x": {"long_name": "medial to lateral", "units": "1"},
-    "y": {"long_name": "posterior to anterior", "units": "1"},
-}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -274,26 +265,6 @@ class Measurement:
         }
         about = {"side": self.side, "protocol": self.protocol.name, "decision": self.decision}
         return make_dataset(variables, coordinates, about)
-
-
-def attributes(name: str) -> dict[str, str]:
-    """Describe a variable: unit, definition and source."""
-    for row in MAPS:
-        if row.name == name:
-            return {"units": row.unit, "long_name": row.definition, "source": row.source}
-    return dict(zip(("long_name", "units"), (_EXTRA_VARIABLES | STATE)[name], strict=False))
-
-
-def node_axes(grid: SheetSettings, region: str) -> dict[str, Any]:
-    """Coordinates of the nodes, by the settings of the sheet."""
-    axis_values = zip("xy", node_coordinates(grid, region), strict=True)
-    return {axis: ([axis], values, _NODES[axis]) for axis, values in axis_values}
-
-
-def check_choice(name: str, value: object, choices: Mapping[Any, object]) -> None:
-    """Refuse a value that is not among the choices."""
-    if value not in choices:
-        raise ArgumentError(name, f"is {value!r}; choose {' or '.join(map(repr, choices))}")
 
 
 @in_python()

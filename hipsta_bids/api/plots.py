@@ -9,8 +9,9 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from hipsta_bids.api.drawing import add_color_bar, draw_map, map_kind
-from hipsta_bids.api.maps import Measurement, check_choice
+from hipsta_bids.api.maps import Measurement
 from hipsta_bids.api.models import GroupFit
+from hipsta_bids.api.variables import check_choice
 from hipsta_bids.derivatives.results import STATE
 from hipsta_bids.io.gifti import sheet_triangles
 from hipsta_bids.reports import display

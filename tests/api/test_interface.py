@@ -44,7 +44,7 @@ def loaded(program):
 
 def test_the_command_line_needs_no_xarray():
     """Images do without it."""
-    modules = ("cli.main", "participant.run", "group.questions.compare", "group.questions.study")
+    modules = ("cli.main", "participant.run", "group.questions.compare", "api.figures")
     names = ", ".join(f"hipsta_bids.{name}" for name in modules)
     assert loaded(f"import {names}")["xarray"] == "False"
 
