@@ -11,6 +11,7 @@ from functools import cache
 from importlib import import_module
 from importlib.resources import files
 from importlib.util import find_spec
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -214,8 +215,8 @@ class Extension:
     measurements: tuple[Measurement, ...] = ()
     participant_settings: tuple[tuple[str, str], ...] = ()
     """Tables of the settings of the participant level: name and class."""
-    columns: str = ""
-    """Meaning of the columns of its tables, as ``module:mapping``, for the documentation."""
+    has_columns: bool = False
+    """Whether the documentation lists the columns of its tables, from its ``columns.toml``."""
     sections: str = ""
     """Sections of the page of an analysis, as ``module:tuple``."""
     addition: str = ""
@@ -238,8 +239,13 @@ def find_extensions() -> tuple[Extension, ...]:
     return tuple(import_module(f"{registry}.{name}").EXTENSION for name in present)
 
 
+def _gather(kind: str) -> tuple[Any, ...]:
+    """Gather what all extensions declare of a kind, the name of a field of `Extension`."""
+    return tuple(chain.from_iterable(getattr(extension, kind) for extension in find_extensions()))
+
+
 def load_all(kind: str) -> list[Any]:
-    """Load what extensions have of a kind, the name of a field of `Extension`."""
+    """Load the function or table that each extension names in a field of `Extension`."""
     places = (getattr(extension, kind) for extension in find_extensions())
     return [load(place) for place in places if place]
 
@@ -267,19 +273,17 @@ def is_present(name: str) -> bool:
 
 def find_regions() -> dict[str, Region]:
     """Find the regions of extensions, by name."""
-    return {region.name: region for extension in find_extensions() for region in extension.regions}
+    return {region.name: region for region in _gather("regions")}
 
 
 def find_measurements() -> tuple[Measurement, ...]:
     """Find what options of extensions add to measured hemispheres."""
-    return tuple(
-        measurement for extension in find_extensions() for measurement in extension.measurements
-    )
+    return _gather("measurements")
 
 
 def find_parts() -> tuple[Part, ...]:
     """Find what extensions add to the results of a comparison."""
-    return tuple(part for extension in find_extensions() for part in extension.parts)
+    return _gather("parts")
 
 
 def find_protocols() -> str:
@@ -289,32 +293,30 @@ def find_protocols() -> str:
 
 def find_functions() -> dict[str, str]:
     """Find functions of the Python interface: their modules, by name."""
-    places = [place.split(":") for extension in find_extensions() for place in extension.functions]
+    places = (place.split(":") for place in _gather("functions"))
     return {name: module for module, name in places}
 
 
 def find_sources() -> tuple[Source, ...]:
     """Find what extensions read beside the sheets, in the order of reading."""
-    return tuple(source for extension in find_extensions() for source in extension.sources)
+    return _gather("sources")
 
 
-def find_settings() -> dict[str, str]:
-    """Find tables of settings by name; two extensions may share one."""
-    return {
-        name: place for extension in find_extensions() for name, place in extension.group_settings
-    }
+def find_settings(level: str) -> dict[str, Any]:
+    """Load tables of settings of a level, by name; two extensions may share one."""
+    return {name: load(place) for name, place in _gather(f"{level}_settings")}
 
 
 def find_sessions() -> tuple[SessionChoice, ...]:
     """Find which sessions can be compared, beside the first of each participant."""
-    return tuple(choice for extension in find_extensions() for choice in extension.sessions)
+    return _gather("sessions")
 
 
 def find_questions() -> tuple[Question, ...]:
     """Find what extensions can be asked instead of a comparison."""
-    return tuple(question for extension in find_extensions() for question in extension.questions)
+    return _gather("questions")
 
 
 def find_steps() -> tuple[Step, ...]:
     """Find what extensions add to the line of an analysis."""
-    return tuple(step for extension in find_extensions() for step in extension.steps)
+    return _gather("steps")

@@ -8,12 +8,12 @@ What does not change a result (jobs, verbosity, folders) is in
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Annotated, Literal, Self, TypeVar
+from typing import TYPE_CHECKING, Annotated, Literal, Self
 
-from pydantic import Field, create_model, model_validator
+from pydantic import Field, model_validator
 from pydantic.types import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
-from hipsta_bids.joints import find_extensions, load
+from hipsta_bids.joints import find_settings
 from hipsta_bids.protocols import EXPERIMENTAL, toml
 from hipsta_bids.types import tables
 
@@ -21,7 +21,6 @@ if TYPE_CHECKING:  # type checkers know no extensions
     _Region = str
 else:
     _Region = Literal["body", "extended", "entorhinal", *EXPERIMENTAL]
-_Table = TypeVar("_Table", bound=tables.SettingsTable)
 
 
 class BodySettings(tables.SettingsTable):
@@ -285,7 +284,7 @@ PUBLISHED: Mapping[str, Mapping[str, str | float]] = MappingProxyType(
 )
 
 
-class Settings(tables.SettingsTable):
+class Settings(tables.ExtendedSettings):
     """All settings of the participant level."""
 
     body: BodySettings = Field(default_factory=BodySettings)
@@ -300,10 +299,6 @@ class Settings(tables.SettingsTable):
     checks: CheckSettings = Field(default_factory=CheckSettings)
     maps: MapSettings = Field(default_factory=MapSettings)
 
-    def table(self, kind: type[_Table]) -> _Table:
-        """Return the table of an extension."""
-        return next(table for _, table in self if isinstance(table, kind))
-
     def as_published(self) -> list[str]:
         """List the settings of ``--method published`` that hold here, as ``group.name``."""
         return [
@@ -315,14 +310,7 @@ class Settings(tables.SettingsTable):
 
 
 if not TYPE_CHECKING:  # type checkers know the tables of the core
-    _FURTHER = {
-        name: (load(place), Field(default_factory=load(place)))
-        for extension in find_extensions()
-        for name, place in extension.participant_settings
-    }
-    Settings = create_model(
-        "Settings", __base__=Settings, __module__=__name__, __doc__=Settings.__doc__, **_FURTHER
-    )
+    Settings = Settings.extended(find_settings("participant"))
 
 
 def load_settings(path: Path | None) -> Settings:

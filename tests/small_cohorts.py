@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
+from hipsta_bids.cli.main import main
 from hipsta_bids.derivatives import dataset
 from hipsta_bids.derivatives.hemisphere import format_column
 from hipsta_bids.derivatives.names import HemisphereName
@@ -139,6 +140,15 @@ def write_participants(data, rows, columns=("participant_id", "group", "age", "s
 
 def read_participants(data):
     return [list(row.values()) for row in files.read_tsv(data / "participants.tsv")]
+
+
+def run_named(dataset, *options):
+    """Run the group level; the folder of results is named by the options."""
+    data, out = dataset
+    words = "".join(c if c.isalnum() else " " for c in " ".join(options[2:])).split()
+    name = "-".join(words)
+    assert main([str(data), str(out), "group", *options, "--name", name]) == 0
+    return out / "group" / name
 
 
 def table(path):

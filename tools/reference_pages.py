@@ -24,7 +24,7 @@ from hipsta_bids.derivatives.names import (
 from hipsta_bids.derivatives.results import LAYERS, NODES, POSITION, STATE
 from hipsta_bids.errors import EXIT_MEANINGS
 from hipsta_bids.geometry.catalog import MAPS, PER_SUBFIELD, SECTIONS, SUMMARY, Column
-from hipsta_bids.group.output.tables import COLUMNS, JOINT_COLUMNS
+from hipsta_bids.group.output.tables import COLUMNS, JOINT_COLUMNS, read_columns
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.joints import find_extensions, is_present, load
 from hipsta_bids.reports.page import read_table
@@ -229,7 +229,7 @@ def _group_columns() -> Iterator[tuple[str, str]]:
     ruled = re.compile(r".+_(low|high|se|cv_sd)|(p|below_)\d+")
     columns = {**JOINT_COLUMNS, **COLUMNS}
     for extension in find_extensions():
-        columns |= load(extension.columns) if extension.columns else {}
+        columns |= read_columns(extension.package) if extension.has_columns else {}
     for name, words in columns.items():
         if not ruled.fullmatch(name) and words not in {name, name.removesuffix("_id")}:
             yield f"`{name}`", words

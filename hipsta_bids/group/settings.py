@@ -3,9 +3,9 @@
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pydantic import PositiveInt, create_model
+from pydantic import PositiveInt
 
-from hipsta_bids.joints import find_settings, load
+from hipsta_bids.joints import find_settings
 from hipsta_bids.protocols import toml
 from hipsta_bids.stats import settings as statistics
 from hipsta_bids.types import tables
@@ -26,7 +26,7 @@ class ShapeSettings(tables.SettingsTable):
     """Sheets per hemisphere that are averaged, spread evenly over all; bounds time and memory."""
 
 
-class GroupSettings(tables.SettingsTable):
+class GroupSettings(tables.ExtendedSettings):
     """All settings of the group level; extensions add tables."""
 
     registration: statistics.RegistrationSettings = statistics.RegistrationSettings()
@@ -40,20 +40,9 @@ class GroupSettings(tables.SettingsTable):
     shapes: ShapeSettings = ShapeSettings()
     classification: statistics.ClassificationSettings = statistics.ClassificationSettings()
 
-    def of(self, kind: type[tables.Table]) -> tables.Table:
-        """Return the settings of an extension, by their class."""
-        return next(value for _, value in self if isinstance(value, kind))
 
-
-if not TYPE_CHECKING:
-    _TABLES = {name: load(place) for name, place in find_settings().items()}
-    GroupSettings = create_model(
-        "GroupSettings",
-        __base__=GroupSettings,
-        __doc__=GroupSettings.__doc__,
-        __module__=__name__,
-        **{name: (kind, kind()) for name, kind in _TABLES.items()},
-    )
+if not TYPE_CHECKING:  # type checkers know the tables of the core
+    GroupSettings = GroupSettings.extended(find_settings("group"))
 
 
 def load_group_settings(path: Path | None) -> GroupSettings:

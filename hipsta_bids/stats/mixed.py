@@ -350,11 +350,29 @@ def _satterthwaite(
 
 
 @dataclass(frozen=True, eq=False)
-class RepeatedRows(glm.RowModel):
-    """A mixed model of a design in which participants have several rows."""
+class RowsOfPeople(glm.RowModel):
+    """A model of a design in which participants have several rows."""
 
     participants: NDArray[np.str_]
     """(rows,)"""
+
+    def people(self, rows: Int) -> Int:
+        """Return the number of the participant of each row."""
+        return np.asarray(
+            np.unique(self.participants, return_inverse=True)[1][rows], dtype=np.int64
+        )
+
+    def fit_measures(
+        self, values: Float, rows: Int, contrasts: tuple[Contrast, ...]
+    ) -> glm.PointwiseFit:
+        """Fit some rows of the design to each summary measure, as if it were a point."""
+        return self.fit(values, rows, contrasts)
+
+
+@dataclass(frozen=True, eq=False)
+class RepeatedRows(RowsOfPeople):
+    """A mixed model of random intercepts, and perhaps slopes."""
+
     times: Float | None
     """(rows,) of each visit, if known."""
     slopes: bool
@@ -366,12 +384,6 @@ class RepeatedRows(glm.RowModel):
         """Whose each row is, and when."""
         people = np.unique(self.participants, return_inverse=True)[1]
         return Visits(np.asarray(people, dtype=np.int64), self.times, self.slopes)
-
-    def people(self, rows: Int) -> Int:
-        """Return the number of the participant of each row."""
-        return np.asarray(
-            np.unique(self.participants, return_inverse=True)[1][rows], dtype=np.int64
-        )
 
     def fit(
         self,
@@ -390,12 +402,6 @@ class RepeatedRows(glm.RowModel):
             times=self.times[rows] if self.times is not None and self.slopes else None,
             covariates=covariates,
         )
-
-    def fit_measures(
-        self, values: Float, rows: Int, contrasts: tuple[Contrast, ...]
-    ) -> glm.PointwiseFit:
-        """Fit some rows of the design to each summary measure, as if it were a point."""
-        return self.fit(values, rows, contrasts)
 
 
 def longitudinal_model(

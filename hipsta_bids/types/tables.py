@@ -13,6 +13,7 @@ from pydantic import (
     PositiveFloat,
     Strict,
     ValidationError,
+    create_model,
 )
 
 from hipsta_bids.errors import SettingsError
@@ -60,6 +61,22 @@ class SettingsTable(TomlTable):
             if isinstance(value, Mapping)
         }
         return settings_from({**dict(self), **values, **groups}, type(self), origin="settings")
+
+
+class ExtendedSettings(SettingsTable):
+    """All settings of a level, to which extensions add tables."""
+
+    def of(self, kind: type[Table]) -> Table:
+        """Return the table of an extension, by its class."""
+        return next(table for _, table in self if isinstance(table, kind))
+
+    @classmethod
+    def extended(cls, further: Mapping[str, type[SettingsTable]]) -> type[Self]:
+        """Return the class with further tables, by name, at their defaults."""
+        fields: dict[str, Any] = {name: (kind, kind()) for name, kind in further.items()}
+        return create_model(
+            cls.__name__, __base__=cls, __module__=cls.__module__, __doc__=cls.__doc__, **fields
+        )
 
 
 def _odd(value: int) -> int:

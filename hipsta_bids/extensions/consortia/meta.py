@@ -11,7 +11,7 @@ import pandas as pd
 
 from hipsta_bids import __version__
 from hipsta_bids.errors import OutputError, UsageError
-from hipsta_bids.extensions.consortia.columns import COLUMNS
+from hipsta_bids.extensions.consortia import EXTENSION
 from hipsta_bids.extensions.consortia.effects import FIXED, RANDOM
 from hipsta_bids.extensions.consortia.exchange import SiteSummary, read_summary, shown_counts
 from hipsta_bids.extensions.consortia.page import FOLDER, write_meta_page
@@ -25,6 +25,7 @@ from hipsta_bids.group.output.maps import ContrastMap, contrasts
 from hipsta_bids.group.output.methods import discovery_text
 from hipsta_bids.group.output.panels import Row, draw_pages
 from hipsta_bids.group.output.style import Drawing
+from hipsta_bids.group.output.tables import read_columns
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.io import files
 from hipsta_bids.protocols.toml import resolve
@@ -60,7 +61,13 @@ def run_meta(
         )
     with write.whole_folder(folder) as scratch:
         for name, table in meta_tables(meta):
-            write.write_table(scratch, name, table, described=name != "sites", meaning=COLUMNS)
+            write.write_table(
+                scratch,
+                name,
+                table,
+                described=name != "sites",
+                meaning=read_columns(EXTENSION.package),
+            )
         _write_maps(scratch, meta)
         notes += write.write_figures(scratch, _figures(meta), prints=figures)
         files.write_text(scratch / "methods.md", _methods(meta))

@@ -38,7 +38,7 @@ EXTENSION = Extension(
         ("norms", f"{__name__}.settings:NormSettings"),
         ("exchange", "hipsta_bids.stats.settings:ExchangeSettings"),
     ),
-    columns=f"{__name__}.columns:COLUMNS",
+    has_columns=True,
     sections=f"{__name__}.page:SECTIONS",
     has_templates=True,
 )

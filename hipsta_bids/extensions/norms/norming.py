@@ -13,9 +13,9 @@ from scipy import special
 from hipsta_bids import __version__
 from hipsta_bids.derivatives import dataset
 from hipsta_bids.errors import ModelError
+from hipsta_bids.extensions.norms import EXTENSION
 from hipsta_bids.extensions.norms import centiles as normative
 from hipsta_bids.extensions.norms import sums as summed_norms
-from hipsta_bids.extensions.norms.columns import COLUMNS
 from hipsta_bids.extensions.norms.figures import deviation_rows, draw_norms, norm_rows
 from hipsta_bids.extensions.norms.file import NormsFile, load_norms, save_norms
 from hipsta_bids.extensions.norms.methods import norms_text
@@ -31,6 +31,7 @@ from hipsta_bids.group.output.ground import grounds_of
 from hipsta_bids.group.output.panels import draw_pages
 from hipsta_bids.group.output.saved import templates_from_json
 from hipsta_bids.group.output.style import Drawing
+from hipsta_bids.group.output.tables import read_columns
 from hipsta_bids.group.questions import study as studies
 from hipsta_bids.group.questions.mixing import with_mixes
 from hipsta_bids.group.settings import GroupSettings
@@ -231,7 +232,13 @@ def _write(study: studies.Study, scoring: _Scoring, notes: Iterable[str]) -> stu
     if file.site not in cohort.table:
         notes.append(f"no column {file.site!r}: all are taken to be at one, {_NO_SITE!r}")
     return study.write(
-        name, notes, visits=visits, tables=scoring.tables, meaning=COLUMNS, record=record, fill=fill
+        name,
+        notes,
+        visits=visits,
+        tables=scoring.tables,
+        meaning=read_columns(EXTENSION.package),
+        record=record,
+        fill=fill,
     )
 
 

@@ -9,12 +9,11 @@ import numpy as np
 import pandas as pd
 
 from hipsta_bids.errors import ModelError
-from hipsta_bids.extensions.norms import STEP
-from hipsta_bids.extensions.norms.columns import COLUMNS
+from hipsta_bids.extensions.norms import EXTENSION, STEP
 from hipsta_bids.extensions.norms.wscores import ScoredMaps, w_scores
 from hipsta_bids.group.cohort import data
 from hipsta_bids.group.output.results import Analysis
-from hipsta_bids.group.output.tables import entity_label
+from hipsta_bids.group.output.tables import entity_label, read_columns
 from hipsta_bids.group.output.write import can_write_parquet
 from hipsta_bids.group.request import Request
 from hipsta_bids.group.settings import GroupSettings
@@ -160,7 +159,7 @@ def tables(
     """Table of scores, with the meaning of its columns."""
     table = analysis.parts[STEP].table
     if len(table):
-        yield f"{prefix}wscores", table, COLUMNS
+        yield f"{prefix}wscores", table, read_columns(EXTENSION.package)
 
 
 def score_files(

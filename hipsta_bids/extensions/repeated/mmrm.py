@@ -18,7 +18,7 @@ from hipsta_bids.stats import glm
 from hipsta_bids.stats.arrays import Bool, Float, Int
 from hipsta_bids.stats.contrasts import Contrast, split_name
 from hipsta_bids.stats.design import VISIT, Design
-from hipsta_bids.stats.mixed import denominator
+from hipsta_bids.stats.mixed import RowsOfPeople, denominator
 from hipsta_bids.stats.settings import GlmSettings, LongitudinalSettings
 from hipsta_bids.types import PARTICIPANT
 
@@ -390,20 +390,12 @@ def _kenward_roger(first: Float, second: Float, rows: int) -> tuple[Float, Float
 
 
 @dataclass(frozen=True, eq=False)
-class VisitRows(glm.RowModel):
+class VisitRows(RowsOfPeople):
     """A model of a design whose rows are visits of participants, as categories."""
 
-    participants: NDArray[np.str_]
-    """(rows,)"""
     numbers: Int
     """(rows,) of each row's visit, from 0."""
     longitudinal: LongitudinalSettings
-
-    def people(self, rows: Int) -> Int:
-        """Return the number of the participant of each row."""
-        return np.asarray(
-            np.unique(self.participants, return_inverse=True)[1][rows], dtype=np.int64
-        )
 
     def fit(
         self,
@@ -419,12 +411,6 @@ class VisitRows(glm.RowModel):
         return fit_visits(
             values, matrix[rows], visits, contrasts, self.longitudinal, baseline=baseline
         )
-
-    def fit_measures(
-        self, values: Float, rows: Int, contrasts: tuple[Contrast, ...]
-    ) -> glm.PointwiseFit:
-        """Fit some rows of the design to each summary measure, as if it were a point."""
-        return self.fit(values, rows, contrasts)
 
 
 def visit_model(

@@ -35,7 +35,7 @@ EXTENSION = Extension(
         ),
     ),
     group_settings=(("harmonization", f"{__name__}.settings:HarmonizationSettings"),),
-    columns=f"{__name__}.columns:COLUMNS",
+    has_columns=True,
     sections=f"{__name__}.page:SECTIONS",
     has_templates=True,
 )

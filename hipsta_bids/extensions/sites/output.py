@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from hipsta_bids.extensions.sites.columns import COLUMNS
+from hipsta_bids.extensions.sites import EXTENSION
 from hipsta_bids.extensions.sites.combat import ARRAYS, SiteEffects
 from hipsta_bids.extensions.sites.harmonize import Harmonization, part_of
 from hipsta_bids.extensions.sites.planning import SitePlan
@@ -15,6 +15,7 @@ from hipsta_bids.extensions.sites.saved import SavedEffects
 from hipsta_bids.group.cohort.data import Cohort
 from hipsta_bids.group.output import style
 from hipsta_bids.group.output.results import Analysis, digests
+from hipsta_bids.group.output.tables import read_columns
 from hipsta_bids.io import files
 from hipsta_bids.joints import Writer
 from hipsta_bids.reports.cells import display_name
@@ -32,7 +33,7 @@ def tables(
 ) -> Iterator[tuple[str, pd.DataFrame, Mapping[str, str]]]:
     """Table of shifts and scales, with the meaning of its columns."""
     if rows := list(_site_rows(part_of(analysis), cohort.units)):
-        yield f"{prefix}sites", pd.DataFrame(rows), COLUMNS
+        yield f"{prefix}sites", pd.DataFrame(rows), read_columns(EXTENSION.package)
 
 
 def _site_rows(harmonization: Harmonization, units: Mapping[str, str]) -> Iterator[dict[str, Any]]:

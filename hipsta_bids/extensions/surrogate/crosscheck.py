@@ -68,7 +68,7 @@ def _measure(item: HemisphereInput, result: ResultPlace, settings: Settings) -> 
     sheet = _read_sheet(result)
     rows: list[list[str]] = []
     lines = []
-    for position in settings.table(SurrogateSettings).positions:
+    for position in settings.of(SurrogateSettings).positions:
         for profile in surrogate_profiles(body, position, settings.sheet):
             mesh = np.full(len(profile.points), np.nan)
             if sheet is not None:

@@ -21,7 +21,7 @@ EXTENSION = Extension(
         ("retest", f"{__name__}.settings:RetestSettings"),
         ("power", f"{__name__}.settings:PowerSettings"),
     ),
-    columns=f"{__name__}.columns:COLUMNS",
+    has_columns=True,
     sections=f"{__name__}.page:SECTIONS",
     has_templates=True,
 )

@@ -13,8 +13,8 @@ from scipy import stats
 from hipsta_bids import __version__
 from hipsta_bids.derivatives import dataset
 from hipsta_bids.errors import ModelError
+from hipsta_bids.extensions.trials import EXTENSION
 from hipsta_bids.extensions.trials import sizes as trials
-from hipsta_bids.extensions.trials.columns import COLUMNS
 from hipsta_bids.extensions.trials.figures import agreement_rows, size_rows
 from hipsta_bids.extensions.trials.methods import power_text, retest_text
 from hipsta_bids.extensions.trials.page import TABLES
@@ -29,7 +29,7 @@ from hipsta_bids.group.output.ground import grounds_of
 from hipsta_bids.group.output.methods import COMMON_SHEETS
 from hipsta_bids.group.output.panels import draw_pages
 from hipsta_bids.group.output.style import Drawing
-from hipsta_bids.group.output.tables import entity_label
+from hipsta_bids.group.output.tables import entity_label, read_columns
 from hipsta_bids.group.questions import study as studies
 from hipsta_bids.group.questions.mixing import with_mixes
 from hipsta_bids.group.settings import GroupSettings
@@ -357,7 +357,7 @@ def run_trial(
         _notes(source, results, study, effect),
         visits=modeled,
         tables=tables,
-        meaning=COLUMNS,
+        meaning=read_columns(EXTENSION.package),
         record=_record(study, source, modeled, effect) | {"among": among},
         fill=fill,
     )
@@ -510,7 +510,7 @@ def _write_tables(
                     table = table.sort_values(
                         ["per_arm", "cohen_d"], ascending=[True, False], ignore_index=True
                     )
-            write.write_table(folder, title, table, meaning=COLUMNS)
+            write.write_table(folder, title, table, meaning=read_columns(EXTENSION.package))
 
 
 def _write_maps(folder: Path, cohorts: Mapping[str, Cohort], results: Sequence[Described]) -> None:

@@ -117,7 +117,7 @@ def estimate_uncertainty(
     ends = extract_body(volume, settings.body.changed(region="body")).ends
     for number in range(copies):
         try:
-            copy = perturb(volume, ends, settings.table(UncertaintySettings), number)
+            copy = perturb(volume, ends, settings.of(UncertaintySettings), number)
             measured.append(_measure(copy, hemi, settings))
         except GeometryError:
             continue

@@ -3,6 +3,7 @@
 import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from importlib.resources import files
 from typing import Any
 
@@ -40,7 +41,8 @@ JOINT_COLUMNS: Mapping[str, str] = COLUMNS | _MEANINGS["joint"]
 DEMOGRAPHIC_COLUMNS: Mapping[str, str] = COLUMNS | _MEANINGS["demographics"]
 
 
-def read_columns(package: str) -> dict[str, str]:
+@cache
+def read_columns(package: str) -> Mapping[str, str]:
     """Read the meaning of the columns of an extension, beside the columns of all analyses."""
     return {**COLUMNS, **tomllib.loads((files(package) / "columns.toml").read_text("utf-8"))}
 

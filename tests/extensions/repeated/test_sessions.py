@@ -6,21 +6,15 @@ import re
 import numpy as np
 import pytest
 from scipy import stats
-from small_cohorts import PLAN, methods_of, place_of, table, write_dataset
+from small_cohorts import PLAN, methods_of, place_of, run_named, table, write_dataset
 
 from hipsta_bids.cli.main import main
-from hipsta_bids.group.output import write
 from hipsta_bids.reports.group import group_page
 from hipsta_bids.stats.inference import control_fdr
 
 ALIGNED = ["--align", "none"]
 PLAIN = [*ALIGNED, "--no-classification"]
-
-
-@pytest.fixture(autouse=True)
-def _no_figures(monkeypatch):
-    """Figures take longer than all else."""
-    monkeypatch.setattr(write, "draw_figures", lambda *_: iter(()))
+pytestmark = pytest.mark.usefixtures("without_figures")
 
 
 @pytest.fixture(scope="module")
@@ -28,17 +22,9 @@ def dataset(tmp_path_factory):
     return write_dataset(tmp_path_factory.mktemp("one-session"))
 
 
-def run(dataset, *options):
-    data, out = dataset
-    words = "".join(c if c.isalnum() else " " for c in " ".join(options[2:])).split()
-    name = "-".join(words)
-    assert main([str(data), str(out), "group", *options, "--name", name]) == 0
-    return out / "group" / name
-
-
 def test_two_sessions_give_the_paired_t_test(sessions, quick):
     options = [*quick, *PLAIN, "--paired", "1", "ses-3", "--formula", "1", "--asymmetry"]
-    folder = run(sessions, *options)
+    folder = run_named(sessions, *options)
     found = table(folder / "hemi-R_contrast-Mean_desc-thickness_statmap.tsv")
     _, out = sessions
     maps = {
@@ -74,7 +60,7 @@ def test_two_sessions_give_the_paired_t_test(sessions, quick):
 
 
 def test_changes_of_groups_are_compared_between_two_sessions(sessions, quick):
-    folder = run(sessions, *quick, *PLAIN, "--paired", "1", "2")
+    folder = run_named(sessions, *quick, *PLAIN, "--paired", "1", "2")
     record = json.loads((folder / "analysis.json").read_text())
     assert record["formula"] == "group + age + sex"
     assert set(record["contrasts"]) == {"mean", "CN-AD"}
@@ -91,7 +77,7 @@ def test_changes_of_groups_are_compared_between_two_sessions(sessions, quick):
 
 @pytest.mark.parametrize("random", ["intercept", ""])
 def test_longitudinal_model_finds_the_slopes(sessions, quick, random):
-    folder = run(sessions, *quick, *ALIGNED, "--longitudinal", *random.split())
+    folder = run_named(sessions, *quick, *ALIGNED, "--longitudinal", *random.split())
     record = json.loads((folder / "analysis.json").read_text())
     assert record["formula"] == "group * time + age + sex"
     assert (record["participants"], record["rows"]) == (30, 90)
@@ -128,7 +114,7 @@ def test_longitudinal_model_finds_the_slopes(sessions, quick, random):
 def test_default_model_with_a_curve_of_age_tests_it(sessions, quick):
     """Also in a mixed model, where the spline's part beyond a line takes an F test."""
     options = ("--longitudinal", "intercept", "--age-model", "spline", "--measures", "thickness")
-    folder = run(sessions, *quick, *PLAIN, *options)
+    folder = run_named(sessions, *quick, *PLAIN, *options)
     formula = json.loads((folder / "analysis.json").read_text())["formula"]
     assert formula == 'group * time + cr(age, df=3, constraints="center") + sex'
     found = table(folder / "hemi-L_contrast-AgeNonlinear_desc-thickness_statmap.tsv")
@@ -145,7 +131,9 @@ def test_default_model_with_a_curve_of_age_tests_it(sessions, quick):
 
 def test_permutations_of_repeated_visits_flip_signs_of_participants(sessions, quick):
     options = ("--correction", "permutation-max", "--permutations", "20", "--blocks", "sex")
-    folder = run(sessions, *quick, *PLAIN, *options, "--longitudinal", "--measures", "thickness")
+    folder = run_named(
+        sessions, *quick, *PLAIN, *options, "--longitudinal", "--measures", "thickness"
+    )
     found = table(folder / "hemi-L_contrast-TimeInAD_desc-thickness_statmap.tsv")
     # The loss of .1 mm per session is in all: none of the other signs gives as much.
     np.testing.assert_allclose(found.p_corrected * 20, (found.p_corrected * 20).round(), atol=1e-6)

@@ -9,21 +9,16 @@ from small_cohorts import (
     PLAN,
     methods_of,
     place_of,
+    run_named,
     table,
     write_dataset,
 )
 
 from hipsta_bids.cli.main import main
-from hipsta_bids.group.output import write
 
 ALIGNED = ["--align", "none"]
 PLAIN = [*ALIGNED, "--no-classification"]
-
-
-@pytest.fixture(autouse=True)
-def _no_figures(monkeypatch):
-    """Figures take longer than all else."""
-    monkeypatch.setattr(write, "draw_figures", lambda *_: iter(()))
+pytestmark = pytest.mark.usefixtures("without_figures")
 
 
 @pytest.fixture(scope="module")
@@ -31,19 +26,11 @@ def dataset(tmp_path_factory):
     return write_dataset(tmp_path_factory.mktemp("one-session"))
 
 
-def run(dataset, *options):
-    data, out = dataset
-    words = "".join(c if c.isalnum() else " " for c in " ".join(options[2:])).split()
-    name = "-".join(words)
-    assert main([str(data), str(out), "group", *options, "--name", name]) == 0
-    return out / "group" / name
-
-
 def test_permutations_are_in_the_tables_of_the_map(dataset, quick):
     corrected = {}
     for method in ("permutation-tfce", "permutation-max"):
         options = [*quick, *PLAIN, "--correction", method, "--permutations", "100"]
-        folder = run(dataset, *options)
+        folder = run_named(dataset, *options)
         found = table(folder / "hemi-L_contrast-CNAD_desc-thickness_statmap.tsv")
         assert found.p_corrected.min() == pytest.approx(1 / 100)
         assert (found.significant == (found.p_corrected <= 0.05)).all()
@@ -63,7 +50,7 @@ def test_permutations_are_in_the_tables_of_the_map(dataset, quick):
     overview = table(folder / "maps.tsv").set_index(["measure", "hemi"])
     largest = maximum.p[maximum.significant].max()
     assert overview.loc[("thickness", "L"), "p_cutoff"] == pytest.approx(largest)
-    again = run(dataset, *options)
+    again = run_named(dataset, *options)
     pd.testing.assert_frame_equal(
         maximum, table(again / "hemi-L_contrast-CNAD_desc-thickness_statmap.tsv")
     )
@@ -71,9 +58,9 @@ def test_permutations_are_in_the_tables_of_the_map(dataset, quick):
 
 def test_pooled_family_is_no_less_strict(dataset, quick):
     options = [*quick, *PLAIN, "--correction", "permutation-max", "--permutations", "100"]
-    single = run(dataset, *options)
-    pooled = run(dataset, *options, "--fdr-scope", "hemispheres")
-    every = run(dataset, *options, "--fdr-scope", "all")
+    single = run_named(dataset, *options)
+    pooled = run_named(dataset, *options, "--fdr-scope", "hemispheres")
+    every = run_named(dataset, *options, "--fdr-scope", "all")
     overview = table(every / "maps.tsv").query("contrast == 'CN-AD'")
     assert len(set(overview.n_tests)) == 1
     assert overview.n_tests.iloc[0] == len(overview) * 147
@@ -89,7 +76,7 @@ def test_pooled_family_is_no_less_strict(dataset, quick):
 def test_blocks_are_a_column_inside_which_the_contrast_varies(dataset, quick, capsys):
     data, out = dataset
     options = [*quick, *PLAIN, "--correction", "permutation-max", "--permutations", "20"]
-    folder = run(dataset, *options, "--blocks", "sex")
+    folder = run_named(dataset, *options, "--blocks", "sex")
     assert "within levels of sex" in (folder / "methods.md").read_text()
     arguments = [str(data), str(out), "group", *options]
     assert main([*arguments, "--blocks", "group"]) == 65
@@ -99,13 +86,13 @@ def test_blocks_are_a_column_inside_which_the_contrast_varies(dataset, quick, ca
 
 
 def test_first_session_is_the_default_and_says_so(sessions, quick, capsys):
-    folder = run(sessions, *quick, *PLAIN, "--formula", "group + age")
+    folder = run_named(sessions, *quick, *PLAIN, "--formula", "group + age")
     assert "60 later sessions are not in it" in capsys.readouterr().out
     assert json.loads((folder / "analysis.json").read_text())["rows"] == 30
 
 
 def test_asymmetry_is_left_minus_right_in_the_same_model(dataset, quick):
-    folder = run(dataset, *quick, *PLAIN, "--asymmetry")
+    folder = run_named(dataset, *quick, *PLAIN, "--asymmetry")
     _, out = dataset
     wall = {
         hemi: np.array(
