@@ -15,6 +15,7 @@ from hipsta_bids.geometry.digital import (
     grow,
     positions,
     shrink,
+    to_ras,
     widened,
 )
 
@@ -164,3 +165,8 @@ def test_start_arrays_are_left_alone():
     grow(start, allowed, field, 3)
     shrink(allowed, start & allowed, field, 3)
     np.testing.assert_array_equal(start, before)
+
+
+def test_places_of_voxels_follow_from_all_of_the_affine():
+    affine = np.array([[0.0, -2.0, 0.5, 10.0], [1.0, 0.0, 0.0, 20.0], [0.0, 0.1, 3.0, 30.0]])
+    np.testing.assert_allclose(to_ras(np.array([[1, 2, 3]]), affine), [[7.5, 21.0, 39.2]])

@@ -1,13 +1,11 @@
 """Planes at the ends of the body and the axis between them, from points whose order is known."""
 
-import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from geometry_cases import rotation, straight_ends
 
-from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry import ends as ends_mod
 from hipsta_bids.geometry.digital import affine_of
 from hipsta_bids.geometry.ends import EndPlane, long_axis
@@ -121,24 +119,6 @@ def test_the_plane_between_mirror_images_is_the_mirror():
         assert point @ normal == pytest.approx(1.2, abs=1e-6)
 
 
-def slab(levels, low=-4.0, high=4.0):
-    """Points of slices across y."""
-    x, y, z = np.meshgrid(np.arange(low + 0.2, high, 0.4), levels, np.arange(-1.8, 2, 0.4))
-    return np.stack([x, y, z], axis=-1).reshape(-1, 3)
-
-
-def test_a_slice_of_both_labels_tilts_the_plane_towards_them():
-    """Point symmetric labels: the plane passes through the middle, and leans to its half."""
-    below = np.vstack([slab([-4.0, -2.0]), slab([0.0], high=0.0)])
-    above = np.vstack([slab([2.0, 4.0]), slab([0.0], low=0.0)])
-    for first, second in ((below, above), (below, np.vstack([above, above]))):
-        point, normal = ends_mod._plane_along_slices(first, second, 2 * Y)
-        assert point @ normal == pytest.approx(0.0, abs=1e-4)
-        assert normal[2] == pytest.approx(0.0, abs=1e-6)
-        # Below is at x < 0: there the plane is higher, by up to 2 mm at 4 mm.
-        assert 2.0 < np.degrees(np.arctan2(normal[0], normal[1])) < 27.0
-
-
 @pytest.mark.parametrize(
     ("edges", "axis", "expected"),
     [
@@ -163,30 +143,3 @@ def test_the_level_of_a_plane_is_taken_within_two_millimeters():
     axis = np.array([0.6, 0.8, 0.0])
     assert ends_mod._level(plane, points, axis) == pytest.approx(0.6 * 3 + 0.8 * 1.0)
     assert ends_mod._level(plane, points + 20, axis) == pytest.approx(0.6 * 50 + 0.8)
-
-
-@pytest.mark.parametrize(
-    ("rule", "other", "tilt", "message", "reason"),
-    [
-        ("labels", "labels", 49, None, None),
-        ("labels", "labels", 51, "the anterior end plane near .* tilted by 51", "end-plane-tilted"),
-        ("user", "core", 51, "the given anterior end plane .* by 51 degrees", "end-plane-tilted"),
-        ("labels", "core", 51, "the posterior end has no labels", "labels-end"),
-        ("labels", "labels", 89, "tilted by 89", "end-plane-tilted"),
-        ("labels", "labels", 91, "labels of the head lie on both sides", "end-labels-inside"),
-        ("user", "user", 91, "labels of the head lie on both sides", "end-labels-inside"),
-    ],
-)
-def test_planes_lie_across_the_axis(rule, other, tilt, message, reason):
-    planes = {
-        "posterior": EndPlane(np.zeros(3), Z, other),
-        "anterior": EndPlane(8 * Z, leaning(tilt), rule),
-    }
-    if message is None:
-        ends = ends_mod._checked(planes, Z, 0.3)
-        np.testing.assert_allclose(ends.axis, leaning(tilt / 2))
-        assert (ends.half_slice, ends["posterior"].rule) == (0.3, other)
-        return
-    with pytest.raises(GeometryError, match=re.compile(message)) as caught:
-        ends_mod._checked(planes, Z, 0.3)
-    assert caught.value.reason == reason
