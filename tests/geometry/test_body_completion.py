@@ -1,4 +1,4 @@
-"""The uncus beside the body, cavities at their limits, and pieces that grow towards each other."""
+"""The uncus beside the body, and cavities at their limits."""
 
 from dataclasses import replace
 
@@ -38,17 +38,8 @@ def beside_the_body(uncus=UNCUS, *, wide=0, tilted=0):
     return tissue
 
 
-def found(tissue, ends=ENDS, affine=AFFINE):
-    mask = np.zeros(tissue.shape, dtype=bool)
-    mask[tuple(completion.find_uncus(tissue, affine, ends).T)] = True
-    return mask
-
-
-def test_the_uncus_gets_the_nearer_half_of_what_connects_it():
-    """Of seven voxels to the subiculum, the one in the middle is the body's."""
-    expected = np.zeros((52, 16, 16), dtype=bool)
-    expected[8:15, 8:12, 12:16] = True
-    np.testing.assert_array_equal(found(beside_the_body()), expected)
+def found(tissue):
+    """Mask of the uncus; the same if the body is turned and its voxels are in another order."""
     turn = Rotation.from_euler("xyz", [20, -30, 50], degrees=True).as_matrix()
     ends = replace(
         ENDS,
@@ -57,7 +48,22 @@ def test_the_uncus_gets_the_nearer_half_of_what_connects_it():
         axis=turn[:, 2],
     )
     turned = affine_of(turn @ AFFINE[:3, :3], turn @ AFFINE[:3, 3])
-    np.testing.assert_array_equal(found(beside_the_body(), ends, turned), expected)
+    turned = turned @ affine_of(np.diag([-1.0, 1, 1]), np.array([len(tissue) - 1.0, 0, 0]))
+    masks = np.zeros((2, *tissue.shape), dtype=bool)
+    for mask, voxels, planes, affine in (
+        (masks[0], tissue, ENDS, AFFINE),
+        (masks[1, ::-1], tissue[::-1], ends, turned),
+    ):
+        mask[tuple(completion.find_uncus(voxels, affine, planes).T)] = True
+    np.testing.assert_array_equal(*masks)
+    return masks[0]
+
+
+def test_the_uncus_gets_the_nearer_half_of_what_connects_it():
+    """Of seven voxels to the subiculum, the one in the middle is the body's."""
+    expected = np.zeros((52, 16, 16), dtype=bool)
+    expected[8:15, 8:12, 12:16] = True
+    np.testing.assert_array_equal(found(beside_the_body()), expected)
 
 
 @pytest.mark.parametrize(
@@ -92,17 +98,6 @@ def test_without_medial_labels_or_a_second_piece_there_is_no_uncus():
     assert not found(np.zeros_like(tissue)).any()
 
 
-@pytest.mark.parametrize(("way", "count"), [(6, 3), (7, 3), (1, 0)])
-def test_two_pieces_meet_halfway(way, count):
-    """In a bent tunnel of free voxels; what both reach at once goes to the second."""
-    line = [(1, 1 + n, 1) for n in range(5)] + [(2 + n, 6, 1) for n in range(5)]
-    first, second, free = (np.zeros((9, 9, 3), dtype=bool) for _ in range(3))
-    first[line[0]] = second[line[way + 1]] = True
-    free[tuple(np.array(line[: way + 2]).T)] = True
-    grown = completion._nearer_to(first, second, free)
-    np.testing.assert_array_equal(np.argwhere(grown), line[: count + 1])
-
-
 def holed(cavity, opening=None):
     """A block, CA1 beside dentate gyrus, with a hole between them and a way out of the image."""
     tissue = np.zeros((16, 12, 14), dtype=np.uint8)
@@ -113,18 +108,17 @@ def holed(cavity, opening=None):
     return tissue
 
 
-def cavities(tissue, edge=EDGE, slices=None, ends=None, **changes):
+def cavities(tissue, edge=EDGE, ends=None):
     volume = LabelVolume(
         tissue=tissue,
         part=np.zeros_like(tissue),
-        affine=affine_of(np.diag([edge, edge, slices or edge]), np.array([0.0, 0.0, 0.25])),
+        affine=affine_of(edge * np.eye(3), np.array([0.0, 0.0, 0.25])),
         protocol=load_protocol("freesurferCA"),
     )
     sheet = np.where(tissue == Tissue.CA1, tissue, 0).astype(np.uint8)
-    settings = BodySettings(**changes)
-    whole = straight_ends(14.0 * (slices or edge))
+    planes = ends or straight_ends(14.0 * edge)
     return tuple(
-        completion.find_cavities(volume, sheet, ends or whole, settings, second=second)
+        completion.find_cavities(volume, sheet, planes, BodySettings(), second=second)
         for second in (False, True)
     )
 
@@ -152,12 +146,6 @@ def test_a_cavity_with_large_openings_to_the_next_slices_is_none(depth, edge, co
         np.testing.assert_array_equal(index, np.argwhere(holed(PIT, None) == 0))
 
 
-def test_between_thick_slices_openness_is_no_argument():
-    opening = slice(6, 10), slice(0, 7), 7
-    assert len(cavities(holed(PIT, opening), slices=1.0)[0].narrow) == 1
-    assert len(cavities(holed(PIT, opening), slices=1.0, slit_voxel=1.0)[0].narrow) == 0
-
-
 @pytest.mark.parametrize(("size", "wide", "narrow"), [(3, 0, 1), (5, 1, 0)])
 def test_a_cavity_with_room_for_a_ball_is_wide(size, wide, narrow):
     """The middle of a cube of 3 or 5 voxels is 2 or 3 voxels from its walls; 0.9 mm are 1.8."""
@@ -175,13 +163,3 @@ def test_cavities_touch_both_sides_and_lie_between_the_planes():
     assert not len(cavities(holed(PIT), ends=straight_ends(2.5))[0].all)  # voxels from 2.75 mm on
     (index,) = cavities(holed(PIT), ends=straight_ends(3.0))[0].narrow
     assert set(index[:, 2]) == {5}
-
-
-def test_what_lies_between_the_planes_is_known_by_its_points():
-    mask = np.zeros((3, 4, 20), dtype=bool)
-    mask[1, 2] = True
-    inside, points = completion.between(mask, AFFINE, straight_ends(4.0))
-    np.testing.assert_array_equal(np.flatnonzero(inside[1, 2]), np.arange(8))
-    assert np.count_nonzero(inside) == 8
-    expected = [[-4.5, 4.0, z] for z in 0.25 + 0.5 * np.arange(8)]
-    np.testing.assert_allclose(points, expected)

@@ -170,3 +170,18 @@ def test_cells_fill_the_sheet_with_positive_tetrahedra(sheet):
         assert volumes.sum() == pytest.approx(2.0 * 12 * 8)
         assert coordinates.values.min() == -1
         assert coordinates.values.max() == 1
+
+
+def test_columns_are_continued_in_equal_steps(sheet):
+    points, depth = columns._continued(sheet)
+    steps = np.r_[
+        np.arange(-1.5, -0.01, 0.05), np.arange(0, 2.01, 0.05), np.arange(2.05, 3.51, 0.05)
+    ]
+    np.testing.assert_allclose(depth[3, 4], steps, atol=1e-12)
+    np.testing.assert_allclose(points[3, 4, :, 0], LOW + steps)
+
+
+def test_lines_lie_among_nodes_within_an_extent():
+    found = columns._positions(0.8, 5, 9), columns._positions(1.0, 3, 9, 0.5)
+    np.testing.assert_allclose(found[0], [0, 1.5, 4, 6.5, 8])
+    np.testing.assert_allclose(found[1], [2, 4, 6])

@@ -7,7 +7,6 @@ import pytest
 from geometry_cases import rotation, straight_ends
 
 from hipsta_bids.geometry import ends as ends_mod
-from hipsta_bids.geometry.digital import affine_of
 from hipsta_bids.geometry.ends import EndPlane, long_axis
 from hipsta_bids.protocols.protocol import Part
 
@@ -117,24 +116,6 @@ def test_the_plane_between_mirror_images_is_the_mirror():
         point, found = ends_mod._separating_plane(first, second, normal, 2.0)
         np.testing.assert_allclose(found, normal, atol=1e-6)
         assert point @ normal == pytest.approx(1.2, abs=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("edges", "axis", "expected"),
-    [
-        ((1.0, 1.9, 0.5), Y, 1.9 * Y),
-        ((1.0, 1.9, 0.5), -Y, -1.9 * Y),
-        ((1.0, 1.7, 0.5), Y, None),  # 1.8 times the other edges at least
-        ((1.0, 1.9, 0.5), rotation(0, 59) @ Y, 1.9 * Y),
-        ((1.0, 1.9, 0.5), rotation(0, 61) @ Y, None),
-    ],
-)
-def test_thick_slices_across_the_axis_have_a_step(edges, axis, expected):
-    step = ends_mod._across_slices(affine_of(TURN * edges, np.ones(3)), TURN @ axis)
-    if expected is None:
-        assert step is None
-    else:
-        np.testing.assert_allclose(step, TURN @ expected)
 
 
 def test_the_level_of_a_plane_is_taken_within_two_millimeters():

@@ -19,6 +19,8 @@ from hipsta_bids.geometry.measures import (
     pool_sd,
     section_area,
     subfield_volumes,
+    wall_area,
+    wall_length,
 )
 from hipsta_bids.protocols.protocol import Tissue
 from hipsta_bids.settings import MeasureSettings
@@ -268,3 +270,12 @@ def test_volumes_of_subfields_lie_between_the_end_planes():
     body = plain_body(tissue, affine, straight_ends(3.5))
     cells = subfield_volumes(box_mesh((3, 2, 4), (3.0, 2.0, 4.0)), body)
     assert cells == pytest.approx({Tissue.CA1: 14.0, Tissue.CA3: 7.0})
+
+
+def test_beside_rounded_edges_walls_follow_the_middle():
+    """The interior wall of half a pipe, without its outermost 3 of 40 steps on both sides."""
+    points = tube().points.copy()
+    points[:3, :, 0], points[-3:, :, 0] = points[3, :, 0], points[-4, :, 0]
+    length = 2 * 3.0 * np.sin(np.pi / 80) * 40
+    np.testing.assert_allclose(wall_length(sheet_of(points), 0), length)
+    assert wall_area(sheet_of(points), 0) == pytest.approx(10 * length)

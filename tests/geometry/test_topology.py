@@ -371,3 +371,28 @@ def test_each_slit_is_an_edit_with_its_nodes():
     field = SimpleNamespace(separated=None, slits=slits, cavities=None)
     edits = topology._before_smoothing(field)
     assert [(edit.kind, len(edit.nodes)) for edit in edits] == [("slit", 1), ("slit", 2)]
+
+
+def test_a_filled_hole_is_as_thick_as_the_wall_beside_it():
+    """Plates of 5 and, farther away, 9 nodes; the membrane lies in the middle of the first."""
+    state = np.zeros((44, 24, 44), dtype=bool)
+    state[2:42, 9:14, 2:42] = state[31:42, 7:16, 2:42] = True
+    state[10:13, 9:14, 30:33] = False
+    whole = state.copy()
+    whole[10:13, 9:14, 30:33] = True
+    nodes = np.stack(np.meshgrid([10, 11, 12], [11], [30, 31, 32], indexing="ij"), -1).reshape(
+        -1, 3
+    )
+    state[tuple(nodes.T)] = True
+    lifted = np.full(state.shape, -1.0, dtype=np.float32)
+    added = membranes._thicken(state, lifted, nodes)
+    np.testing.assert_array_equal(state, whole)
+    assert len(added) == 5 * 9
+
+
+def test_stumps_of_a_cut_lie_along_the_line_between_them():
+    solid = np.zeros((9, 9, 12), dtype=bool)
+    cut = np.array([[4, 5, 6], [5, 5, 6]])
+    solid[3, 5, 4] = solid[6, 5, 8] = True
+    assert membranes._stumps_along(cut[:1], solid) == 0
+    assert membranes._stumps_along(cut, solid) == pytest.approx(16 / 25)
