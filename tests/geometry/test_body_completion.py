@@ -91,13 +91,6 @@ def test_the_uncus_is_large_and_medial_at_the_anterior_plane(uncus, wide, tilted
     assert found(tissue)[uncus].all() == is_uncus
 
 
-def test_without_medial_labels_or_a_second_piece_there_is_no_uncus():
-    tissue = beside_the_body()
-    assert not found(np.where(tissue == Tissue.SUBICULUM, Tissue.CA1, tissue)).any()
-    assert not found(np.where(tissue == Tissue.CA2, 0, tissue)).any()
-    assert not found(np.zeros_like(tissue)).any()
-
-
 def holed(cavity, opening=None):
     """A block, CA1 beside dentate gyrus, with a hole between them and a way out of the image."""
     tissue = np.zeros((16, 12, 14), dtype=np.uint8)

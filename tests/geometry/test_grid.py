@@ -298,6 +298,8 @@ def test_the_grid_ends_at_its_margins():
     shift = (voxel - grid.origin) @ grid.across.T / 0.35
     np.testing.assert_allclose(shift, np.rint(shift), atol=1e-6)
     assert grid.step == pytest.approx(0.35, rel=0.05)
+    hands = [np.linalg.det(resampled(body, hemi=hemi).grid.frame) for hemi in "LR"]
+    assert hands == pytest.approx([1, -1])
 
 
 @pytest.mark.parametrize(("degrees", "across"), [(59, True), (61, False)])
@@ -328,6 +330,12 @@ def test_motion_of_cross_sections_behind_a_plane(skew):
     np.testing.assert_allclose(across, turn[:2], atol=EXACT)
     # The corners of voxels blunt the shear.
     np.testing.assert_allclose(found, turn[:2, :2] @ change @ turn[:2, :2].T, atol=0.025)
+    if not skew:  # what lies a millimeter beyond the plane is read from this place in it
+        body = replace(body, ends=replace(straight_ends(9.0), half_slice=0.125))
+        nodes = np.array([[2.0, 1.0, -1.0], [3.0, -1.5, -2.0]])
+        read = continued_nodes(SimpleNamespace(node_points=nodes.copy, across=turn[:2]), body, 0.0)
+        places = [np.linalg.inv(np.eye(2) + node[2] * change) @ node[:2] for node in nodes]
+        np.testing.assert_allclose(read, np.column_stack([places, [0, 0]]), atol=0.08)
 
 
 def test_filling_and_parting_of_labels_is_undone():
@@ -397,11 +405,3 @@ def test_labels_that_were_resampled_are_refused(times, edge, refused):
         return
     with pytest.raises(GeometryError, match=refused):
         grids.check_voxel(volume, CheckSettings())
-
-
-def test_a_long_straight_stretch_is_not_resampled():
-    """Slices change after 1, 2, 2 and 12 steps: 12 is more than three times the median."""
-    slices = np.repeat([2, 3, 2, 3, 2, 3], [4, 1, 2, 2, 12, 3])[:, None, None].astype(np.uint8)
-    assert grids._repeats(slices) == 1.0
-    assert grids._repeats(slices[:10]) == 2.0
-    assert grids._repeats(slices[:3]) == 1.0

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from geometry_cases import box_mesh, plain_body, rigid, straight_ends
+from geometry_cases import rigid
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from sheet_cases import grid, plates, quadric, saddle, sheet_of, shell, tube
@@ -17,12 +17,7 @@ from hipsta_bids.geometry.measures import (
     measure_thickness,
     node_shares,
     pool_sd,
-    section_area,
-    subfield_volumes,
-    wall_area,
-    wall_length,
 )
-from hipsta_bids.protocols.protocol import Tissue
 from hipsta_bids.settings import MeasureSettings
 
 MEASURES = MeasureSettings()
@@ -242,40 +237,3 @@ def test_sds_are_averaged_as_variances_of_what_is_there():
     assert pooled[0, 2, 3] == pytest.approx(np.sqrt(np.mean(beside**2)))
     corner = np.pad(sd[1], 1, mode="edge")[:3, :3]
     assert pooled[1, 0, 0] == pytest.approx(np.sqrt(np.mean(corner**2)))
-
-
-@pytest.mark.parametrize("lines", [40, 41])
-def test_area_of_a_section_is_that_of_its_polygon_or_of_its_arc(lines):
-    """Half a ring of 3 and 5 mm: with an even number of lines, chords are not extrapolated."""
-    x, y, z = grid(nx=lines, ny=3)
-    r = 3 + 2 * z
-    points = np.stack([r * np.cos(np.pi * x), r * np.sin(np.pi * x), 10 * y], axis=-1)
-    chords = 8 * np.sin(np.pi / (lines - 1)) * (lines - 1)
-    arcs = chords + (chords - 8 * np.sin(2 * np.pi / (lines - 1)) * (lines - 1) / 2) / 3
-    wanted = arcs if lines == 41 else chords
-    np.testing.assert_allclose(section_area(sheet_of(points)), wanted, rtol=EXACT * 1e3)
-    assert arcs == pytest.approx(8 * np.pi, rel=1e-5)
-
-
-def test_volumes_of_subfields_lie_between_the_end_planes():
-    """A box of 3 x 2 x 4 mm, cut at z = 3 mm; CA1 and CA3 meet at x = 2 mm."""
-    tissue = np.full((6, 4, 10), Tissue.CA1)
-    tissue[4:] = Tissue.CA3
-    affine = np.diag([0.5, 0.5, 0.5, 1.0])
-    affine[:3, 3] = 0.25
-    body = plain_body(tissue, affine, straight_ends(3.0))
-    found = subfield_volumes(box_mesh((3, 2, 4), (3.0, 2.0, 4.0)), body)
-    assert found == pytest.approx({Tissue.CA1: 12.0, Tissue.CA3: 6.0})
-    # Of a tetrahedron that a plane cuts, as much as its corners' depths say.
-    body = plain_body(tissue, affine, straight_ends(3.5))
-    cells = subfield_volumes(box_mesh((3, 2, 4), (3.0, 2.0, 4.0)), body)
-    assert cells == pytest.approx({Tissue.CA1: 14.0, Tissue.CA3: 7.0})
-
-
-def test_beside_rounded_edges_walls_follow_the_middle():
-    """The interior wall of half a pipe, without its outermost 3 of 40 steps on both sides."""
-    points = tube().points.copy()
-    points[:3, :, 0], points[-3:, :, 0] = points[3, :, 0], points[-4, :, 0]
-    length = 2 * 3.0 * np.sin(np.pi / 80) * 40
-    np.testing.assert_allclose(wall_length(sheet_of(points), 0), length)
-    assert wall_area(sheet_of(points), 0) == pytest.approx(10 * length)

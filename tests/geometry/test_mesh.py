@@ -21,7 +21,7 @@ from hipsta_bids.geometry.mesh import (
     unique_edges,
 )
 from hipsta_bids.settings import SurfaceSettings, TetraSettings
-from hipsta_bids.types import Surface, TetMesh
+from hipsta_bids.types import TetMesh
 
 SMOOTH, RAW = SurfaceSettings(), SurfaceSettings(taubin_iterations=0)
 SPACING = 0.5
@@ -264,17 +264,3 @@ def test_box_volumes():
     mesh = box_mesh((2, 3, 4), (1.0, 2.0, 3.0))
     volumes = tetra_volumes(mesh.vertices, mesh.tetrahedra)
     np.testing.assert_allclose(volumes, 6.0 / (24 * 6), rtol=1e-12)  # rounding
-
-
-def test_the_sharpest_fold_is_the_edge_with_the_smallest_angle():
-    """A wedge with a ridge of 2 mm, far from the origin; its other angles are larger."""
-    points = np.array([[0, 0, 0], [0, 2, 0], [5, 0, 1], [5, 2, 1], [5, 0, -1], [5, 2, -1.0]])
-    faces = [[0, 3, 1], [0, 2, 3], [0, 1, 5], [0, 5, 4], [2, 5, 3], [2, 4, 5], [0, 4, 2], [1, 3, 5]]
-    none = np.zeros(6, dtype=bool)
-    surface = Surface(
-        vertices=points + np.array([50.0, -30, 20]),
-        triangles=np.array(faces),
-        posterior_cap=none,
-        anterior_cap=none,
-    )
-    np.testing.assert_allclose(meshing._sharpest_fold(surface), [50, -29, 20])
