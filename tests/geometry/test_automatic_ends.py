@@ -239,7 +239,6 @@ def test_profiles_of_a_box_have_its_area_and_spread():
     affine[:3, :3] = turn * [0.4, 1.2, 0.3]
     volume = LabelVolume(tissue=tissue, part=tissue * 0, affine=affine, protocol=HIPPUNFOLD)
     levels, area, spread = automatic_ends._profile(volume, tissue, turn[:, 1])
-    np.testing.assert_allclose(np.diff(levels), 0.25)
     inner = np.abs(levels - 9.5 * 1.2) < 5
     np.testing.assert_allclose(area["CA1"][inner], 8 * 3, rtol=3e-3)
     expected = np.sqrt((0.4**2 * (20**2 - 1) + 0.3**2 * (10**2 - 1)) / 12)

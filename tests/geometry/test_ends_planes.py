@@ -9,6 +9,7 @@ from geometry_cases import rotation, straight_ends
 from hipsta_bids.geometry import ends as ends_mod
 from hipsta_bids.geometry.ends import EndPlane, long_axis
 from hipsta_bids.protocols.protocol import Part
+from hipsta_bids.types import GivenEnd
 
 X, Y, Z = np.eye(3)
 TURN = rotation(0, 20) @ rotation(2, -35)
@@ -44,7 +45,6 @@ def test_lengths_and_depths_between_planes_that_lean():
     below = (points[:, 2] + slope[0] * points[:, 0]) * np.cos(np.radians(10))
     above = (8 + slope[1] * points[:, 0] - points[:, 2]) * np.cos(np.radians(20))
     np.testing.assert_allclose(ends.depths(points), [below, above])
-    np.testing.assert_allclose(ends.depth(points), np.minimum(below, above))
     apart = ends.beyond(1.5)
     assert apart.length(points) == pytest.approx(11 + 2 * sum(slope))
     np.testing.assert_allclose(apart.posterior.point, [0, 0, -1.5])
@@ -124,3 +124,10 @@ def test_the_level_of_a_plane_is_taken_within_two_millimeters():
     axis = np.array([0.6, 0.8, 0.0])
     assert ends_mod._level(plane, points, axis) == pytest.approx(0.6 * 3 + 0.8 * 1.0)
     assert ends_mod._level(plane, points + 20, axis) == pytest.approx(0.6 * 50 + 0.8)
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_normals_of_given_planes_point_along_the_axis(sign):
+    end = GivenEnd(end="anterior", point=(1.0, 2.0, 3.0), normal=(0.0, 3.0 * sign, 4.0 * sign))
+    plane = ends_mod._given_plane(end, X, Z)
+    assert (plane.point.tolist(), plane.normal.tolist()) == ([1.0, 2.0, 3.0], [0.0, 0.6, 0.8])

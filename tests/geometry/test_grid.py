@@ -1,5 +1,6 @@
 """The working grid between two planes, and the smoothed mask on it."""
 
+from contextlib import nullcontext
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -16,10 +17,8 @@ from hipsta_bids.geometry import grid as grids
 from hipsta_bids.geometry.ends import EndPlanes
 from hipsta_bids.geometry.grid import WedgeGrid, continued_nodes, in_plane_voxel, smooth_body
 from hipsta_bids.geometry.outlines import SLIT_HALF_WIDTH, TOUCH_DISTANCE
-from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.protocols.protocol import Tissue
 from hipsta_bids.settings import CheckSettings
-from hipsta_bids.types import LabelVolume
 
 EXACT = 1e-9  # rounding of coordinates of some ten mm
 
@@ -297,7 +296,6 @@ def test_the_grid_ends_at_its_margins():
     voxel = body.affine[:3, :3] @ nearest + body.affine[:3, 3]
     shift = (voxel - grid.origin) @ grid.across.T / 0.35
     np.testing.assert_allclose(shift, np.rint(shift), atol=1e-6)
-    assert grid.step == pytest.approx(0.35, rel=0.05)
     hands = [np.linalg.det(resampled(body, hemi=hemi).grid.frame) for hemi in "LR"]
     assert hands == pytest.approx([1, -1])
 
@@ -339,20 +337,13 @@ def test_motion_of_cross_sections_behind_a_plane(skew):
 
 
 def test_filling_and_parting_of_labels_is_undone():
-    rng = np.random.default_rng(4)
-    kind = rng.choice(5, size=(12, 11, 10), p=[0.4, 0.3, 0.1, 0.1, 0.1])
-    slits, cavities, separated = (kind == n for n in (2, 3, 4))
-    whole = grids._smooth(((kind == 1) | slits | cavities).astype(np.float32), 1.1)
-    field = replace(
-        field_of(kind > 0),
-        values=whole,
-        smoothing=1.1,
-        slits=slits,
-        cavities=cavities,
-        separated=separated,
+    kind = np.random.default_rng(4).choice(5, size=(12, 11, 10), p=[0.4, 0.3, 0.1, 0.1, 0.1])
+    parts = {"slits": kind == 2, "cavities": kind == 3, "separated": kind == 4}
+    after, before = (
+        grids._smooth(np.isin(kind, kinds).astype(np.float32), 1.1) for kinds in ((1, 2, 3), (1, 4))
     )
-    expected = grids._smooth(((kind == 1) | separated).astype(np.float32), 1.1)
-    np.testing.assert_allclose(grids.before_mending(field).values, expected, atol=1e-5)
+    field = replace(field_of(kind > 0), values=after, smoothing=1.1, **parts)
+    np.testing.assert_allclose(grids.before_mending(field).values, before, atol=1e-5)
 
 
 def test_smoothing_keeps_quadratic_functions():
@@ -394,14 +385,6 @@ def test_labels_that_were_resampled_are_refused(times, edge, refused):
     tissue = np.random.default_rng(0).integers(2, 4, (8, 9, 7)).astype(np.uint8)
     for axis, count in enumerate(times):
         tissue = np.repeat(tissue, count, axis=axis)
-    volume = LabelVolume(
-        tissue=tissue,
-        part=np.zeros_like(tissue),
-        affine=rigid() @ np.diag([edge, edge, edge, 1.0]),
-        protocol=load_protocol("freesurfer"),
-    )
-    if refused is None:
-        grids.check_voxel(volume, CheckSettings())
-        return
-    with pytest.raises(GeometryError, match=refused):
+    volume = SimpleNamespace(tissue=tissue, affine=rigid() @ np.diag([edge, edge, edge, 1.0]))
+    with pytest.raises(GeometryError, match=refused) if refused else nullcontext():
         grids.check_voxel(volume, CheckSettings())
