@@ -153,6 +153,8 @@ def test_a_bump_on_plates_has_a_known_score():
              for n, step, row in ((41, 0.3, 20), (21, 0.4, 9))]  # fmt: skip
     assert found.value == pytest.approx(0.85 / np.sqrt(np.prod(sizes)) / CHECKS.smooth_wall)
     np.testing.assert_allclose(found.points, [points[20, 9, -1]])
+    outward = bumps._stand_out(points[:, :, [0, -1]], predictor(21, 0.4))[20, 9]
+    np.testing.assert_allclose(outward, [0, 0.85 / sizes[1]], atol=1e-12)
     for share, count in ((6.5 / 8, 0), (6.7 / 8, 1)):  # three times the gap are 6.6 mm
         assert len(check_bumps(sheet_of(points * [1, share, 1]), CHECKS)) == count
 

@@ -326,7 +326,6 @@ def test_motion_of_cross_sections_behind_a_plane(skew):
     center, across, found = grids._motion(body, "posterior", inward, turn[:2])
     np.testing.assert_allclose(center, 0.0, atol=0.1)
     np.testing.assert_allclose(across, turn[:2], atol=EXACT)
-    # The corners of voxels blunt the shear.
     np.testing.assert_allclose(found, turn[:2, :2] @ change @ turn[:2, :2].T, atol=0.025)
     if not skew:  # what lies a millimeter beyond the plane is read from this place in it
         body = replace(body, ends=replace(straight_ends(9.0), half_slice=0.125))
@@ -388,3 +387,14 @@ def test_labels_that_were_resampled_are_refused(times, edge, refused):
     volume = SimpleNamespace(tissue=tissue, affine=rigid() @ np.diag([edge, edge, edge, 1.0]))
     with pytest.raises(GeometryError, match=refused) if refused else nullcontext():
         grids.check_voxel(volume, CheckSettings())
+
+
+def test_filled_nodes_are_known_to_the_field(arc):
+    index = np.argwhere(arc.body.inside)
+    height = arc.body.ends.height(arc.body.inside_points()[1], "posterior")
+    index = index[np.abs(height - np.median(height)) < 3][::200]  # mm; nodes at ends lie closer
+    field = resampled(replace(arc.body, filled=index))
+    points = index @ arc.body.affine[:3, :3].T + arc.body.affine[:3, 3]
+    nodes = np.argwhere(field.slits).astype(float)
+    distance = np.linalg.norm(field.grid.to_ras(nodes)[:, None] - points, axis=-1).min(axis=1)
+    assert distance.max() <= 0.5 * np.sqrt(3) * 0.4 + 1e-6  # half the diagonal of a voxel

@@ -396,3 +396,29 @@ def test_stumps_of_a_cut_lie_along_the_line_between_them():
     solid[3, 5, 4] = solid[6, 5, 8] = True
     assert membranes._stumps_along(cut[:1], solid) == 0
     assert membranes._stumps_along(cut, solid) == pytest.approx(16 / 25)
+
+
+def test_cuts_between_turns_that_touch_sever_nothing(monkeypatch):
+    """Whether they touch is asked at the place of the cut."""
+    mask, _, where = with_bridge()
+    monkeypatch.setattr(membranes, "SEVER_ALONG", -1.0)
+    places = []
+
+    def touch(points):
+        places.append(SPACING * np.array(where) - points.mean(axis=0))
+        return True
+
+    field = field_of(mask, spacing=SPACING)
+    solid = topology.repair_topology(field, TOPOLOGY, lambda _: "", touch)
+    assert only_repair(solid, "cut").excess < np.inf
+    assert np.linalg.norm(places, axis=1).max() < 2.5
+
+
+def test_fills_across_the_axis_cost_more_away_from_the_ends():
+    solid = np.zeros((20, 20, 40), dtype=bool)
+    across = np.argwhere(np.ones((5, 5, 1), dtype=bool)) + np.array([5, 5, 20])
+    for shift, dear in ((0, True), (-12, True), (-13, False), (11, True), (12, False)):
+        factor = membranes._implausibility("fill", across + np.array([0, 0, shift]), solid)
+        assert factor == (membranes.ACROSS_FACTOR if dear else 1)
+    assert membranes._implausibility("fill", across[:, [0, 2, 1]], solid) == 1
+    assert membranes._implausibility("fill", across[:3], solid) == 1
