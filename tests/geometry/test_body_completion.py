@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from geometry_cases import straight_ends
-from scipy.spatial.transform import Rotation
+from geometry_cases import rotation, straight_ends
 
 from hipsta_bids.geometry import completion
 from hipsta_bids.geometry.digital import affine_of
+from hipsta_bids.geometry.ends import EndPlane, EndPlanes
 from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.protocols.protocol import Tissue
 from hipsta_bids.settings import BodySettings
@@ -40,21 +40,15 @@ def beside_the_body(uncus=UNCUS, *, wide=0, tilted=0):
 
 def found(tissue):
     """Mask of the uncus; the same if the body is turned and its voxels are in another order."""
-    turn = Rotation.from_euler("xyz", [20, -30, 50], degrees=True).as_matrix()
-    ends = replace(
-        ENDS,
-        posterior=ENDS.posterior._replace(normal=turn[:, 2]),
-        anterior=ENDS.anterior._replace(point=8.0 * turn[:, 2], normal=turn[:, 2]),
-        axis=turn[:, 2],
-    )
-    turned = affine_of(turn @ AFFINE[:3, :3], turn @ AFFINE[:3, 3])
+    turn = rotation(0, 20) @ rotation(2, -35)
+    z = turn[:, 2]
+    planes = EndPlane(np.zeros(3), z, "labels"), EndPlane(8.0 * z, z, "labels")
+    ends = EndPlanes(posterior=planes[0], anterior=planes[1], axis=z, half_slice=0.5)
+    turned = affine_of(turn, np.zeros(3)) @ AFFINE
     turned = turned @ affine_of(np.diag([-1.0, 1, 1]), np.array([len(tissue) - 1.0, 0, 0]))
     masks = np.zeros((2, *tissue.shape), dtype=bool)
-    for mask, voxels, planes, affine in (
-        (masks[0], tissue, ENDS, AFFINE),
-        (masks[1, ::-1], tissue[::-1], ends, turned),
-    ):
-        mask[tuple(completion.find_uncus(voxels, affine, planes).T)] = True
+    masks[0][tuple(completion.find_uncus(tissue, AFFINE, ENDS).T)] = True
+    masks[1, ::-1][tuple(completion.find_uncus(tissue[::-1], turned, ends).T)] = True
     np.testing.assert_array_equal(*masks)
     return masks[0]
 

@@ -7,6 +7,7 @@ import pytest
 from geometry_cases import plain_body, solve_case, straight_ends
 from scipy import ndimage
 
+from hipsta_bids.geometry import outlines
 from hipsta_bids.geometry import slices as shapes
 from hipsta_bids.geometry.measures import measure_thickness
 from hipsta_bids.geometry.outlines import DISTANCE_REACH, SLIT_HALF_WIDTH, outline_slice
@@ -379,3 +380,10 @@ def test_places_of_ribbons_give_flows_and_bends():
     np.testing.assert_allclose(flows, steps[..., None, None] + 0 * flows, rtol=1e-5)
     expected = np.array([[0.0, -1.0, 0, 0, 0], [0.0, 3.0, 0, 0, 0]])
     np.testing.assert_allclose(bends, expected[..., None, None] + 0 * bends, atol=1e-5)
+
+
+def test_pixels_have_their_distance_from_a_segment():
+    found = outlines._segment_distance((4, 9), np.array([2, 3]), np.array([2, 6]))
+    row, column = np.indices((4, 9))
+    beyond = np.maximum(np.maximum(3 - column, column - 6), 0)
+    np.testing.assert_allclose(found, np.hypot(row - 2, beyond))
