@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from geometry_cases import straight_grid
+from grids import straight_grid
 from test_columns import BENT, HIGH, LOW, at, flat_sheet, plate_field
 
 from hipsta_bids.geometry.grid import Field, _smooth, before_mending

@@ -5,7 +5,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from geometry_cases import field_of, ribbon_mask, solid_of, straight_grid
+from geometry_cases import field_of, ribbon_mask, solid_of
+from grids import straight_grid
 from scipy import ndimage
 
 from hipsta_bids.errors import GeometryError
