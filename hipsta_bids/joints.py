@@ -192,6 +192,40 @@ class Measurement:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Grouping:
+    """Hemispheres that are measured together (``Job.visits``): all are inputs of each."""
+
+    setting: str
+    """Setting of the participant level that asks it, as ``table.name``."""
+    commands: Mapping[str, tuple[str, ...]]
+    """Words of a command line that ask it, by values of the setting. Others do not."""
+    options: str
+    """Function that adds its options to a group of the parser."""
+    settings: str
+    """Function of the parsed options and the settings; returns the settings, or refuses both."""
+    advice: str
+    """Function of two values of the setting: how a folder was made with the first one, and what to
+    do; empty for other values."""
+    notes: str
+    """Function of inputs; returns notes on their groups."""
+    gather: str
+    """Function of jobs; returns them in groups."""
+    run: str
+    """Function of a group; returns outcomes."""
+    is_complete: str
+    """Function of a job of a group: whether its files exist."""
+    methods: str
+    """Function of settings; returns sentences of the methods text."""
+    columns: str
+    """As of `Measurement`."""
+
+    def is_asked(self, settings: Any) -> bool:  # noqa: ANN401  (of the participant level)
+        """Check whether settings ask it."""
+        table, name = self.setting.split(".")
+        return getattr(getattr(settings, table), name) in self.commands
+
+
+@dataclass(frozen=True, kw_only=True)
 class Extension:
     """What a folder adds to the program."""
 
@@ -203,8 +237,9 @@ class Extension:
     questions: tuple[Question, ...] = ()
     steps: tuple[Step, ...] = ()
     sources: tuple[Source, ...] = ()
-    group_settings: tuple[tuple[str, str], ...] = ()
-    """Tables of the settings of the group level: name, and class as ``module:name``."""
+    settings: tuple[tuple[str, str, str], ...] = ()
+    """Tables of settings: level (``participant``, ``group``), name, and class as ``module:name``.
+    Under the name of a table of the core, its settings are added to that table."""
     pages: tuple[Page, ...] = ()
     sessions: tuple[SessionChoice, ...] = ()
     protocols: str = ""
@@ -213,20 +248,20 @@ class Extension:
     """Functions of the Python interface, as ``module:name``."""
     regions: tuple[Region, ...] = ()
     measurements: tuple[Measurement, ...] = ()
-    participant_settings: tuple[tuple[str, str], ...] = ()
-    """Tables of the settings of the participant level: name and class."""
-    has_columns: bool = False
-    """Whether the documentation lists the columns of its tables, from its ``columns.toml``."""
+    groupings: tuple[Grouping, ...] = ()
     sections: str = ""
     """Sections of the page of an analysis, as ``module:tuple``."""
+    participant_sections: str = ""
+    """Sections of the page of a participant."""
     addition: str = ""
     """What each comparison adds: function of study and analysis; as ``Part.make``."""
     figures: str = ""
     """Function of the results of a comparison; yields its figures, by name."""
-    has_texts: bool = False
-    """Whether the folder has a ``texts.toml``: files of a hemisphere, their columns, reasons."""
-    has_templates: bool = False
-    """Whether the folder has templates of pages."""
+
+    def has(self, name: str) -> bool:
+        """Check for ``columns.toml`` (of tables), ``texts.toml`` (files) or ``templates``."""
+        place = files(self.package) / name
+        return place.is_file() or place.is_dir()
 
 
 @cache
@@ -260,7 +295,7 @@ def find_texts(kind: str) -> dict[str, dict[str, Any]]:
     """Collect the tables of texts of extensions of a kind, joined where they have one key."""
     texts: dict[str, dict[str, Any]] = {}
     for extension in find_extensions():
-        if extension.has_texts:
+        if extension.has("texts.toml"):
             for key, table in read_texts(extension.package).get(kind, {}).items():
                 texts[key] = texts.get(key, {}) | table
     return texts
@@ -279,6 +314,21 @@ def find_regions() -> dict[str, Region]:
 def find_measurements() -> tuple[Measurement, ...]:
     """Find what options of extensions add to measured hemispheres."""
     return _gather("measurements")
+
+
+def find_groupings() -> tuple[Grouping, ...]:
+    """Find which hemispheres can be measured together."""
+    return _gather("groupings")
+
+
+def find_grouping(settings: Any) -> Grouping | None:  # noqa: ANN401  (of the participant level)
+    """Find how these settings measure hemispheres together; ``None`` is each alone."""
+    return next((grouping for grouping in find_groupings() if grouping.is_asked(settings)), None)
+
+
+def find_columns() -> list[str]:
+    """Find functions of a hemisphere of a page that return further maps of its sheet."""
+    return [part.columns for part in _gather("measurements") + _gather("groupings")]
 
 
 def find_parts() -> tuple[Part, ...]:
@@ -304,7 +354,7 @@ def find_sources() -> tuple[Source, ...]:
 
 def find_settings(level: str) -> dict[str, Any]:
     """Load tables of settings of a level, by name; two extensions may share one."""
-    return {name: load(place) for name, place in _gather(f"{level}_settings")}
+    return {name: load(place) for of, name, place in _gather("settings") if of == level}
 
 
 def find_sessions() -> tuple[SessionChoice, ...]:

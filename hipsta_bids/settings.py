@@ -167,9 +167,6 @@ class SheetSettings(tables.SettingsTable):
     """The grid spans plus and minus this along z; 1 is the whole wall."""
     max_filled: tables.Fraction = 0.2
     """Refuse a sheet with a larger fraction of columns that could not be measured."""
-    frame: Literal["visit", "person", "shared"] = "visit"
-    """Each ``visit`` has its own sheet, or all visits of a ``person`` lie on one sheet
-    (`--longitudinal`). ``shared``: likewise, and their labels share a space."""
     depths: Literal["distance", "volume"] = "distance"
     """Spacing of layers along each column: ``distance`` (even), or ``volume`` (equal volumes; Bok
     1929, Leprince et al. 2015). The measures do not depend on it."""
@@ -311,6 +308,7 @@ class Settings(tables.ExtendedSettings):
 
 if not TYPE_CHECKING:  # type checkers know the tables of the core
     Settings = Settings.extended(find_settings("participant"))
+    SheetSettings = type(Settings().sheet)  # with settings of extensions
 
 
 def load_settings(path: Path | None) -> Settings:

@@ -41,14 +41,15 @@ COMMANDS = [
         1,  # one hemisphere is damaged
         ["labels/out/report.html", "labels/out/sub-02.html", "labels/out/sub-01_ses-[12].html"],
     ),
-    (
+    *[
         (
             "labels labels/shared participant --longitudinal --participant-label 01"
-            " --settings coarse.toml --n-procs 1"
-        ),
-        0,
-        ["labels/shared/report.html", "labels/shared/sub-01_ses-[12].html"],
-    ),
+            " --settings coarse.toml --n-procs 1",
+            0,
+            ["labels/shared/report.html", "labels/shared/sub-01_ses-[12].html"],
+        )
+    ]
+    * ("visits" in PRESENT),
     *[("surrogate labels labels/out --participant-label 02 --hemi L --settings coarse.toml", 0, [])]
     * SURROGATE,
     ("figure participant labels/out --participant-label 02 -o sheet.svg", 0, ["sheet.svg"]),

@@ -5,6 +5,8 @@ import json
 import nibabel as nib
 import numpy as np
 
+from hipsta_bids.cli import main
+from hipsta_bids.errors import ExitCode
 from hipsta_bids.inputs.search import InputRequest, find_hemispheres
 
 #: 0.5 mm voxels, rotated a little so that mistakes in affines show.
@@ -59,3 +61,19 @@ def by_key(items):
     found = {item.key: item for item in items}
     assert len(found) == len(items)
     return found
+
+
+def put_visits(root, *names, sides="lr"):
+    for name in names:
+        for side in sides:
+            path = (
+                root / "derivatives/freesurfer" / name / f"mri/{side}h.hippoAmygLabels-T1.v22.mgz"
+            )
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(f"use {name} {side}")
+
+
+def said_of(capsys, *arguments, code=ExitCode.OK):
+    assert main.main([str(word) for word in arguments]) == code
+    said = capsys.readouterr()
+    return said.out + said.err

@@ -14,7 +14,7 @@ from hipsta_bids.derivatives.names import HemisphereName
 from hipsta_bids.errors import GeometryError, InputError
 from hipsta_bids.geometry.catalog import MAPS, SECTIONS, average_profiles
 from hipsta_bids.inputs.scan import HemisphereInput
-from hipsta_bids.participant.job import run_job
+from hipsta_bids.participant.job import run_alone
 from hipsta_bids.protocols.protocol import Label, Part, Protocol, Tissue
 from hipsta_bids.types import BodyMask, Coordinates, Flag, HemisphereMaps, Sheet, TetMesh
 
@@ -175,14 +175,14 @@ def replace_measurement():
     sys.modules[participant.__name__] = participant
 
 
-def stand_in_job(job):
-    """Take the place of ``run_job`` in workers, which are processes of their own."""
+def stand_in_jobs(jobs):
+    """Take the place of ``run_alone`` in workers, which are processes of their own."""
     replace_measurement()
-    return run_job(job)
+    return run_alone(jobs)
 
 
-def thread_job(job):
+def thread_jobs(jobs):
     """Say what a worker sees of its surroundings."""
     seen = {name: os.environ.get(name) for name in ("OMP_NUM_THREADS", "TMPDIR")}
-    Path(job.result.root, "seen.json").write_text(json.dumps(seen))
-    return stand_in_job(job)
+    Path(jobs[0].result.root, "seen.json").write_text(json.dumps(seen))
+    return stand_in_jobs(jobs)

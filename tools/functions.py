@@ -16,9 +16,6 @@ MAX_COMPLEXITY, MAX_LINES = 15, 60
 EXCEPTIONS: tuple[tuple[str, str], ...] = (
     ("cli/participant.py:_run", "messages of wrong use, in the order in which they are given"),
     ("participant/pool.py:run_jobs", "one loop over processes that end, fail or are killed"),
-    ("participant/run.py:_prepare", "decides on each hemisphere once, with a reason"),
-    ("participant/run.py:_measured", "collects what each way of running returns"),
-    ("participant/visits.py:_measure_visits", "the visits of a participant, each with its error"),
 )
 
 _FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)

@@ -229,7 +229,9 @@ def _group_columns() -> Iterator[tuple[str, str]]:
     ruled = re.compile(r".+_(low|high|se|cv_sd)|(p|below_)\d+")
     columns = {**JOINT_COLUMNS, **COLUMNS}
     for extension in find_extensions():
-        columns |= read_columns(extension.package) if extension.has_columns else {}
+        if extension.has("columns.toml"):
+            columns = {**read_columns(extension.package), **columns}
+    columns = {name: words for name, words in columns.items() if isinstance(words, str)}
     for name, words in columns.items():
         if not ruled.fullmatch(name) and words not in {name, name.removesuffix("_id")}:
             yield f"`{name}`", words

@@ -11,8 +11,8 @@ from scipy import ndimage
 from scipy.spatial import KDTree
 
 from hipsta_bids.errors import GeometryError
+from hipsta_bids.extensions.visits.common import Placed, find_common, measure_placed
 from hipsta_bids.inputs.search import HemisphereInput, InputRequest, find_hemispheres
-from hipsta_bids.participant.longitudinal import Laid, find_common, measure_laid
 from hipsta_bids.protocols.protocol import Part, Tissue
 from hipsta_bids.settings import Settings
 from hipsta_bids.types import HemisphereMaps, LabelVolume, Sheet
@@ -111,15 +111,15 @@ def lose_edge(volume: LabelVolume, sheet: Sheet, *, lateral: bool) -> LabelVolum
 def measure(volumes: Sequence[LabelVolume], hemi: str) -> list[HemisphereMaps | str]:
     """Measure visits on a common sheet; a reason replaces the maps of a visit without."""
     try:
-        frame, laid = find_common(volumes, hemi, Settings(), untimed, shared=False)
+        frame, placed = find_common(volumes, hemi, Settings(), untimed, shared=False)
     except GeometryError as error:
         return [error.reason] * len(volumes)
-    motions = dict(zip(laid, frame.motions, strict=True))
+    motions = dict(zip(placed, frame.motions, strict=True))
     results: list[HemisphereMaps | str] = []
     for number, volume in enumerate(volumes):
-        visit = laid.get(number)
-        if isinstance(visit, Laid):
-            results.append(measure_laid(frame, motions[number], volume, visit, untimed))
+        visit = placed.get(number)
+        if isinstance(visit, Placed):
+            results.append(measure_placed(frame, motions[number], volume, visit, untimed))
         else:
             results.append(visit.reason if visit else "visit-unlike")
     return results

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from skimage.measure import marching_cubes
 
 from hipsta_bids.extensions.trials.sizes import participants_needed
+from hipsta_bids.extensions.visits.common import Frame, make_frame, measure_placed, place_visit
 from hipsta_bids.geometry.body import extract_body
 from hipsta_bids.geometry.columns import SMOOTHING
 from hipsta_bids.geometry.digital import box_around, low_corner, positions
@@ -22,7 +23,6 @@ from hipsta_bids.geometry.ends import long_axis
 from hipsta_bids.geometry.measures import column_area
 from hipsta_bids.inputs.search import HemisphereInput
 from hipsta_bids.participant.job import peak_memory, reset_peak_memory
-from hipsta_bids.participant.longitudinal import Frame, lay_visit, make_frame, measure_laid
 from hipsta_bids.phantom import PhantomSpec, Thinning
 from hipsta_bids.protocols.protocol import Part, Tissue
 from hipsta_bids.settings import BodySettings, Settings
@@ -253,8 +253,8 @@ def measure_frame(
 def measure_on(frame: Frame, volumes: Sequence[LabelVolume], hemi: str) -> list[HemisphereMaps]:
     """Measure visits on a sheet."""
     return [
-        measure_laid(
-            frame, motion, volume, lay_visit(frame, number, volume, hemi, untimed), untimed
+        measure_placed(
+            frame, motion, volume, place_visit(frame, number, volume, hemi, untimed), untimed
         )
         for number, (motion, volume) in enumerate(zip(frame.motions, volumes, strict=True))
     ]

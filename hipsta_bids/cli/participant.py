@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hipsta_bids import __version__
+from hipsta_bids import __version__, joints
 from hipsta_bids.cli import console
 from hipsta_bids.cli.parser import (
     Parser,
@@ -25,7 +25,6 @@ from hipsta_bids.cli.parser import (
     subject_label,
 )
 from hipsta_bids.errors import ExitCode, NothingToDoError, OutputError, UsageError, did_you_mean
-from hipsta_bids.joints import find_measurements, find_regions, load
 from hipsta_bids.participant.cluster import Cluster, Shard, check_cluster, parse_shard
 from hipsta_bids.participant.pool import pin_threads, processors
 from hipsta_bids.protocols import EXPERIMENTAL
@@ -127,10 +126,11 @@ def _add_processing(parser: Parser) -> None:
     add("--x-coordinate", "NAME", choices=("midsurface", "volume"))
     add("--ends", "FILE.tsv")
     add("--probabilities", "auto|never|DIR", type=_probabilities, default="auto")
-    add("--longitudinal", "", nargs="?", const="auto", choices=["auto", "shared"])
+    for grouping in joints.find_groupings():
+        joints.load(grouping.options)(group)
     add("--write-meshes")
-    for measurement in find_measurements():
-        load(measurement.options)(group)
+    for measurement in joints.find_measurements():
+        joints.load(measurement.options)(group)
     add("--force")
     add_pages = adder(group.add_mutually_exclusive_group(), _HELP)
     add_pages("--no-reports")
@@ -148,7 +148,7 @@ def _add_processing(parser: Parser) -> None:
 
 def _regions_text() -> str:
     """List the regions, for the help."""
-    regions = find_regions().items()
+    regions = joints.find_regions().items()
     further = [f"{name} ({one.meaning})" if one.meaning else name for name, one in regions]
     text = help_texts()["participant"]["--region"]
     return f"{text}; experimental: {', '.join(further)}" if further else text
@@ -293,13 +293,14 @@ def _run(options: "Namespace", arguments: Sequence[str]) -> ExitCode:
 def _list_inputs(
     items: "Sequence[HemisphereInput]", findings: "Findings", settings: "Settings"
 ) -> None:
-    """Print tables of the inputs and of all that is not used, and the visits on common sheets."""
-    from hipsta_bids.inputs import account, search  # noqa: PLC0415  (heavy)
+    """Print tables of the inputs and of all that is not used, and what is measured together."""
+    from hipsta_bids.inputs import account  # noqa: PLC0415  (heavy)
 
     console.echo_table(account.selection_table(items))
     console.echo_table(account.ignored_table(findings.ignored))
     console.echo_table(account.other_entries_table(findings.other_entries))
-    for note in search.sheet_notes(items) if settings.sheet.frame != "visit" else ():
+    grouping = joints.find_grouping(settings)
+    for note in joints.load(grouping.notes)(items) if grouping else ():
         console.echo(note)
 
 
@@ -322,24 +323,20 @@ def _settings(options: "Namespace") -> "Settings":
 
     preset = PUBLISHED if options.method == "published" else {}
     settings = load_settings(options.settings).changed(**preset)
-    frames = {"auto": "person", "shared": "shared", None: None}
-    sheet = {"x_coordinate": options.x_coordinate, "frame": frames[options.longitudinal]}
     settings = settings.changed(
         body={"region": options.region} if options.region else {},
-        sheet={name: value for name, value in sheet.items() if value},
+        sheet={"x_coordinate": options.x_coordinate} if options.x_coordinate else {},
     )
-    if settings.sheet.frame != "visit" and (settings.body.region != "body" or _further(options)):
-        flags = " and ".join(
-            ["--region", *(f"--{measurement.name}" for measurement in find_measurements())]
-        )
-        raise UsageError(f"--longitudinal measures the body; omit {flags}")
+    for grouping in joints.find_groupings():
+        settings = joints.load(grouping.settings)(options, settings)
     return settings
 
 
 def _further(options: "Namespace") -> dict[str, object]:
     """Collect the options of extensions that were given, by name."""
     values = {
-        measurement.name: getattr(options, measurement.name) for measurement in find_measurements()
+        measurement.name: getattr(options, measurement.name)
+        for measurement in joints.find_measurements()
     }
     return {name: value for name, value in values.items() if value}
 

@@ -21,7 +21,7 @@ from hipsta_bids.derivatives.names import (
 from hipsta_bids.errors import InputError, SettingsError, UsageError
 from hipsta_bids.io import files
 from hipsta_bids.io.files import DATASET, locked
-from hipsta_bids.joints import find_texts
+from hipsta_bids.joints import find_groupings, find_texts, load
 from hipsta_bids.protocols.protocol import Protocol, Tissue
 from hipsta_bids.protocols.toml import flatten, resolve, settings_hash
 from hipsta_bids.settings import BodySettings, Settings
@@ -42,13 +42,6 @@ _APPTAINER_VARIABLES = ("APPTAINER_CONTAINER", "SINGULARITY_CONTAINER")
 #: Where the code is: set in container images; else it is read from the package's metadata.
 CODE_URL_VARIABLE = "HIPSTA_BIDS_CODE_URL"
 _CODE_LABELS = ("source", "repository")
-
-#: Options by values of ``sheet.frame``.
-_FRAME_OPTIONS = {
-    "visit": "--longitudinal",
-    "person": "--longitudinal",
-    "shared": "--longitudinal shared",
-}
 
 
 def check_own_dataset(root: Path) -> None:
@@ -113,9 +106,7 @@ def settle_settings(root: Path, settings: Settings) -> str:
             for key in keys
             if recorded.get(key) != current.get(key)
         ]
-        before_frame, frame = (str(cells.get("sheet.frame")) for cells in (recorded, current))
-        if before_frame in _FRAME_OPTIONS and before_frame != frame:
-            raise SettingsError(f"{root}: {_other_frame(before_frame, frame, changes)}")
+        _refuse_other_grouping(root, recorded, current, changes)
         if changes or is_same_version or not recorded:
             raise SettingsError(
                 f"{root}: results with other settings ({'; '.join(changes) or 'hash differs'}); "
@@ -126,15 +117,17 @@ def settle_settings(root: Path, settings: Settings) -> str:
     return digest
 
 
-def _other_frame(before: str, current: str, changes: Sequence[str]) -> str:
-    """Return what to do in a folder made with or without --longitudinal; other changes follow."""
-    option = _FRAME_OPTIONS[before]
-    option += " auto" if (before, current) == ("person", "shared") else ""  # as without a choice
-    advice = f"with {option}; {'add' if current == 'visit' else 'use'} {option}"
-    advice = advice if before != "visit" else f"without {option}; omit it"
-    remainder = "; ".join(text for text in changes if not text.startswith("sheet.frame "))
-    also = f" (other settings: {remainder})" if remainder else ""
-    return f"this folder was made {advice}, or choose another output folder{also}"
+def _refuse_other_grouping(
+    root: Path, recorded: Mapping[str, Any], current: Mapping[str, Any], changes: Sequence[str]
+) -> None:
+    """Refuse a folder in which other hemispheres were measured together; other changes follow."""
+    for grouping in find_groupings():
+        setting = grouping.setting
+        advice = load(grouping.advice)(recorded.get(setting), current.get(setting))
+        if advice:
+            remainder = "; ".join(text for text in changes if not text.startswith(f"{setting} "))
+            also = f" (other settings: {remainder})" if remainder else ""
+            raise SettingsError(f"{root}: {advice}, or choose another output folder{also}")
 
 
 def upgrade_notes(root: Path) -> list[str]:
@@ -366,7 +359,9 @@ def citation_text(
         operator=about["operator"][settings.boundaries.operator],
         edges=about["edges"][settings.boundaries.edges],
         x_coordinate=about["x_coordinate"][sheet.x_coordinate],
-        frame=about["frame"][sheet.frame],
+        further="".join(
+            load(g.methods)(settings) for g in find_groupings() if g.is_asked(settings)
+        ),
         nodes=f"{sheet.x_nodes} x {sheet.y_nodes} x {sheet.z_nodes}",
         order=settings.measures.curvature_order,
         window=settings.measures.curvature_window,

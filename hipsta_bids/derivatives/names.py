@@ -177,36 +177,20 @@ OUTPUTS: tuple[Output, ...] = (
     _output("qc", "metrics", ".json", desc="qc"),
 )
 
-_CHANGE = _output("change", "morph", ".shape.gii", unit="mm", desc="thicknessChange")
-#: Of the sheet that all visits of a participant share, in the folder of the participant.
-_TEMPLATE = (
-    *(
-        Output(
-            f"template_{name}",
-            name,
-            ".surf.gii",
-            f"{name} {_ABOUT['template_surface']}",
-            unit="mm",
-            desc="longitudinal",
-        )
-        for name in ("interior", "midthickness", "exterior")
-    ),
-    _output("template_thickness", "thickness", ".shape.gii", unit="mm", desc="longitudinal"),
-    _output("template_sd", "morph", ".shape.gii", unit="mm", desc="longitudinalSd"),
-    _output("template_mask", "mask", ".nii.gz", desc="longitudinal"),
-)
 _SAMPLED = {"table": ".tsv", "sidecar": ".json", "shape": ".shape.gii", "series": ".func.gii"}
 
 
 def _of_extensions() -> Iterator[Output]:
-    """Describe files that extensions add: tables, and images with their sidecars."""
+    """Describe files that extensions add: tables, records, and images with their sidecars."""
     images = []
     for key, row in _FURTHER.items():
         fields = {name: value for name, value in row.items() if name != "text"}
-        if fields:
-            images.append(_output(key, **fields))
-        else:
+        if not fields:
             yield from _table(key, called="that table")
+        elif fields["extension"] == ".json":
+            yield _output(key, **fields)
+        else:
+            images.append(_output(key, **fields))
     yield from images
     yield from _sidecars(images)
 
@@ -216,11 +200,6 @@ def _of_extensions() -> Iterator[Output]:
 EXTRA_OUTPUTS: tuple[Output, ...] = (
     *(_output(f"map_{key}", "map", end, desc="*") for key, end in _SAMPLED.items()),
     *_table("roi", called="the region table"),
-    _CHANGE,
-    *_sidecars([_CHANGE]),
-    *_TEMPLATE,
-    *_sidecars(_TEMPLATE),
-    _output("template_qc", "metrics", ".json", desc="longitudinal"),
     *_of_extensions(),
 )
 

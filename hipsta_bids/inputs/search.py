@@ -44,11 +44,11 @@ __all__ = [
     "Findings",
     "HemisphereInput",
     "InputRequest",
+    "count_names",
     "dataset_notes",
     "find_hemispheres",
     "find_inputs",
     "list_subjects",
-    "sheet_notes",
 ]
 
 _LOOKED_FOR = (
@@ -165,9 +165,9 @@ def _search_notes(
         if f.subject in subjects
     ]
     if names:
-        yield f"renamed: {_count(names, 'folder')}"
+        yield f"renamed: {count_names(names, 'folder')}"
     if sides := [f"{e.inside.name} {e.hemi}" for e in ignored if e.hemi and e.inside]:
-        yield f"no labels of one hemisphere: {_count(sides, 'visit')}"
+        yield f"no labels of one hemisphere: {count_names(sides, 'visit')}"
     if text := _unused(ignored):
         yield f"not used: {text}; see --dry-run and the log for the reasons"
 
@@ -252,7 +252,7 @@ def dataset_notes(
     present = {item.subject for item in items}
     if without := sorted(expected - selection.excluded - present):
         hint = did_you_mean(selection.subjects.intersection(without), present)
-        notes.append(f"no segmentation found for {_count(without, 'participant')}{hint}")
+        notes.append(f"no segmentation found for {count_names(without, 'participant')}{hint}")
     usable = [item for item in items if item.problem is None]
     segmentations = Counter(item.protocol.name for item in usable)
     if len(segmentations) > 1:
@@ -266,26 +266,6 @@ def dataset_notes(
                 f" unless --mixed {name} allows it"
             )
     return tuple(notes)
-
-
-def sheet_notes(items: Iterable[HemisphereInput]) -> list[str]:
-    """Count sheets of several visits and of a single one, and name participants and sessions."""
-    visits: dict[tuple[str, str, str], list[str]] = {}
-    for item in items:
-        if item.problem is None:
-            visits.setdefault(item.side, []).append(f"ses-{item.session}" if item.session else "")
-    notes = []
-    for title, is_common in (("several visits", True), ("a single visit", False)):
-        sides = {side: labels for side, labels in visits.items() if (len(labels) > 1) == is_common}
-        sessions: dict[str, dict[str, None]] = {}
-        for (subject, *_), labels in sides.items():
-            sessions.setdefault(subject, {}).update(dict.fromkeys(labels))
-        names = [
-            " ".join((f"sub-{subject}", *labels)).strip() for subject, labels in sessions.items()
-        ]
-        if names:
-            notes.append(f"sheets of {title}: {len(sides)} of {_count(names, 'participant')}")
-    return notes
 
 
 def _search(
@@ -415,12 +395,15 @@ def _labels_hint(request: InputRequest, sources: Sequence[Source]) -> tuple[str,
     folders = [folder for source in sources for folder in source.folders()[0]]
     subjects = {folder.subject for folder in folders}
     unmatched = {label.removeprefix("sub-") for label in request.participant_labels} - subjects
-    hint, contents = did_you_mean(sorted(unmatched), subjects), _count(sorted(subjects), "subject")
+    hint, contents = (
+        did_you_mean(sorted(unmatched), subjects),
+        count_names(sorted(subjects), "subject"),
+    )
     if request.session_labels:
         sessions = {visit.session for visit in tree.list_visits(folders) if visit.session}
         absent = {label.removeprefix("ses-") for label in request.session_labels} - sessions
         hint = hint or did_you_mean(sorted(absent), sessions)
-        contents += f" and {_count(sorted(sessions), 'session')}"
+        contents += f" and {count_names(sorted(sessions), 'session')}"
     return hint, contents
 
 
@@ -429,10 +412,11 @@ def _unused(ignored: Iterable[tree.Ignored]) -> str:
     missed = [entry for entry in ignored if not (entry.template or entry.hemi)]
     kinds = {entry.path.is_file() for entry in missed}
     noun = "name" if len(kinds) > 1 else "file" if kinds == {True} else "folder"
-    return _count([entry.name for entry in missed], noun) if missed else ""
+    return count_names([entry.name for entry in missed], noun) if missed else ""
 
 
-def _count(names: list[str], noun: str) -> str:
+def count_names(names: list[str], noun: str) -> str:
+    """Count names, and list the first ones."""
     ellipsis = ", ..." if len(names) > _LISTED_NAMES else ""
     plural = "" if len(names) == 1 else "s"
     listed = f" ({', '.join(names[:_LISTED_NAMES])}{ellipsis})" if names else ""

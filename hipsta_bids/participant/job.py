@@ -25,7 +25,7 @@ from hipsta_bids.errors import GeometryError, HipstaError, InputError, OutputErr
 from hipsta_bids.geometry.sampling import Regions
 from hipsta_bids.inputs.scan import HemisphereInput
 from hipsta_bids.io import files
-from hipsta_bids.joints import find_measurements, load
+from hipsta_bids.joints import find_groupings, find_measurements, load
 from hipsta_bids.participant.maps import (
     Mapped,
     add_signals,
@@ -55,7 +55,7 @@ class Job:
     """Input datasets by name."""
     write_meshes: bool
     visits: tuple[HemisphereInput, ...] = ()
-    """All visits that share a sheet, this one included; none if it has its own sheet."""
+    """All visits that are measured together, this one included; none if it is measured alone."""
     further: Mapping[str, Any] = field(default_factory=dict)
     """Options of extensions that were given, by name in Python."""
     force: bool = False
@@ -116,7 +116,7 @@ def recorded(job: Job) -> Outcome | None:
         all(path.exists() for path in job.result.paths(optional=job.write_meshes))
         and is_complete(job.result, record)
         and all(load(measurement.is_complete)(job, record) for measurement in find_measurements())
-        and (not job.visits or job.result.path("change").exists())
+        and (not job.visits or all(load(g.is_complete)(job) for g in find_groupings()))
     )
     if not (is_current and whole):
         return None
@@ -233,7 +233,7 @@ def _describe_reading(
 
 
 def _hash_visits(job: Job) -> Iterator[dict[str, Any]]:
-    """List the files of all visits that share a sheet, with their hashes."""
+    """List the files of all visits that are measured together, with their hashes."""
     sources = dict(job.sources)
     for visit in job.visits:
         edited = (edit.path for edit in visit.edits)
@@ -341,6 +341,11 @@ def run_job(job: Job) -> Outcome:
             return finished(job) or measure_job(job)
     except OutputError as error:
         return fail(job, error)
+
+
+def run_alone(jobs: tuple[Job, ...]) -> list[Outcome]:
+    """Measure hemispheres, each by itself."""
+    return [run_job(job) for job in jobs]
 
 
 #: Function of labels, hemisphere, settings and clock that measures a hemisphere.

@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import timedelta
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from hipsta_bids.derivatives.results import ResultPlace, read_record
 from hipsta_bids.errors import ExitCode, HipstaError, InputError, OutputError, ProtocolError
 from hipsta_bids.inputs.scan import HemisphereInput
 from hipsta_bids.io import files
-from hipsta_bids.joints import find_measurements, load
+from hipsta_bids.joints import find_grouping, find_measurements, load
 from hipsta_bids.participant.cluster import Cluster, Shard, run_on_cluster
 from hipsta_bids.participant.job import (
     INTERNAL,
@@ -28,14 +29,13 @@ from hipsta_bids.participant.job import (
     fail,
     finished,
     recorded,
-    run_job,
+    run_alone,
     warm_up,
 )
 from hipsta_bids.participant.log import log_file, log_outcome
 from hipsta_bids.participant.pages import PagePlan, reports_after
 from hipsta_bids.participant.pool import WorkerLost, WorkerPlan, run_jobs
 from hipsta_bids.participant.status import StatusTable, not_finished
-from hipsta_bids.participant.visits import by_side, run_visits, share_sheets
 from hipsta_bids.progress import tell
 from hipsta_bids.settings import Settings
 from hipsta_bids.types import Decision
@@ -45,6 +45,9 @@ WORKER_GB = 0.6
 
 STAGE = "hemispheres"
 """Name of the stage that measures them, on the terminal."""
+
+#: Hemispheres by the groups in which they are measured.
+_Groups = list[tuple[Job, ...]]
 
 _LOGGER = logging.getLogger(__name__)
 
@@ -187,10 +190,11 @@ def _run(
     options: RunOptions,
     *,
     report: Callable[[Outcome], None],
-    outcomes_of: Callable[[list[Job], StatusTable, RunOptions, Path], Generator[Outcome]],
+    outcomes_of: Callable[[_Groups, StatusTable, RunOptions, Path], Generator[Outcome]],
 ) -> RunResult:
     """Log, report and tabulate outcomes as they come, then make the pages."""
-    jobs = _prepare(items, out_dir, settings, options)
+    groups = _prepare(items, out_dir, settings, options)
+    jobs = list(chain.from_iterable(groups))
     shard = None if options.shard is None else options.shard.name
     outcomes: list[Outcome] = []
     copies: list[str] = []
@@ -212,7 +216,7 @@ def _run(
         with (
             reports_after(plan if options.reports else None, visits) as pages,
             contextlib.closing(table),
-            contextlib.closing(outcomes_of(jobs, table, options, log)) as results,
+            contextlib.closing(outcomes_of(groups, table, options, log)) as results,
         ):
             for outcome in results:
                 log_outcome(outcome)
@@ -281,35 +285,10 @@ def _find_copies(jobs: Sequence[Job], out_dir: Path) -> Iterator[str]:
 
 def _prepare(
     items: Sequence[HemisphereInput], out_dir: Path, settings: Settings, options: RunOptions
-) -> list[Job]:
-    """Write what describes the dataset as a whole, and list what is to be done."""
-    origins = [(item.source, item.source_path) for item in items]
-    origins += [(edit.source, edit.source_path) for item in items for edit in item.edits]
-    probabilities = [item.probabilities for item in items if item.probabilities]
-    origins += [(soft.source, soft.source_path) for soft in probabilities]
-    origins += [("bids", m.source_path) for item in items for m in item.maps if m.source_path]
-    sources = dataset.source_names(origins)
-    used_protocols = [
-        p for item in items for p in (item.protocol, item.parts_protocol) if p is not None
-    ]
-    protocols = {protocol.name: protocol for protocol in used_protocols}
-    dataset.check_own_dataset(out_dir)
-    files.check_writable(out_dir)
-    with files.locked(out_dir, files.DATASET) as is_only_run:
-        if is_only_run:
-            files.remove_leftovers(out_dir, "*")
-        digest = dataset.settle_settings(out_dir, settings)
-        dataset.write_description(out_dir, sources)
-        if options.shard is None or not (out_dir / DATASET_FILES["citation"]).exists():
-            text = dataset.citation_text(
-                settings,
-                [protocols[k] for k in sorted(protocols)],
-                pybids=options.pybids,
-                probabilities=bool(probabilities),
-            )
-            files.write_text(out_dir / DATASET_FILES["citation"], text)
-        dataset.write_sidecar(out_dir)
-        write_shared(out_dir)
+) -> _Groups:
+    """Write what describes the dataset as a whole; list what is to be done, in groups."""
+    sources = _find_sources(items)
+    digest = _describe(items, out_dir, settings, options, sources)
     memory = options.mem_gb and options.mem_gb / n_workers(options, len(items))
     jobs = [
         Job(
@@ -334,7 +313,49 @@ def _prepare(
         )
         for item in items
     ]
-    return share_sheets(jobs) if settings.sheet.frame != "visit" else jobs
+    grouping = find_grouping(settings)
+    return [(job,) for job in jobs] if grouping is None else load(grouping.gather)(jobs)
+
+
+def _find_sources(items: Sequence[HemisphereInput]) -> dict[str, Path]:
+    """Name the datasets of all inputs."""
+    origins = [(item.source, item.source_path) for item in items]
+    origins += [(edit.source, edit.source_path) for item in items for edit in item.edits]
+    origins += [(soft.source, soft.source_path) for i in items if (soft := i.probabilities)]
+    origins += [("bids", m.source_path) for item in items for m in item.maps if m.source_path]
+    return dataset.source_names(origins)
+
+
+def _describe(
+    items: Sequence[HemisphereInput],
+    out_dir: Path,
+    settings: Settings,
+    options: RunOptions,
+    sources: Mapping[str, Path],
+) -> str:
+    """Write the files of the dataset as a whole; return the hash of the settings."""
+    used_protocols = [
+        p for item in items for p in (item.protocol, item.parts_protocol) if p is not None
+    ]
+    protocols = {protocol.name: protocol for protocol in used_protocols}
+    dataset.check_own_dataset(out_dir)
+    files.check_writable(out_dir)
+    with files.locked(out_dir, files.DATASET) as is_only_run:
+        if is_only_run:
+            files.remove_leftovers(out_dir, "*")
+        digest = dataset.settle_settings(out_dir, settings)
+        dataset.write_description(out_dir, sources)
+        if options.shard is None or not (out_dir / DATASET_FILES["citation"]).exists():
+            text = dataset.citation_text(
+                settings,
+                [protocols[k] for k in sorted(protocols)],
+                pybids=options.pybids,
+                probabilities=any(item.probabilities for item in items),
+            )
+            files.write_text(out_dir / DATASET_FILES["citation"], text)
+        dataset.write_sidecar(out_dir)
+        write_shared(out_dir)
+    return digest
 
 
 def n_workers(options: RunOptions, n_jobs: int) -> int:
@@ -343,66 +364,67 @@ def n_workers(options: RunOptions, n_jobs: int) -> int:
     return int(max(1, min(options.n_procs, by_memory, n_jobs)))
 
 
-def _collected(jobs: list[Job], *_: object) -> Generator[Outcome]:
+def _collected(groups: _Groups, *_: object) -> Generator[Outcome]:
     """Read the outcomes of all hemispheres from their records."""
-    for job in jobs:
+    for job in chain.from_iterable(groups):
         yield recorded(job) or not_finished(job)
 
 
 def _measured(
-    jobs: list[Job], table: StatusTable, options: RunOptions, log: Path
+    groups: _Groups, table: StatusTable, options: RunOptions, log: Path
 ) -> Generator[Outcome]:
     """Return the outcomes of all hemispheres: first what is done already, then the others."""
-    todo: list[Job] = []
-    # Visits that share a sheet are measured together.
-    shared = any(job.visits for job in jobs)
-    for unit in by_side(jobs) if shared else [(job,) for job in jobs]:
-        earlier = [outcome for job in unit if (outcome := finished(job)) is not None]
-        if len(earlier) < len(unit):
-            todo += unit
+    todo: _Groups = []
+    for group in groups:
+        earlier = [outcome for job in group if (outcome := finished(job)) is not None]
+        if len(earlier) < len(group):
+            todo.append(group)
         else:
             yield from earlier
-    table.expect(todo)
-    for job in todo:
+    table.expect(list(chain.from_iterable(todo)))
+    for job in chain.from_iterable(todo):
         if job.item.problem is not None:
             yield fail(job, job.item.problem)
-    able = [job for job in todo if job.item.problem is None]
-    units: Sequence[Job | tuple[Job, ...]] = by_side(able) if shared else able
-    visits = max((len(unit) for unit in units if isinstance(unit, tuple)), default=1)
+    able = [tuple(job for job in group if job.item.problem is None) for group in todo]
+    yield from _pooled([group for group in able if group], table, options, log)
+
+
+def _pooled(
+    groups: _Groups, table: StatusTable, options: RunOptions, log: Path
+) -> Generator[Outcome]:
+    """Measure groups of hemispheres side by side; clean up if the user stops it."""
+    jobs = list(chain.from_iterable(groups))
+    grouping = find_grouping(jobs[0].settings) if jobs else None
     plan = WorkerPlan(
-        work=run_visits if shared else run_job,
-        n_workers=n_workers(options, len(units)),
-        timeout=options.timeout * visits,
+        work=run_alone if grouping is None else load(grouping.run),
+        n_workers=n_workers(options, len(groups)),
+        timeout=options.timeout * max(map(len, groups), default=1),
         log=log,
         warm_up=warm_up,
         environment=() if options.work_dir is None else (("TMPDIR", str(options.work_dir)),),
         begun=_tell_titles,
     )
-    if options.cluster is None or not able:
-        tell(STAGE, None, current=f"about {_expected(table, plan, able)}")
-        pool = run_jobs(plan, units)
+    if options.cluster is None or not groups:
+        tell(STAGE, None, current=f"about {_expected(table, plan, jobs)}")
+        pool = run_jobs(plan, groups)
     else:
-        pool = run_on_cluster(options.cluster, plan, units)
+        pool = run_on_cluster(options.cluster, plan, groups)
     try:
-        for unit, answer in pool:
+        for group, answer in pool:
             if isinstance(answer, WorkerLost):
-                yield from (_lost(job, answer, options) for job in _jobs_of(unit))
+                yield from (_lost(job, answer, options) for job in group)
             else:
-                yield from answer if isinstance(answer, list) else (answer,)
+                yield from answer
     except BaseException:
         pool.close()
-        for job in able:
+        for job in jobs:
             with contextlib.suppress(OutputError):
                 _remove_unfinished(job)
         raise
 
 
-def _jobs_of(unit: Job | tuple[Job, ...]) -> tuple[Job, ...]:
-    return unit if isinstance(unit, tuple) else (unit,)
-
-
-def _tell_titles(units: list[Job | tuple[Job, ...]]) -> None:
-    name, count = _jobs_of(units[-1])[0].result.name, len(units) - 1
+def _tell_titles(groups: _Groups) -> None:
+    name, count = groups[-1][0].result.name, len(groups) - 1
     ending = f" and {count} more" if count else ""
     tell(STAGE, None, current=f"sub-{name.subject} {name.hemi}{ending}")
 

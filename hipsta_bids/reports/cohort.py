@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,7 @@ from hipsta_bids.derivatives.outliers import FEWEST, SIZE, TEXT
 from hipsta_bids.errors import InputError
 from hipsta_bids.geometry.catalog import SUMMARY
 from hipsta_bids.io import files
+from hipsta_bids.joints import find_groupings
 from hipsta_bids.protocols.toml import flatten, resolve
 from hipsta_bids.reports.maps import make_sprites, read_maps
 from hipsta_bids.reports.page import number, render
@@ -383,8 +385,7 @@ def _from(root: Path, path: Path) -> str:
 def settings_options(settings: Mapping[str, Any]) -> list[str]:
     """Return the options that a later run in a folder with these resolved settings needs."""
     recorded = flatten(settings)
-    frames = {"person": ["--longitudinal"], "shared": ["--longitudinal", "shared"]}
-    options = frames.get(str(recorded.pop("sheet.frame", None)), [])
+    options = _grouping_words(recorded)
     recorded.pop("body.region", None)  # one folder may hold several
     default = flatten(resolve(Settings()))
     changed = {
@@ -393,6 +394,12 @@ def settings_options(settings: Mapping[str, Any]) -> list[str]:
     if changed == flatten(PUBLISHED):
         return [*options, "--method", "published"]
     return [*options, "--settings", "FILE"] if changed else options
+
+
+def _grouping_words(recorded: dict[str, Any]) -> list[str]:
+    """Return the options that measure hemispheres together; take their settings out."""
+    pairs = [(g.commands, recorded.pop(g.setting, None)) for g in find_groupings()]
+    return list(chain.from_iterable(commands.get(str(value), ()) for commands, value in pairs))
 
 
 def correction_of(
@@ -425,5 +432,5 @@ def correction_of(
         "folder": f"EDITS/{first.folder}",
         "command": shlex.join(command),
         "has_file": "FILE" in command,
-        "has_common_sheets": "--longitudinal" in command,
+        "is_grouped": bool(_grouping_words(flatten(settings))),
     }

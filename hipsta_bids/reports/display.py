@@ -87,16 +87,6 @@ CURVATURE = MapKind(
     percentiles=(4, 96),
 )
 MAP_KINDS = (THICKNESS, CURVATURE)
-#: At visits that share a sheet (``--longitudinal``); noise is about 0.1 mm.
-THICKNESS_CHANGE = MapKind(
-    column="thickness_change",
-    title="Change of thickness",
-    unit="mm",
-    colors="PRGn",
-    centered=True,
-    digits=3,
-    limits=(-0.3, 0.3),
-)
 #: Of any measure, between two visits or sides.
 _CHANGE = MapKind(
     column="", title="", unit="", colors="PRGn", centered=True, digits=3, percentiles=(2, 98)

@@ -6,7 +6,7 @@ import io
 import logging
 import re
 import shlex
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,6 @@ from hipsta_bids.derivatives.names import DATASET_FILES, group_report
 from hipsta_bids.errors import HipstaError
 from hipsta_bids.io import files
 from hipsta_bids.io.files import hide_home
-from hipsta_bids.joints import load_all
 from hipsta_bids.protocols import EXPERIMENTAL
 from hipsta_bids.reports import cells, group_tables
 from hipsta_bids.reports.display import DESIGN_COLORS, colors_of
@@ -126,7 +125,7 @@ def group_page(folder: Path) -> str:
         folder=folder.name,
         **heading(record),
         cohort=(folder.parent.parent / DATASET_FILES["report"]).exists(),
-        sections=build_sections(_all_sections(), results, _PREFIX),
+        sections=build_sections(SECTIONS, results, _PREFIX, kind="sections"),
     )
 
 
@@ -237,15 +236,6 @@ SECTIONS: tuple[Section[GroupResults], ...] = (
     Section("methods", "Methods paragraph", "group/methods.html", methods),
     Section("origin", "Origin", "group/origin.html", origin),
 )
-
-
-def _all_sections() -> Iterator[Section[GroupResults]]:
-    """Sections of the core and of extensions, in the order of the page."""
-    further = [section for sections in load_all("sections") for section in sections]
-    yield from (section for section in further if not section.after)
-    for section in SECTIONS:
-        yield section
-        yield from (follower for follower in further if follower.after == section.key)
 
 
 def write_group_report(

@@ -6,7 +6,7 @@ A page is one file that asks for nothing from outside.
 import logging
 import math
 import tomllib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
@@ -14,7 +14,7 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from hipsta_bids import __version__
-from hipsta_bids.joints import find_extensions, find_texts
+from hipsta_bids.joints import find_extensions, find_texts, load_all
 from hipsta_bids.reports.cells import FILTERS
 from hipsta_bids.reports.display import HATCHING, ORIENTATION
 from hipsta_bids.settings import Settings
@@ -41,12 +41,25 @@ class Section(Generic[_Topic]):
     """Of an extension: anchor of the section that it follows; empty to be first."""
 
 
-def build_sections(
-    sections: Iterable[Section[_Topic]], topic: _Topic, prefix: str
-) -> list[SimpleNamespace]:
-    """Build sections; one that fails is noted in the page and in the log, and harms no other."""
-    built = []
+def _add_sections(sections: Sequence[Section[_Topic]], kind: str) -> list[Section[_Topic]]:
+    """Return sections with the ones of extensions, from a field of `Extension`, in order."""
+    further = [s for added in load_all(kind) for s in added] if kind else []
+    keys = [section.key for section in sections]
+    ordered = [section for section in further if section.after not in keys]
     for section in sections:
+        ordered += [section, *(s for s in further if s.after == section.key)]
+    return ordered
+
+
+def build_sections(
+    sections: Sequence[Section[_Topic]], topic: _Topic, prefix: str, *, kind: str = ""
+) -> list[SimpleNamespace]:
+    """Build sections, and sections of extensions from a field of `Extension`, ``kind``.
+
+    One that fails is noted in the page and in the log, and harms no other.
+    """
+    built = []
+    for section in _add_sections(sections, kind):
         try:
             values = section.build(topic)
         except Exception as error:  # a page with a gap is better than none
@@ -75,7 +88,7 @@ def _environment() -> "Environment":
         loader=ChoiceLoader(
             [
                 PackageLoader("hipsta_bids.reports"),
-                *(PackageLoader(e.package) for e in find_extensions() if e.has_templates),
+                *(PackageLoader(e.package) for e in find_extensions() if e.has("templates")),
             ]
         ),
         autoescape=True,

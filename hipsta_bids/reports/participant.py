@@ -35,7 +35,6 @@ from hipsta_bids.reports.results import (
 )
 from hipsta_bids.reports.slices import stack_of
 from hipsta_bids.reports.verdict import of_flag
-from hipsta_bids.reports.visits import draw_visits
 from hipsta_bids.types import RATINGS, Decision, Float
 
 #: Finer masks of failed hemispheres are thinned to about this edge before they are drawn, mm.
@@ -306,7 +305,7 @@ def participant_page(
             "title": part.title,
             "protocol": part.hemispheres[0].record.get("scheme_title") or part.title,
             "prefix": f"p{n}",
-            "sections": build_sections(SECTIONS, part, f"p{n}"),
+            "sections": build_sections(SECTIONS, part, f"p{n}", kind="participant_sections"),
         }
         for n, part in enumerate(series, start=1)
     ]
@@ -394,11 +393,6 @@ def _sheets(series: Series) -> Mapping[str, Any] | None:
     }
 
 
-def _visits(series: Series) -> Mapping[str, Any] | None:
-    sides = list(filter(None, (draw_visits(h, series.bids_dir) for h in series.measured)))
-    return {"sides": sides} if sides else None
-
-
 def _view(series: Series) -> Mapping[str, Any] | None:
     names = subfields_of(series.measured)
     scenes = [scene_of(h, series.view(h), names) for h in series.hemispheres]
@@ -445,7 +439,6 @@ SECTIONS: tuple[Section[Series], ...] = tuple(
         ("status", "Hemispheres", _sides),
         ("numbers", "Key numbers", _key_numbers),
         ("sheet", "Unfolded maps", _sheets),
-        ("visits", "Visits on one sheet", _visits),
         ("view", "Three dimensions", _view),
         ("profiles", "Profiles", _profiles),
         ("quality", "Quality", _quality_numbers),

@@ -26,7 +26,7 @@ from hipsta_bids.geometry.sampling import ScalarVolume
 from hipsta_bids.inputs.search import Candidate, find_anatomy
 from hipsta_bids.io import files, gifti, volumes
 from hipsta_bids.io.volumes import LabelImage, read_grid, read_labels, read_scalars
-from hipsta_bids.joints import find_measurements, load
+from hipsta_bids.joints import find_columns, load
 from hipsta_bids.protocols import body_ends
 from hipsta_bids.protocols.load import load_protocol, protocol_names
 from hipsta_bids.protocols.protocol import Protocol
@@ -208,12 +208,8 @@ class Hemisphere:
         words = ("subfield", "valid", "repaired", "doubtful")
         columns = read_sheet(self.result.path("sheet"), words=words)
         subfield, valid, repaired, doubtful = (columns.pop(name) for name in words)
-        for measurement in find_measurements():
-            columns |= load(measurement.columns)(self)
-        if self.record.get("visits") and self.result.path("change").exists():
-            path, hemi = self.result.path("change"), self.result.name.hemi
-            change = gifti.read_map(path, "thickness_change", hemi).values
-            columns["thickness_change"] = change.reshape(valid.shape)
+        for place in find_columns():
+            columns |= {name: v.reshape(valid.shape) for name, v in load(place)(self).items()}
         return SheetTable(
             columns=columns,
             subfield=subfield.astype(np.str_),

@@ -72,11 +72,24 @@ class ExtendedSettings(SettingsTable):
 
     @classmethod
     def extended(cls, further: Mapping[str, type[SettingsTable]]) -> type[Self]:
-        """Return the class with further tables, by name, at their defaults."""
-        fields: dict[str, Any] = {name: (kind, kind()) for name, kind in further.items()}
+        """Return the class with further tables, by name, at their defaults.
+
+        A table of a name that exists adds its settings to that table.
+        """
+        fields: dict[str, Any] = {}
+        for name, addition in further.items():
+            core: Any = cls.model_fields[name].annotation if name in cls.model_fields else None
+            kind: Any = addition if core is None else _joined(core, addition)
+            fields[name] = kind, kind()
         return create_model(
             cls.__name__, __base__=cls, __module__=cls.__module__, __doc__=cls.__doc__, **fields
         )
+
+
+def _joined(core: type[SettingsTable], addition: type[SettingsTable]) -> type[SettingsTable]:
+    """Return the class of a table with the settings of two."""
+    about = {"__module__": core.__module__, "__doc__": core.__doc__}
+    return create_model(core.__name__, __base__=(core, addition), **about)  # type: ignore[call-overload, no-any-return]  # of keywords in a mapping
 
 
 def _odd(value: int) -> int:

@@ -3,7 +3,8 @@
 import sys
 
 import pytest
-from stand_ins import stand_in_job
+from input_cases import put_visits, said_of
+from stand_ins import stand_in_jobs
 
 from hipsta_bids.api.datasets import load
 from hipsta_bids.cli import main
@@ -19,7 +20,7 @@ def _measured(monkeypatch):
     for name in ("hipsta_bids.inputs.labels", "hipsta_bids.participant.measure"):
         monkeypatch.setitem(sys.modules, name, None)  # put back afterwards
     monkeypatch.setattr(
-        runner, "run_jobs", lambda _, jobs: ((job, stand_in_job(job)) for job in jobs)
+        runner, "run_jobs", lambda _, jobs: ((job, stand_in_jobs(job)) for job in jobs)
     )
 
 
@@ -188,12 +189,6 @@ def test_where_labels_come_from(tmp_path, capsys):
             ]
 
 
-def said_of(capsys, *arguments, code=ExitCode.OK):
-    assert main.main([str(word) for word in arguments]) == code
-    said = capsys.readouterr()
-    return said.out + said.err
-
-
 def test_what_a_name_must_not_decide_is_a_question(tmp_path, capsys):
     command = (tmp_path / "bids", tmp_path / "out", "participant", "--no-reports")
     for dataset in ("a", "b"):
@@ -253,16 +248,6 @@ def test_a_part_notes_its_own_participants_without_labels(tmp_path, capsys):
     assert notes == [[f"note: no segmentation found for {text}"] for text in numbers]
 
 
-def put_visits(root, *names, sides="lr"):
-    for name in names:
-        for side in sides:
-            path = (
-                root / "derivatives/freesurfer" / name / f"mri/{side}h.hippoAmygLabels-T1.v22.mgz"
-            )
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_text(f"use {name} {side}")
-
-
 def test_sessions_of_the_dataset_are_named_where_none_matches(tmp_path, capsys):
     put_visits(tmp_path / "bids", "sub-01_ses-m00", "sub-01_ses-m12", "sub-02_ses-m12")
     command = (tmp_path / "bids", tmp_path / "out", "participant", "--session-label")
@@ -273,24 +258,6 @@ def test_sessions_of_the_dataset_are_named_where_none_matches(tmp_path, capsys):
     text = said_of(capsys, *command, "baseline", code=ExitCode.NOTHING_TO_DO)
     assert "2 sessions (m00, m12)" in text
     assert "did you mean" not in text
-
-
-def test_a_dry_run_counts_common_sheets(tmp_path, capsys):
-    put_visits(tmp_path / "bids", "sub-01_ses-1", "sub-01_ses-2", "sub-02_ses-1", "sub-02_ses-3")
-    put_visits(tmp_path / "bids", "sub-01_ses-3", sides="r")
-    command = (tmp_path / "bids", tmp_path / "out", "participant", "--dry-run")
-    text = said_of(capsys, *command, "--longitudinal")
-    several = "sheets of several visits: 4 of 2 participants"
-    assert f"{several} (sub-01 ses-1 ses-2 ses-3, sub-02 ses-1 ses-3)\n" in text
-    assert "a single visit" not in text
-    put_visits(tmp_path / "bids", *(f"sub-1{n}_ses-1" for n in range(7)))
-    put_visits(tmp_path / "bids", "sub-03_ses-1")
-    put_visits(tmp_path / "bids", "sub-03_ses-2", sides="l")
-    text = said_of(capsys, *command, "--longitudinal")
-    assert "sheets of several visits: 5 of 3 participants (sub-01" in text
-    assert "sheets of a single visit: 15 of 8 participants (sub-03 ses-1, sub-10 ses-1" in text
-    assert "sub-14 ses-1, ...)\n" in text
-    assert "sheets of" not in said_of(capsys, *command)
 
 
 @pytest.mark.parametrize("is_relative", [False, True])

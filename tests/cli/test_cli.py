@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from extension_marks import PRESENT, needs
-from stand_ins import make_input, stand_in_job
+from stand_ins import make_input, stand_in_jobs
 
 from hipsta_bids import __version__
 from hipsta_bids.cli import main
@@ -400,7 +400,7 @@ def stand_in_run(monkeypatch, tmp_path):
     for name in ("hipsta_bids.inputs.labels", "hipsta_bids.participant.measure"):
         monkeypatch.setitem(sys.modules, name, None)  # put back afterwards
     monkeypatch.setattr(
-        runner, "run_jobs", lambda _, jobs: ((job, stand_in_job(job)) for job in jobs)
+        runner, "run_jobs", lambda _, jobs: ((job, stand_in_jobs(job)) for job in jobs)
     )
     return ["x", str(tmp_path / "out"), "participant"]
 

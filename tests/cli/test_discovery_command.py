@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from stand_ins import make_input, stand_in_job
+from stand_ins import make_input, stand_in_jobs
 
 from hipsta_bids.cli import main
 from hipsta_bids.derivatives.dataset import read_status
@@ -26,7 +26,7 @@ def measured(monkeypatch):
     for name in ("hipsta_bids.inputs.labels", "hipsta_bids.participant.measure"):
         monkeypatch.setitem(sys.modules, name, None)  # put back afterwards
     monkeypatch.setattr(
-        runner, "run_jobs", lambda _, jobs: ((job, stand_in_job(job)) for job in jobs)
+        runner, "run_jobs", lambda _, jobs: ((job, stand_in_jobs(job)) for job in jobs)
     )
 
 

@@ -73,28 +73,6 @@ def test_damaged_settings_are_other_settings(tmp_path, damage):
         dataset.settle_settings(tmp_path, Settings())
 
 
-@pytest.mark.parametrize(
-    ("before", "now", "advice"),
-    [
-        ("person", "visit", "with --longitudinal; add --longitudinal"),
-        ("shared", "visit", "with --longitudinal shared; add --longitudinal shared"),
-        ("visit", "shared", "without --longitudinal; omit it"),
-        ("person", "shared", "with --longitudinal auto; use --longitudinal auto"),
-        ("shared", "person", "with --longitudinal shared; use --longitudinal shared"),
-    ],
-)
-def test_folders_name_the_option_that_they_were_made_with(tmp_path, before, now, advice):
-    dataset.settle_settings(tmp_path, Settings().changed(sheet={"frame": before}))
-    settings = Settings().changed(sheet={"frame": now})
-    with pytest.raises(SettingsError) as refusal:
-        dataset.settle_settings(tmp_path, settings)
-    advice = f"{tmp_path}: this folder was made {advice}, or choose another output folder"
-    assert str(refusal.value) == advice
-    with pytest.raises(SettingsError) as refusal:
-        dataset.settle_settings(tmp_path, settings.changed(grid={"spacing": 0.5}))
-    assert str(refusal.value).startswith(f"{advice} (other settings: grid.spacing was ")
-
-
 def test_settings_that_are_gone_are_those_of_another_version(tmp_path):
     earlier = {"hash": "0", "version": "0.0.9", "settings": {"body": {"plane_tilt": 10.0}}}
     files.write_json(tmp_path / "desc-settings.json", earlier)

@@ -71,7 +71,7 @@ def test_all_names_differ():
 
 def test_texts_of_outputs_have_no_leftovers():
     described = {output.key for output in (*OUTPUTS, *EXTRA_OUTPUTS)}
-    surfaces = {"surface", "unfold", "template_surface"}  # of three surfaces each
+    surfaces = {"surface", "unfold"}  # of three surfaces each
     assert TEXTS["outputs"].keys() - described == surfaces
 
 

@@ -4,13 +4,14 @@ from dataclasses import dataclass
 from itertools import permutations
 
 import numpy as np
+from grids import straight_grid
 from scipy import ndimage
 
 from hipsta_bids.geometry.body import Body, extract_body
 from hipsta_bids.geometry.boundaries import Boundaries, find_boundaries
 from hipsta_bids.geometry.ends import EndPlane, EndPlanes
 from hipsta_bids.geometry.fem import Laplace, volume_laplace
-from hipsta_bids.geometry.grid import Field, WedgeGrid, resample_body
+from hipsta_bids.geometry.grid import Field, resample_body
 from hipsta_bids.geometry.mesh import extract_surface, tetrahedralize
 from hipsta_bids.geometry.sheet import sample_sheet, solve_coordinates
 from hipsta_bids.geometry.topology import SolidField, repair_topology
@@ -113,19 +114,6 @@ def straight_ends(length, *, tilt=0.0):
         anterior=EndPlane(np.array([0.0, 0.0, length]), normal, "labels"),
         axis=middle / np.linalg.norm(middle),
         half_slice=0.0,
-    )
-
-
-def straight_grid(shape, spacing=0.5):
-    """A working grid without tilt: node (a, b, w) lies at ``spacing`` (a, b, w) mm."""
-    return WedgeGrid(
-        shape=shape,
-        spacing=spacing,
-        origin=np.zeros(3),
-        across=np.eye(3)[:2],
-        axis=np.array([0.0, 0.0, 1.0]),
-        posterior=np.zeros(3),
-        anterior=np.array([spacing * (shape[2] - 1), 0.0, 0.0]),
     )
 
 

@@ -4,7 +4,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from geometry_cases import box_mesh, field_of, ribbon_mask, short_phantom, straight_grid
+from geometry_cases import box_mesh, field_of, ribbon_mask, short_phantom
+from grids import straight_grid
 from scipy import sparse
 
 from hipsta_bids.errors import GeometryError

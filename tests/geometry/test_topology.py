@@ -5,7 +5,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from geometry_cases import field_of, ribbon_mask, solid_of, straight_grid
+from geometry_cases import field_of, ribbon_mask, solid_of
+from grids import straight_grid
 from scipy import ndimage
 
 from hipsta_bids.errors import GeometryError
@@ -422,3 +423,10 @@ def test_fills_across_the_axis_cost_more_away_from_the_ends():
         assert factor == (membranes.ACROSS_FACTOR if dear else 1)
     assert membranes._implausibility("fill", across[:, [0, 2, 1]], solid) == 1
     assert membranes._implausibility("fill", across[:3], solid) == 1
+
+
+def test_changes_beyond_the_end_planes_are_known():
+    nodes = membranes.FIRST + np.array([[4, 4, level] for level in (2, 3, 16, 17)])
+    field = SimpleNamespace(beyond=3, grid=SimpleNamespace(shape=(9, 9, 20)))
+    between = topology._between_planes(membranes.Edit("cut", nodes), field)
+    assert between.tolist() == [False, True, True, False]

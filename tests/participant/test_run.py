@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from stand_ins import THICKNESS, make_input, stand_in_job, thread_job
+from stand_ins import THICKNESS, make_input, stand_in_jobs, thread_jobs
 
 from hipsta_bids.cli.console import summary_line
 from hipsta_bids.derivatives.dataset import COLUMNS, read_status
@@ -28,7 +28,7 @@ def stand_ins(monkeypatch):
     """No geometry: it is faster."""
     for name in ("hipsta_bids.inputs.labels", "hipsta_bids.participant.measure"):
         monkeypatch.setitem(sys.modules, name, None)  # put back afterwards
-    monkeypatch.setattr(runner, "run_job", stand_in_job)
+    monkeypatch.setattr(runner, "run_alone", stand_in_jobs)
     monkeypatch.setattr(runner, "warm_up", None)
 
 
@@ -405,7 +405,7 @@ def test_limits_on_workers(options, n_jobs, expected):
 
 @pytest.mark.usefixtures("workers")
 def test_workers_have_one_thread_and_the_scratch_folder(tmp_path, monkeypatch):
-    monkeypatch.setattr(runner, "run_job", thread_job)
+    monkeypatch.setattr(runner, "run_alone", thread_jobs)
     monkeypatch.setenv("OMP_NUM_THREADS", "7")
     run([make_input(tmp_path / "in")], tmp_path / "out", work_dir=tmp_path)
     seen = json.loads((tmp_path / "out" / "seen.json").read_text())
@@ -419,13 +419,13 @@ import sys
 from pathlib import Path
 sys.path.insert(0, {tests!r})
 if __name__ == "__main__":
-    from stand_ins import make_input, stand_in_job
+    from stand_ins import make_input, stand_in_jobs
     from hipsta_bids.cli import main as cli
     from hipsta_bids.participant import run as runner
     from hipsta_bids.settings import Settings
     # Ignored where the tests run in the background of a shell.
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    runner.run_job, runner.warm_up = stand_in_job, None
+    runner.run_alone, runner.warm_up = stand_in_jobs, None
     where = Path({where!r})
     items = [make_input(where / "in", f"{{k:02d}}", act="slow") for k in range(9)]
     def run(arguments):

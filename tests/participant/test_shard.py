@@ -5,7 +5,7 @@ import sys
 from dataclasses import replace
 
 import pytest
-from stand_ins import make_input, stand_in_job
+from stand_ins import make_input, stand_in_jobs
 
 from hipsta_bids.cli import main
 from hipsta_bids.derivatives.dataset import read_status, read_table, table_path, update_status
@@ -94,7 +94,9 @@ def command(monkeypatch, tmp_path):
     monkeypatch.setattr(search, "dataset_notes", lambda *_: ())
     for name in ("hipsta_bids.inputs.labels", "hipsta_bids.participant.measure"):
         monkeypatch.setitem(sys.modules, name, None)  # put back afterwards
-    monkeypatch.setattr(run, "run_jobs", lambda _, jobs: ((job, stand_in_job(job)) for job in jobs))
+    monkeypatch.setattr(
+        run, "run_jobs", lambda _, jobs: ((job, stand_in_jobs(job)) for job in jobs)
+    )
 
     def call(out, level, *options):
         return main.main(["x", str(tmp_path / out), level, *options])

@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 
 import pytest
-from stand_ins import make_input, stand_in_job
+from stand_ins import make_input, stand_in_jobs
 
 from hipsta_bids.derivatives.dataset import read_status
 from hipsta_bids.io.files import locked
@@ -22,10 +22,10 @@ RUN = """
 import sys
 from pathlib import Path
 sys.path.insert(0, {tests!r})
-from stand_ins import make_input, stand_in_job
+from stand_ins import make_input, stand_in_jobs
 from hipsta_bids.participant import run as runner
 from hipsta_bids.settings import Settings
-runner.run_job, runner.warm_up = stand_in_job, None
+runner.run_alone, runner.warm_up = stand_in_jobs, None
 where = Path(sys.argv[1])
 items = [make_input(where / "in", f"{{k:02d}}", act="slow") for k in range(6)]
 result = runner.run_participants(
@@ -84,7 +84,7 @@ def test_an_input_that_vanishes_fails_alone(tmp_path, monkeypatch):
     def vanish(_plan, jobs):
         for job in jobs:
             items[1].files[0].unlink(missing_ok=True)
-            yield job, stand_in_job(job)
+            yield job, stand_in_jobs(job)
 
     monkeypatch.setattr(runner, "run_jobs", vanish)
 
@@ -97,7 +97,7 @@ def test_an_input_that_vanishes_fails_alone(tmp_path, monkeypatch):
     rows = read_status(tmp_path / "out")
     assert [row["reason"] for row in rows] == ["n/a", "unreadable-file", "n/a"]
     items[1].files[0].write_text("ok")
-    monkeypatch.setattr(runner, "run_jobs", lambda _, jobs: ((j, stand_in_job(j)) for j in jobs))
+    monkeypatch.setattr(runner, "run_jobs", lambda _, jobs: ((j, stand_in_jobs(j)) for j in jobs))
     assert run().exit_code == 0
 
 
@@ -141,7 +141,7 @@ def test_a_lost_worker_does_not_undo_what_another_run_did(tmp_path, monkeypatch,
 
     def lose(_plan, jobs):
         for job in jobs:
-            stand_in_job(job)  # as the other run does
+            stand_in_jobs(job)  # as the other run does
             yield job, WorkerLost(timed_out=True, exit_code=-9, seconds=1.0)
 
     for name in ("hipsta_bids.inputs.labels", "hipsta_bids.participant.measure"):

@@ -9,6 +9,7 @@ import shutil
 import nibabel as nib
 import numpy as np
 import pytest
+from extension_marks import needs
 from page_outline import Outline
 
 from hipsta_bids.cli import main
@@ -166,10 +167,11 @@ PUBLISHED_METHOD = {group: dict(values) for group, values in PUBLISHED.items()}
     ("changes", "options"),
     [
         ({}, ""),
-        ({"sheet": {"frame": "person"}}, " --longitudinal"),
-        (
+        pytest.param({"sheet": {"frame": "person"}}, " --longitudinal", marks=needs("visits")),
+        pytest.param(
             {"sheet": {"frame": "shared"}, "grid": {"spacing": 0.5}},
             " --longitudinal shared --settings FILE",
+            marks=needs("visits"),
         ),
         ({"grid": {"spacing": 0.5}}, " --settings FILE"),
         (PUBLISHED_METHOD, " --method published"),

@@ -6,7 +6,6 @@ from hipsta_bids.joints import Command, Extension, Page
 COMPARISON = "comparison.json"
 EXTENSION = Extension(
     package=__name__,
-    has_templates=True,
     meaning="Compare finished analyses with each other, with published numbers, or by maps.",
     commands=(
         Command(

@@ -4,7 +4,6 @@ from hipsta_bids.joints import Command, Extension, Part
 
 EXTENSION = Extension(
     package=__name__,
-    has_templates=True,
     meaning="Combine results and norms of several sites, without values of participants.",
     commands=(
         Command(
@@ -15,9 +14,9 @@ EXTENSION = Extension(
             meaning="combine summaries of sites (group level)",
         ),
     ),
-    group_settings=(
-        ("exchange", "hipsta_bids.stats.settings:ExchangeSettings"),
-        ("meta", f"{__name__}.settings:MetaSettings"),
+    settings=(
+        ("group", "exchange", "hipsta_bids.stats.settings:ExchangeSettings"),
+        ("group", "meta", f"{__name__}.settings:MetaSettings"),
     ),
     parts=(
         Part(

@@ -34,11 +34,9 @@ EXTENSION = Extension(
             },
         ),
     ),
-    group_settings=(
-        ("norms", f"{__name__}.settings:NormSettings"),
-        ("exchange", "hipsta_bids.stats.settings:ExchangeSettings"),
+    settings=(
+        ("group", "norms", f"{__name__}.settings:NormSettings"),
+        ("group", "exchange", "hipsta_bids.stats.settings:ExchangeSettings"),
     ),
-    has_columns=True,
     sections=f"{__name__}.page:SECTIONS",
-    has_templates=True,
 )

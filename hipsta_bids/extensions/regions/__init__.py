@@ -19,5 +19,4 @@ EXTENSION = Extension(
         Region(name="headbody", measure=_MEASURE),
         Region(name="whole", measure=_MEASURE, meaning="with head and tail"),
     ),
-    has_texts=True,
 )

@@ -34,8 +34,6 @@ EXTENSION = Extension(
             },
         ),
     ),
-    group_settings=(("harmonization", f"{__name__}.settings:HarmonizationSettings"),),
-    has_columns=True,
+    settings=(("group", "harmonization", f"{__name__}.settings:HarmonizationSettings"),),
     sections=f"{__name__}.page:SECTIONS",
-    has_templates=True,
 )

@@ -14,9 +14,8 @@ EXTENSION = Extension(
             meaning="measure thickness in single slices to check maps",
         ),
     ),
-    participant_settings=(("surrogate", f"{__name__}.settings:SurrogateSettings"),),
+    settings=(("participant", "surrogate", f"{__name__}.settings:SurrogateSettings"),),
     addition=f"{__name__}.groups:describe_groups",
     figures=f"{__name__}.groups:list_figures",
     sections=f"{__name__}.page:SECTIONS",
-    has_texts=True,
 )

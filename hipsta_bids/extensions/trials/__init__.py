@@ -17,11 +17,9 @@ EXTENSION = Extension(
             settings=f"{__name__}.options:given_settings",
         ),
     ),
-    group_settings=(
-        ("retest", f"{__name__}.settings:RetestSettings"),
-        ("power", f"{__name__}.settings:PowerSettings"),
+    settings=(
+        ("group", "retest", f"{__name__}.settings:RetestSettings"),
+        ("group", "power", f"{__name__}.settings:PowerSettings"),
     ),
-    has_columns=True,
     sections=f"{__name__}.page:SECTIONS",
-    has_templates=True,
 )

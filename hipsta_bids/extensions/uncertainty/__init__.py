@@ -17,6 +17,5 @@ EXTENSION = Extension(
             pictures=f"{__name__}.page:draw_spread",
         ),
     ),
-    participant_settings=(("uncertainty", f"{__name__}.settings:UncertaintySettings"),),
-    has_texts=True,
+    settings=(("participant", "uncertainty", f"{__name__}.settings:UncertaintySettings"),),
 )

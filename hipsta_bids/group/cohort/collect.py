@@ -18,12 +18,13 @@ from hipsta_bids.derivatives.outliers import FEWEST, TEXT
 from hipsta_bids.derivatives.results import ResultPlace, list_results, read_record
 from hipsta_bids.errors import InputError, MissingFileError, NothingToDoError
 from hipsta_bids.group.cohort.covariates import relocate
+from hipsta_bids.group.cohort.data import Grid
 from hipsta_bids.group.cohort.exclusions import SHOWN, Choices, Condition, fulfilled
 from hipsta_bids.group.cohort.quality import OUTLIER
 from hipsta_bids.io import files
 from hipsta_bids.io.files import checked_foreign
 from hipsta_bids.protocols.toml import settings_hash
-from hipsta_bids.settings import Settings, SheetSettings
+from hipsta_bids.settings import Settings
 from hipsta_bids.stats.formula import listed
 from hipsta_bids.types import PARTICIPANT, SESSION, Decision, VisitKey
 
@@ -115,7 +116,7 @@ def exclude_visits(table: pd.DataFrame, left_out: Mapping[str, tuple[str, str]])
 class Collection:
     """Results found, by hemisphere."""
 
-    grid: SheetSettings
+    grid: Grid
     """Of the sheets."""
     settings_hash: str
     """Of all settings of the participant level."""
@@ -141,9 +142,7 @@ def collect_sheets(request: GroupRequest, *, may_lack: bool = False) -> Collecti
     places = [result for result in results if result.name.region == request.region]
     notes = _other_regions(results, request)
     if may_lack and not places:
-        return Collection(
-            grid=SheetSettings(), settings_hash=settings_hash(Settings()), notes=notes
-        )
+        return Collection(grid=Grid(), settings_hash=settings_hash(Settings()), notes=notes)
     seg = _one_protocol(places, results, request)
     places = [result for result in places if result.name.seg == seg]
     _refuse_twice(places)
@@ -462,22 +461,22 @@ def _refuse_several_sheets(records: Iterable[SheetRecord]) -> None:
         )
 
 
-def _shared_sheets(grid: SheetSettings) -> tuple[str, ...]:
+def _shared_sheets(grid: Grid) -> tuple[str, ...]:
     """Note that all visits of a participant share a sheet."""
     if grid.frame == "visit":
         return ()
     return ("all visits of a participant share a sheet (participant --longitudinal)",)
 
 
-def grid_of(root: Path) -> SheetSettings:
+def grid_of(root: Path) -> Grid:
     """Read the grid of the sheets of an output dataset."""
     path = root / DATASET_FILES["settings"]
     settings = files.read_json(path).get("settings")
     grid = settings.get("sheet") if isinstance(settings, Mapping) else None
     if isinstance(grid, Mapping):  # other versions may have had more settings
-        grid = {name: grid[name] for name in SheetSettings.model_fields if name in grid}
+        grid = {name: grid[name] for name in Grid.model_fields if name in grid}
     try:
-        return checked_foreign(grid, SheetSettings)
+        return checked_foreign(grid, Grid)
     except ValueError as error:
         raise InputError(
             f"{path}: no settings of a sheet: {error}; run the participant level again",

@@ -3,6 +3,7 @@
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 import pandas as pd
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.model import BOTH, Sessions, asymmetry_name
+from hipsta_bids.settings import SheetSettings
 from hipsta_bids.stats.arrays import Bool, Float, Int, SideMaps
 
 
@@ -21,6 +23,13 @@ class Measures:
     """Maps of the sheet, by the names of their columns or by those that a user gave."""
     summaries: tuple[str, ...] | None = None
     """Summary measures; ``None`` for all."""
+
+
+class Grid(SheetSettings):
+    """The grid of the sheets of an output dataset."""
+
+    frame: Literal["visit", "person", "shared"] = "visit"
+    """Whose sheet it is; all but the first are shared by the visits of a participant."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -13,7 +13,7 @@ from hipsta_bids.errors import InputError, did_you_mean
 from hipsta_bids.geometry.catalog import MAPS, why_impossible
 from hipsta_bids.geometry.sheet import sheet_levels
 from hipsta_bids.group.cohort.collect import Exclusion, SheetRecord
-from hipsta_bids.group.cohort.data import Cohort, Measures
+from hipsta_bids.group.cohort.data import Cohort, Grid, Measures
 from hipsta_bids.protocols import EXPERIMENTAL
 from hipsta_bids.settings import SheetSettings
 from hipsta_bids.stats.arrays import MOST_KEPT, Float, SideMaps, blocks
@@ -105,7 +105,7 @@ class Measured(Cohort):
 
 def read_sheets(
     records: Sequence[SheetRecord],
-    grid: SheetSettings,
+    grid: Grid,
     maps: Sequence[str],
     visits: Sequence[VisitKey] | None = None,
     *,

@@ -14,10 +14,9 @@ from hipsta_bids.group.cohort.collect import (
     collect_sheets,
     grid_of,
 )
-from hipsta_bids.group.cohort.data import Cohort
+from hipsta_bids.group.cohort.data import Cohort, Grid
 from hipsta_bids.group.questions.aligning import register_side
 from hipsta_bids.group.settings import GroupSettings
-from hipsta_bids.settings import SheetSettings
 from hipsta_bids.stats.arrays import SideMaps
 
 NX, NY, PEOPLE, VISITS = 41, 5, 8, 2
@@ -82,7 +81,7 @@ def test_participants_are_registered_as_well(cohort):
 
 @pytest.mark.parametrize(("frame", "count"), [("visit", 0), ("person", 1), ("shared", 1)])
 def test_a_note_names_shared_sheets(tmp_path, frame, count):
-    grid = SheetSettings(frame=frame).model_dump()
+    grid = Grid(frame=frame).model_dump()
     (tmp_path / "desc-settings.json").write_text(json.dumps({"settings": {"sheet": grid}}))
     notes = _shared_sheets(grid_of(tmp_path))
     assert len(notes) == count
@@ -90,7 +89,7 @@ def test_a_note_names_shared_sheets(tmp_path, frame, count):
 
 
 def test_datasets_of_earlier_versions_have_separate_sheets(tmp_path):
-    grid = SheetSettings().model_dump()
+    grid = Grid().model_dump()
     del grid["frame"]
     (tmp_path / "desc-settings.json").write_text(json.dumps({"settings": {"sheet": grid}}))
     assert _shared_sheets(grid_of(tmp_path)) == ()

@@ -1,4 +1,4 @@
-"""Visits of a participant that share a sheet, side by side on the same columns."""
+"""Visits of a participant that share a sheet: thickness and its change, side by side."""
 
 from collections.abc import Mapping
 from contextlib import suppress
@@ -8,10 +8,31 @@ from typing import Any
 
 from hipsta_bids.derivatives.names import natural_order
 from hipsta_bids.errors import InputError
-from hipsta_bids.io import files
-from hipsta_bids.reports.display import THICKNESS, THICKNESS_CHANGE
+from hipsta_bids.io import files, gifti
+from hipsta_bids.reports.display import THICKNESS, MapKind
 from hipsta_bids.reports.maps import draw_map
+from hipsta_bids.reports.page import Section
+from hipsta_bids.reports.participant import Series
 from hipsta_bids.reports.results import Hemisphere, find_results
+
+#: Noise is about 0.1 mm.
+THICKNESS_CHANGE = MapKind(
+    column="thickness_change",
+    title="Change of thickness",
+    unit="mm",
+    colors="PRGn",
+    centered=True,
+    digits=3,
+    limits=(-0.3, 0.3),
+)
+
+
+def read_change(hemisphere: Hemisphere) -> Mapping[str, Any]:
+    """Read thickness (Nx, Ny) minus the mean of all visits, by column, where there is one."""
+    path, name = hemisphere.result.path("change"), THICKNESS_CHANGE.column
+    if not hemisphere.record.get("visits") or not path.exists():
+        return {}
+    return {name: gifti.read_map(path, name, hemisphere.result.name.hemi).values}
 
 
 def sharing(hemisphere: Hemisphere) -> list[Hemisphere]:
@@ -67,3 +88,12 @@ def _dates(participant: str, bids_dir: Path | None) -> dict[str, str]:
         dates = {row.get("session_id", ""): row.get("acq_time", "n/a") for row in rows}
         return {name: date for name, date in dates.items() if not files.is_missing(date)}
     return {}
+
+
+def _visits(series: Series) -> Mapping[str, Any] | None:
+    sides = list(filter(None, (draw_visits(h, series.bids_dir) for h in series.measured)))
+    return {"sides": sides} if sides else None
+
+
+#: Sections of the page of a participant.
+SECTIONS = (Section("visits", "Visits on one sheet", "visits.html", _visits, after="sheet"),)

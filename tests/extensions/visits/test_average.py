@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hipsta_bids.geometry.average import VOXEL, average_labels
+from hipsta_bids.extensions.visits.average import VOXEL, average_labels
 from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.settings import SliceSettings
 from hipsta_bids.types import LabelVolume

@@ -8,12 +8,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hipsta_bids.errors import GeometryError
-from hipsta_bids.participant.longitudinal import (
+from hipsta_bids.extensions.visits.common import (
     check_alone,
     find_common,
-    lay_visit,
     make_frame,
-    measure_laid,
+    measure_placed,
+    place_visit,
 )
 from hipsta_bids.participant.measure import measure_hemisphere
 from hipsta_bids.phantom import Phantom, PhantomSpec
@@ -45,8 +45,8 @@ def clock(_stage):
 
 
 def measure_one(frame, number, volume, hemi):
-    laid = lay_visit(frame, number, volume, hemi, clock)
-    return measure_laid(frame, frame.motions[number], volume, laid, clock)
+    placed = place_visit(frame, number, volume, hemi, clock)
+    return measure_placed(frame, frame.motions[number], volume, placed, clock)
 
 
 def measure(volumes, hemi="L", *, shared=False):
@@ -176,16 +176,16 @@ STRANGER = PhantomSpec(kind="s-shape", thickness=2.4, width=13.0, length=14.0)
 def test_a_visit_that_is_refused_does_not_enter_the_mean(thinning, place):
     visits = list(thinning[:2])
     visits.insert(place, draw(STRANGER, POSES[1]))
-    frame, laid = find_common(visits, "L", Settings(), clock, shared=False)
-    assert place not in laid
-    assert len(frame.motions) == len(laid) == 2
+    frame, placed = find_common(visits, "L", Settings(), clock, shared=False)
+    assert place not in placed
+    assert len(frame.motions) == len(placed) == 2
     expected, _ = find_common(thinning[:2], "L", Settings(), clock, shared=False)
     assert np.array_equal(frame.evidence.sheet.points, expected.evidence.sheet.points)
 
 
 def test_visits_that_fit_are_all_on_the_sheet(thinning):
-    frame, laid = find_common(thinning, "L", Settings(), clock, shared=False)
-    maps = measure_laid(frame, frame.motions[1], thinning[1], laid[1], clock)
+    frame, placed = find_common(thinning, "L", Settings(), clock, shared=False)
+    maps = measure_placed(frame, frame.motions[1], thinning[1], placed[1], clock)
     assert np.array_equal(maps.thickness, measure(thinning)[1][1].thickness)
 
 

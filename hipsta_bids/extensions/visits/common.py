@@ -1,6 +1,6 @@
 """All visits of one side of a participant on one sheet: the sheet of their mean labels.
 
-The labels of the visits are aligned and averaged, and the mean is laid out once. So its end planes,
+The labels of the visits are aligned and averaged, and the mean is unfolded once. So its end planes,
 boundaries and coordinates hold for all visits. Each visit has its own walls, which are found along
 the columns of the common sheet.
 """
@@ -14,9 +14,10 @@ import numpy as np
 from nibabel.affines import apply_affine
 
 from hipsta_bids.errors import GeometryError
+from hipsta_bids.extensions.visits import carry
+from hipsta_bids.extensions.visits.align import align
+from hipsta_bids.extensions.visits.average import average_labels
 from hipsta_bids.geometry import catalog, checks, columns, repairs
-from hipsta_bids.geometry.align import align
-from hipsta_bids.geometry.average import average_labels
 from hipsta_bids.geometry.body import Body, check_side, extract_body, relabel_by_mask
 from hipsta_bids.geometry.digital import voxel_points
 from hipsta_bids.geometry.ends import EndPlanes, hippocampal_voxels
@@ -76,7 +77,7 @@ class Frame:
     """The sheet of the mean labels of all visits, and the way from there to each visit."""
 
     evidence: Evidence
-    """The mean, laid out."""
+    """The mean, unfolded."""
     volume: LabelVolume
     """The mean labels."""
     motions: tuple[Float, ...]
@@ -85,14 +86,14 @@ class Frame:
     @cached_property
     def factors(self) -> dict[Tissue, float]:
         """Volume of each subfield over the volume of its cells."""
-        mesh, _ = columns.grid_mesh(self.evidence.whole)
+        mesh, _ = carry.grid_mesh(self.evidence.whole)
         cells = subfield_volumes(mesh, self.evidence.body)
         return {t: v / cells[t] for t, v in self.evidence.volumes.items() if cells.get(t)}
 
     @cached_property
     def edges(self) -> Float:
         """(Ny, 2) where rows leave the body of the mean, mm from the edges of its sheet."""
-        return columns.find_edges(self.evidence.whole, np.eye(4), self.evidence.solid.field)
+        return carry.find_edges(self.evidence.whole, np.eye(4), self.evidence.solid.field)
 
     def ends(self, motion: Float) -> tuple[GivenEnd, ...]:
         """Return the end planes in a visit."""
@@ -168,7 +169,7 @@ def _mean_ends(volumes: Sequence[LabelVolume], motions: Sequence[Float]) -> tupl
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Laid:
+class Placed:
     """A visit on the common sheet, before it is measured."""
 
     image: list[Finding]
@@ -192,7 +193,7 @@ def check_alone(volume: LabelVolume, hemi: str, settings: Settings) -> None:
 
 def find_common(
     volumes: Sequence[LabelVolume], hemi: str, settings: Settings, clock: Clock, *, shared: bool
-) -> tuple[Frame, dict[int, Laid | GeometryError]]:
+) -> tuple[Frame, dict[int, Placed | GeometryError]]:
     """Make the common sheet of the visits that resemble each other, and lay them on it.
 
     Of three visits or more, a refused visit is omitted, of several the one that resembles the
@@ -202,7 +203,7 @@ def find_common(
     relabeled = [relabel_by_mask(volume, settings.body) for volume in volumes]
     while True:
         part = [relabeled[n] for n in numbers]
-        laid: dict[int, Laid | GeometryError] = {}
+        placed: dict[int, Placed | GeometryError] = {}
         try:
             frame = make_frame(part, hemi, settings, clock, shared=shared)
         except GeometryError:
@@ -214,13 +215,13 @@ def find_common(
             motions = list(frame.motions)
             for place, n in enumerate(numbers):
                 try:
-                    laid[n] = lay_visit(frame, place, volumes[n], hemi, clock)
+                    placed[n] = place_visit(frame, place, volumes[n], hemi, clock)
                 except GeometryError as error:
-                    laid[n] = error
-            fit = not any(isinstance(result, GeometryError) for result in laid.values())
+                    placed[n] = error
+            fit = not any(isinstance(result, GeometryError) for result in placed.values())
             if fit or len(numbers) <= _PAIR:
-                return frame, laid
-        refused = [n for n in numbers if not isinstance(laid.get(n), Laid)]
+                return frame, placed
+        refused = [n for n in numbers if not isinstance(placed.get(n), Placed)]
         overlap = _resemblance(part, motions)
         numbers.remove(min(refused, key=lambda n: overlap[numbers.index(n)]))
 
@@ -251,7 +252,7 @@ def _count_in(mask: Bool, affine: Float, points: Float) -> int:
     return int(np.count_nonzero(mask[tuple(voxel[within].T)]))
 
 
-def lay_visit(frame: Frame, number: int, volume: LabelVolume, hemi: str, clock: Clock) -> Laid:
+def place_visit(frame: Frame, number: int, volume: LabelVolume, hemi: str, clock: Clock) -> Placed:
     """Lay the common sheet on a visit; ``number`` is its place in the frame.
 
     GeometryError if its labels cannot be measured, or do not resemble the mean at all.
@@ -266,15 +267,15 @@ def lay_visit(frame: Frame, number: int, volume: LabelVolume, hemi: str, clock: 
         solid = measure.make_solid(field, body, settings)
     with clock("sheet"):
         visit, walls = _carry(frame, motion, solid.field)
-    return Laid(image=image, body=body, side=side, solid=solid, visit=visit, walls=walls)
+    return Placed(image=image, body=body, side=side, solid=solid, visit=visit, walls=walls)
 
 
-def measure_laid(
-    frame: Frame, motion: Float, volume: LabelVolume, laid: Laid, clock: Clock
+def measure_placed(
+    frame: Frame, motion: Float, volume: LabelVolume, placed: Placed, clock: Clock
 ) -> HemisphereMaps:
     """Measure a visit on the common sheet."""
     common, settings = frame.evidence, frame.evidence.settings
-    body, solid, measured, walls = laid.body, laid.solid, laid.visit, laid.walls
+    body, solid, measured, walls = placed.body, placed.solid, placed.visit, placed.walls
     sheet = measured.sheet
     with clock("measures"):
         maps = catalog.measure_maps(measured)
@@ -282,7 +283,7 @@ def measure_laid(
         layers, folded_layers = measure.space_layers(sheet, settings)
         overlap = _overlap(body, frame, motion)
         findings = [
-            *laid.image,
+            *placed.image,
             *checks.check_image(body),
             *checks.check_end_labels(volume, body, settings.checks),
             *measure.check_edits(volume, body, settings),
@@ -304,7 +305,7 @@ def measure_laid(
             body_mask=volume.in_file(body.inside),
             summary=catalog.summarize(measured, for_region(volume.protocol, body.region).sheet),
             qc={
-                **measure.body_metrics(body, laid.side, settings),
+                **measure.body_metrics(body, placed.side, settings),
                 **{f"{end}_end_rule": common.body.ends[end].rule for end in _ENDS},
                 "euler_before": solid.euler_before,
                 "euler_after": solid.euler_after,
@@ -336,10 +337,10 @@ def _carry(frame: Frame, motion: Float, field: Field) -> tuple[_Visit, columns.W
     """
     common, settings = frame.evidence, frame.evidence.settings
     extents = settings.sheet.x_extent, settings.sheet.y_extent
-    edges = columns.find_edges(common.whole, motion, field) - frame.edges
-    edges = columns.smooth_edges(edges, common.whole)
-    inner = columns.move_edges(common.sheet, edges, *extents)
-    whole = columns.move_edges(common.whole, edges, 1.0, 1.0)
+    edges = carry.find_edges(common.whole, motion, field) - frame.edges
+    edges = carry.smooth_edges(edges, common.whole)
+    inner = carry.move_edges(common.sheet, edges, *extents)
+    whole = carry.move_edges(common.whole, edges, 1.0, 1.0)
     walls = columns.find_walls(inner, motion, field)
     valid = common.sheet.valid & walls.known
     if 1 - valid.mean() > settings.sheet.max_filled:
@@ -348,15 +349,15 @@ def _carry(frame: Frame, motion: Float, field: Field) -> tuple[_Visit, columns.W
             "compare the labels of the visits",
             reason="visit-unlike",
         )
-    moves = columns.moves_at(walls.moves, inner, whole, *extents)
-    whole = columns.move_walls(whole, moves, motion)
-    mesh, coordinates = columns.grid_mesh(whole)
+    moves = carry.moves_at(walls.moves, inner, whole, *extents)
+    whole = carry.move_walls(whole, moves, motion)
+    mesh, coordinates = carry.grid_mesh(whole)
     visit = _Visit(
         factors=frame.factors,
         body=frame.body(motion),
         mesh=mesh,
         coordinates=coordinates,
-        sheet=Sheet(points=columns.move_walls(inner, walls.moves, motion).points, valid=valid),
+        sheet=Sheet(points=carry.move_walls(inner, walls.moves, motion).points, valid=valid),
         subfield=common.subfield,
         whole=whole,
         settings=settings,

@@ -1,6 +1,6 @@
 "use strict";
 // One visit at a time in the same place: windows onto the maps that lie side by side below.
-for (const side of document.querySelectorAll(".visits")) {
+for (const side of document.currentScript.parentElement.querySelectorAll(".visits")) {
   const visits = JSON.parse(side.dataset.visits), maps = JSON.parse(side.dataset.maps);
   const step = side.querySelector(".step"), range = step.querySelector("input"), name = step.querySelector("output");
   const crop = (image, pair) => {

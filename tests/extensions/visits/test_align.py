@@ -8,8 +8,8 @@ from nibabel.affines import apply_affine
 from scipy.spatial.transform import Rotation
 
 from hipsta_bids.errors import GeometryError
-from hipsta_bids.geometry import align as alignment
-from hipsta_bids.geometry.align import align
+from hipsta_bids.extensions.visits import align as alignment
+from hipsta_bids.extensions.visits.align import align
 from hipsta_bids.geometry.digital import voxel_points
 from hipsta_bids.phantom import Phantom, PhantomSpec
 from hipsta_bids.protocols.load import load_protocol

@@ -1,4 +1,4 @@
-"""Files of the sheet that all visits of a participant share, above the folders of sessions."""
+"""Files of the sheet that visits share, above the folders of sessions, and of each visit."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -11,6 +11,7 @@ from hipsta_bids.derivatives.results import ResultPlace
 from hipsta_bids.geometry.sheet import is_left_handed
 from hipsta_bids.io import files, gifti
 from hipsta_bids.io.volumes import mask_bytes
+from hipsta_bids.participant.job import Job
 from hipsta_bids.types import BodyMask, Float, Sheet
 
 _SURFACES = ("interior", "midthickness", "exterior")
@@ -56,3 +57,8 @@ def write_change(result: ResultPlace, change: Float, record: Mapping[str, Any]) 
     content = gifti.shape_bytes(change.ravel(), hemi=result.name.hemi, name=name, unit="mm")
     files.write_bytes(result.path("change"), content)
     write_sources(result, record)
+
+
+def has_change(job: Job) -> bool:
+    """Return whether the file of a visit on a common sheet exists."""
+    return job.result.path("change").exists()
