@@ -239,15 +239,9 @@ def test_short_head_and_tail_labels_are_enough(arc):
     assert not any(found.raised for found in check_end_labels(arc.volume, arc.body, CHECKS))
 
 
-@pytest.mark.parametrize(
-    ("depth", "half", "share"),
-    [
-        ([0.5, -0.5], 0.25, 1.0),
-        ([0.5, 1.5, -0.5], 0.25, 0.5),
-        ([0.2, 1.5], 0.5, 0.3 / 1.7),  # one lies on both sides of the plane
-        ([3.0, -3.2], 0.5, 0.3 / 0.5),  # and one partly beyond the reach of 3 mm
-        ([4.0, -4.0], 0.5, 0.0),
-    ],
-)
-def test_voxels_count_on_the_side_of_a_plane_where_they_lie(depth, half, share):
-    assert _share_beyond(np.array(depth), half) == pytest.approx(share)
+def test_voxels_count_on_the_side_of_a_plane_where_they_lie():
+    assert _share_beyond(np.array([0.5, 1.5, -0.5]), 0.25) == pytest.approx(0.5)
+    # A voxel lies on both sides of the plane, or partly beyond the reach of 3 mm.
+    assert _share_beyond(np.array([0.2, 1.5]), 0.5) == pytest.approx(0.3 / 1.7)
+    assert _share_beyond(np.array([3.0, -3.2]), 0.5) == pytest.approx(0.3 / 0.5)
+    assert _share_beyond(np.array([4.0, -4.0]), 0.5) == 0

@@ -62,24 +62,15 @@ def box(size, head=0.0, tail=0.0):
     return points @ TURN.T, parts
 
 
-@pytest.mark.parametrize(
-    ("size", "head", "tail"),
-    [
-        ((6, 20, 4), 0, 0),  # the principal axis, towards anterior
-        ((6, 20, 4), 5, 0),
-        ((6, 20, 4), 0, 5),
-        ((6, 20, 4), 5, 5),
-        ((20, 6, 4), 2, 0),  # wider than long: from end to middle
-        ((20, 6, 4), 0, 2),
-        ((20, 6, 4), 1, 2),
-    ],
-)
-def test_the_long_axis_leads_from_tail_to_head(size, head, tail):
-    points, parts = box(size, head, tail)
-    np.testing.assert_allclose(long_axis(points, parts), TURN @ Y, atol=1e-12)
-    if head or tail:
-        turned = np.array([Part.UNKNOWN, Part.TAIL, Part.UNKNOWN, Part.HEAD])[parts]
-        np.testing.assert_allclose(long_axis(points, turned), -TURN @ Y, atol=1e-12)
+def test_the_long_axis_leads_from_tail_to_head():
+    """By the principal axis, or from end to middle where all is wider than long."""
+    ends = [((6, 20, 4), 0, 0), ((6, 20, 4), 5, 0), ((6, 20, 4), 0, 5), ((6, 20, 4), 5, 5)]
+    for size, head, tail in [*ends, ((20, 6, 4), 2, 0), ((20, 6, 4), 0, 2), ((20, 6, 4), 1, 2)]:
+        points, parts = box(size, head, tail)
+        np.testing.assert_allclose(long_axis(points, parts), TURN @ Y, atol=1e-12)
+        if head or tail:
+            turned = np.array([Part.UNKNOWN, Part.TAIL, Part.UNKNOWN, Part.HEAD])[parts]
+            np.testing.assert_allclose(long_axis(points, turned), -TURN @ Y, atol=1e-12)
 
 
 @pytest.mark.parametrize(("length", "is_long"), [(9, False), (11, True)])
