@@ -109,14 +109,6 @@ def test_the_plane_between_mirror_images_is_the_mirror():
         assert point @ normal == pytest.approx(1.2, abs=1e-6)
 
 
-def test_the_level_of_a_plane_is_taken_within_two_millimeters():
-    plane = EndPlane(np.array([50.0, 1.0, 0]), Y, "user")
-    points = np.array([[2.0, 2.9, 0], [4.0, -0.9, 0], [100.0, 3.1, 0], [100.0, -1.1, 0]])
-    axis = np.array([0.6, 0.8, 0.0])
-    assert ends_mod._level(plane, points, axis) == pytest.approx(0.6 * 3 + 0.8 * 1.0)
-    assert ends_mod._level(plane, points + 20, axis) == pytest.approx(0.6 * 50 + 0.8)
-
-
 @pytest.mark.parametrize("sign", [1, -1])
 def test_normals_of_given_planes_point_along_the_axis(sign):
     end = GivenEnd(end="anterior", point=(1.0, 2.0, 3.0), normal=(0.0, 3.0 * sign, 4.0 * sign))

@@ -430,3 +430,14 @@ def test_changes_beyond_the_end_planes_are_known():
     field = SimpleNamespace(beyond=3, grid=SimpleNamespace(shape=(9, 9, 20)))
     between = topology._between_planes(membranes.Edit("cut", nodes), field)
     assert between.tolist() == [False, True, True, False]
+
+
+def test_a_body_continues_two_nodes_before_and_behind_a_cut_or_beyond_an_end():
+    nodes = np.array([[4, b, 10] for b in range(1, 11)])
+    for first, last, continues in ((8, 12, True), (9, 12, False), (8, 11, False)):
+        solid = np.zeros((9, 12, 16), dtype=bool)
+        solid[4, 1, first : last + 1] = True  # and the node beside it: two of ten
+        assert membranes._continues(nodes, solid) is continues
+        assert not membranes._continues(nodes + np.array([0, 0, 2]), solid)
+    solid[4, 1, 10:14] = True
+    assert membranes._continues(nodes + np.array([0, 0, 2]), solid)
