@@ -45,12 +45,12 @@ class Terms:
         matrix: ModelMatrix,
         table: pd.DataFrame,
         levels: Mapping[str, Sequence[str]],
-        maps: Sequence[str] = (),
+        added: Sequence[str] = (),
     ) -> None:
         self.matrix: Float = np.asarray(matrix, dtype=np.float64)
         self.columns = tuple(str(column) for column in matrix.columns)
-        #: Columns of the design, and those of maps, which only points have.
-        self.names = (*self.columns, *(f"map({name})" for name in maps))
+        #: Columns of the design, and covariates of each hemisphere.
+        self.names = (*self.columns, *added)
         self.spec, self.table, self.levels = matrix.model_spec, table, levels
         self._grids: dict[tuple[tuple[str, object], ...], Float] = {}
 

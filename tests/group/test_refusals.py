@@ -12,21 +12,25 @@ from hipsta_bids.group.output.steps import EXCLUDED, plan_steps
 from hipsta_bids.joints import find_steps
 
 
-def request(*, sessions=None, maps=(), measured=("thickness",), joint=(), method="fdr2"):
+def request(
+    *, sessions=None, maps=(), summaries=(), measured=("thickness",), joint=(), method="fdr2"
+):
     """What the table is asked about; all else of a request does not matter to it."""
     settings = SimpleNamespace(
         multiplicity=SimpleNamespace(method=method), joint=SimpleNamespace(measures=joint)
     )
     return SimpleNamespace(
         settings=settings,
-        model=SimpleNamespace(maps=maps),
+        model=SimpleNamespace(maps=maps, summaries=summaries),
         measures=SimpleNamespace(maps=measured),
         comparison=SimpleNamespace(sessions=sessions or Sessions()),
     )
 
 
 def core_flags():
-    everything = request(maps=("x",), measured=(), joint=("a", "b"), method="permutation-max")
+    everything = request(
+        maps=("x",), summaries=("y",), measured=(), joint=("a", "b"), method="permutation-max"
+    )
     return set(steps._flags(everything))
 
 

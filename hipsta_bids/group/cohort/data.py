@@ -72,6 +72,17 @@ def summary_values(cohort: Cohort, hemi: str, names: Sequence[str] | None = None
     return selected.reindex(cohort.table.index)
 
 
+def covariate_values(cohort: Cohort, hemi: str, names: Sequence[str]) -> pd.DataFrame:
+    """Summary measures that are covariates, by visit: one row per visit, NaN where missing."""
+    if hemi == BOTH:
+        left, right = (covariate_values(cohort, side, names) for side in BOTH)
+        return (left + right) / 2
+    side = cohort.sides[hemi]
+    columns = {name: side.covariates[name][:, 0, 0] for name in names}
+    table = pd.DataFrame(columns, index=cohort.table.index[side.rows])
+    return table.reindex(cohort.table.index)
+
+
 def hemispheres(cohort: Cohort) -> list[str]:
     """Hemispheres that are there, and both together if both are."""
     sides = list(cohort.sides)

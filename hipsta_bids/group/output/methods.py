@@ -197,6 +197,8 @@ def _models(analysis: Analysis, settings: GroupSettings, cite: Callable[[str], s
     )
     if analysis.model.maps:
         text += f" Maps were covariates, with the value of each point {cite('point-covariates')}."
+    if analysis.model.summaries:
+        text += " Summary measures in it were covariates of the same hemisphere."
     if interactions(analysis.model.formula):
         text += (
             " Levels were compared at equal weights of other factors and at the means of covariates"

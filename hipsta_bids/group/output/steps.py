@@ -11,8 +11,10 @@ from hipsta_bids.joints import Step, find_steps, load
 from hipsta_bids.stats.formula import listed
 from hipsta_bids.stats.inference import PERMUTATIONS
 
+#: Flags of covariates of each hemisphere.
+COVARIATES = ("map() in the formula", "summary measures in the formula")
 #: Flags of the core, and those that they exclude; extensions have their own.
-EXCLUDED: Mapping[str, Sequence[str]] = {"map() in the formula": ("summary measures alone",)}
+EXCLUDED: Mapping[str, Sequence[str]] = {COVARIATES[0]: ("summary measures alone",)}
 
 
 def plan_steps(request: Request) -> Request:
@@ -31,7 +33,8 @@ def _flags(request: Request) -> Iterator[str]:
     """Name what the core is asked beyond the default."""
     settings = request.settings
     is_asked = {
-        "map() in the formula": bool(request.model.maps),
+        COVARIATES[0]: bool(request.model.maps),
+        COVARIATES[1]: bool(request.model.summaries),
         "summary measures alone": not request.measures.maps,
         "--correction by permutation": settings.multiplicity.method in PERMUTATIONS,
         "--joint": bool(settings.joint.measures),

@@ -279,7 +279,7 @@ _About = Mapping[MapKey, Mapping[str, Any]]
 def _about_tests(analysis: results.Analysis, settings: GroupSettings) -> _About:
     """Describe tests for the sidecars of their maps."""
     rules, about = settings.multiplicity, {}
-    names = [*analysis.design.columns, *(f"map({name})" for name in analysis.model.maps)]
+    names = [*analysis.design.columns, *analysis.model.added_terms]
     for key, test, discoveries in results.tested_maps(analysis):
         fitted = np.isfinite(test.df)
         df, n = test.df[fitted], analysis.fitted[key.hemi].fits[key.measure].n[fitted]

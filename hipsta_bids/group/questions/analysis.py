@@ -19,6 +19,9 @@ from hipsta_bids.stats.formula import listed
 from hipsta_bids.stats.glm import RowModel, fit_maps, with_mean
 from hipsta_bids.types import PARTICIPANT
 
+#: Measures that are made of a map, besides the ones that begin with its name.
+CONTAINS = {"thickness": ("volume", "surface_volume_ratio")}
+
 
 def analyze_cohort(request: Request) -> Analysis:
     """Register, fit a model at each point and to each summary measure, and classify.
@@ -71,7 +74,8 @@ def design(request: Request) -> Analysis:
         rows.design.contrasts,
         joint=bool(settings.joint.measures),
     )
-    return replace(analysis, design=rows.design, row_model=rows)
+    analysis = replace(analysis, design=rows.design, row_model=rows)
+    return analysis.noted(_parts_of_outcomes(request))
 
 
 def align(analysis: Analysis) -> Analysis:
@@ -100,7 +104,7 @@ def fit(analysis: Analysis) -> Analysis:
     """Fit each hemisphere, and left minus right if asked for, and correct for many points."""
     request, analysis = analysis.request, extend("adjust", analysis)
     maps, comparison, rows = request.measures.maps, request.comparison, analysis.row_model
-    compared = data.compare_sessions(analysis.cohort, comparison.sessions, request.model.maps)
+    compared = data.compare_sessions(analysis.cohort, comparison.sessions, request.model.added)
     fitted = {
         hemi: fit_maps(hemi, side.only(maps), rows)
         for hemi, side in each("models", list(compared.sides.items()) if maps else [])
@@ -204,6 +208,17 @@ def _check_covariates(request: Request) -> None:
         raise ModelError(
             f"map({outcomes[0]}) in the formula explains itself; choose other maps by --measures"
         )
+
+
+def _parts_of_outcomes(request: Request) -> list[str]:
+    """Note covariates that contain what the maps measure."""
+    return [
+        f"{name} in the formula contains {measure}: effects are local, at equal {name}; for effects"
+        f" on a hemisphere remove {name}"
+        for name in request.model.summaries
+        for measure in request.measures.maps
+        if name.startswith((f"{measure}_", *CONTAINS.get(measure, ())))
+    ]
 
 
 def _check_margins(matrix: Design, cohort: data.Cohort, measures: data.Measures) -> None:

@@ -9,6 +9,7 @@ import pandas as pd
 
 from hipsta_bids.derivatives import dataset
 from hipsta_bids.derivatives.analyses import GroupResults
+from hipsta_bids.errors import ModelError
 from hipsta_bids.group import model as modeling
 from hipsta_bids.group.cohort import collect
 from hipsta_bids.group.cohort.data import SHEET
@@ -85,7 +86,13 @@ def _request(study: studies.Study) -> tuple[Mapping[str, Any], Request]:
         study.settings,
         comparison=options.comparison,
         visits=study.time,
+        summaries={str(name) for side in cohort.sides.values() for name in side.summary.columns},
     )
+    if model.summaries and len(study.cohorts) > 1:
+        raise ModelError(
+            f"{model.summaries[0]} in the formula: maps of other programs have no summary measures;"
+            " remove one"
+        )
     request = Request(
         cohort=cohort,
         model=model,
@@ -165,7 +172,7 @@ def _write(
 
     measures = modeling.wanted_measures(options.model, options.measures)
     return study.write_folder(
-        folder_name(analysis.model.formula, measures) + options.comparison.sessions.suffix,
+        folder_name(analysis.model.text, measures) + options.comparison.sessions.suffix,
         notes=notes,
         counts=(analysis.n_participants, len(exclusions)),
         fill=fill,
