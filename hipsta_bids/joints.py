@@ -110,11 +110,11 @@ class Step:
     places: Mapping[str, str] = field(default_factory=dict)
     """Functions of an analysis and the plan, which return the analysis, by place of the line:
     ``design`` (after it), ``adjust`` (registered maps, before sessions are compared), ``score``
-    (after the fit), ``classify`` (before it)."""
+    (after the fit), ``summarize`` (after the fit of summary measures), ``classify`` (before it)."""
     blocks: Mapping[str, str] = field(default_factory=dict)
     """Functions that yield parts of results, by place: ``tables``, ``figures``, ``files``,
     ``methods`` (before the model), ``methods-after`` (after it), ``record``, ``source`` (of
-    labels that a plan rests on)."""
+    labels that a plan rests on), ``columns`` (meanings, by column of tables of tests)."""
 
 
 @dataclass(frozen=True, kw_only=True)
