@@ -55,7 +55,7 @@ def methods(analysis: Analysis, cite: Callable[[str], str]) -> Iterator[str]:
 
 
 def percent_of(
-    reference: PointTest, other: PointTest, difference: PointTest, confidence: float
+    reference: PointTest, group: PointTest, difference: PointTest, confidence: float
 ) -> dict[str, Float]:
     """Compute the percent difference from the reference's mean, with limits (Fieller 1954).
 
@@ -63,7 +63,7 @@ def percent_of(
     gives the covariance of the means. NaN where the reference's mean is not positive; limits are
     NaN where they are unbounded, because this mean may be zero.
     """
-    (r,), (a,), (r_se,), (a_se,) = reference.estimate, other.estimate, reference.se, other.se
+    (r,), (a,), (r_se,), (a_se,) = reference.estimate, group.estimate, reference.se, group.se
     squared = stdtrit(difference.df, (1 + confidence) / 2) ** 2
     covariance = (r_se**2 + a_se**2 - difference.se[0] ** 2) / 2
     # Limits are the ratios q at which a - q r is t standard errors from zero.
@@ -112,13 +112,13 @@ def _means_of(analysis: Analysis, groups: Groups) -> tuple[dict[str, tuple[str, 
     """Return reference and other mean by the contrast of both, and the model of these means."""
     levels = analysis.design.levels
     cells = {f"{factor}[{level}]" for factor in levels for level in levels[factor]}
-    first, *others = (f"{groups.column}[{level}]" for level in groups.levels)
+    first, *compared = (f"{groups.column}[{level}]" for level in groups.levels)
     defaults = map(texts.parse_contrast, map(texts.contrast_json, groups.contrasts()))
     pairs = {
         spec.name: pair
         for spec in analysis.model.contrasts or defaults
         for pair in (spec.conditions, spec.conditions[::-1])
-        if pair[1:] in [(pair[0].replace(first, other),) for other in others]
+        if pair[1:] in [(pair[0].replace(first, cell),) for cell in compared]
         and cells.issuperset(texts.split_name(pair[0])[0])
     }
     names = dict.fromkeys(chain.from_iterable(pairs.values()))
@@ -138,12 +138,11 @@ def _with_percent(
     """Add percent differences to the tests whose weights are of the difference of two means."""
     mean_of, tests = {test.contrast.name: test for test in means.tests}, list(fit.tests)
     for i, test in enumerate(fit.tests):
-        if test.contrast.name not in pairs:
-            continue
-        first, other = (mean_of[name] for name in pairs[test.contrast.name])
-        weights = first.contrast.weights - other.contrast.weights
-        if np.allclose(np.abs(weights), np.abs(test.contrast.weights)):
-            percent = percent_of(first, other, test, confidence)
-            further = {name: np.where(is_positive, v, np.nan) for name, v in percent.items()}
-            tests[i] = replace(test, further={**test.further, **further})
+        if test.contrast.name in pairs:
+            first, second = (mean_of[name] for name in pairs[test.contrast.name])
+            weights = np.abs(first.contrast.weights - second.contrast.weights)
+            if np.allclose(weights, np.abs(test.contrast.weights)):
+                percent = percent_of(first, second, test, confidence)
+                columns = {name: np.where(is_positive, v, np.nan) for name, v in percent.items()}
+                tests[i] = replace(test, further={**test.further, **columns})
     return replace(fit, tests=tuple(tests))
