@@ -20,6 +20,7 @@ from hipsta_bids.stats.arrays import Bool, Float
 from hipsta_bids.stats.design import build_design
 from hipsta_bids.stats.formula import ModelSpec
 from hipsta_bids.stats.glm import PointTest, PointwiseFit, fit_maps
+from hipsta_bids.stats.grammar import closed_formula
 
 #: Units of measures whose means are positive: lengths, areas and volumes.
 _UNITS = ("mm", "mm^2", "mm^3")
@@ -32,9 +33,10 @@ def is_asked(request: Request) -> bool:
 
 def choose_groups(request: Request) -> Groups:
     """Return the groups; ModelError without, and for changes, whose mean may be zero."""
-    if request.groups is None or request.comparison.sessions.later:
-        raise ModelError(f"--{NAME} needs groups, and not --paired; remove it")
-    return request.groups
+    groups, terms = request.groups, closed_formula(request.model.formula).names
+    if groups is None or groups.column not in terms or request.comparison.sessions.later:
+        raise ModelError(f"--{NAME} needs groups in the model, and not --paired; remove it")
+    return groups
 
 
 def meaning(groups: Groups) -> Iterator[Mapping[str, str]]:  # noqa: ARG001  (as of all steps)

@@ -258,8 +258,17 @@ def test_mixed_models(sessions, random):
         np.testing.assert_allclose(1 + written[COLUMNS].loc[point] / 100, expected, rtol=1e-4)
 
 
+REFUSAL = "--percent needs groups in the model, and not --paired; remove it"
+
+
+def test_a_model_without_groups_is_refused(dataset, capsys):
+    command = [*map(str, dataset), "group", *ADDED]
+    assert main([*command, "--formula", "age", "--contrast", "age"]) == 65
+    assert REFUSAL in capsys.readouterr().err
+
+
 @needs("repeated")
 def test_changes_are_refused(sessions, capsys):
     command = [*map(str, sessions), "group", *ADDED]
     assert main([*command, "--paired", "1", "3"]) == 65
-    assert "--percent needs groups, and not --paired; remove it" in capsys.readouterr().err
+    assert REFUSAL in capsys.readouterr().err
