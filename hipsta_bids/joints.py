@@ -113,12 +113,14 @@ class Step:
     places: Mapping[str, str] = field(default_factory=dict)
     """Functions of an analysis and the plan, which return the analysis, by place of the line:
     ``design`` (after it), ``adjust`` (registered maps, before sessions are compared), ``score``
-    (after the fit), ``classify`` (before it). Of ``surfaces``, the last place, functions take and
-    return the analyses of all surfaces, by name."""
+    (after the fit), ``summarize`` (after the fit of summary measures), ``classify`` (before it). Of
+    ``surfaces``, the last place, functions take and return the analyses of all surfaces, by
+    name."""
     blocks: Mapping[str, str] = field(default_factory=dict)
     """Functions that yield parts of results, by place: ``tables``, ``figures``, ``files``,
     ``methods`` (before the model), ``methods-model`` (after it), ``methods-after`` (at the end),
-    ``record``, ``source`` (of labels that a plan rests on)."""
+    ``record``, ``source`` (of labels that a plan rests on), ``columns`` (meanings, by column of
+    tables of tests)."""
 
 
 @dataclass(frozen=True, kw_only=True)

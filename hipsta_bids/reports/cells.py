@@ -122,7 +122,11 @@ def effect_text(row: Mapping[str, Any]) -> str:
     if row["measure"] == JOINT:
         return str(row["measures"])
     limits = f"{number_text(row['effect_low'])} to {number_text(row['effect_high'])}"
-    return f"{effect_name(row['effect'])} {number_text(row['effect_size'])} ({limits})"
+    text = f"{effect_name(row['effect'])} {number_text(row['effect_size'])} ({limits})"
+    if np.isfinite(row.get("percent", np.nan)):
+        percent, low, high = (number_text(row[f"percent{end}"]) for end in ("", "_low", "_high"))
+        text += f"; {percent} % ({low} to {high})"
+    return text
 
 
 def _size(row: Mapping[str, Any]) -> str:

@@ -51,6 +51,8 @@ class PointTest:
     """(points,) partial: share of the variance that the covariates leave."""
     eta_squared_limits: Float
     """(2, points)"""
+    further: Mapping[str, Float] = field(default_factory=dict)
+    """(points,) effect sizes of extensions, by column of tables."""
 
     @property
     def kind(self) -> str:

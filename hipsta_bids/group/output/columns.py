@@ -91,6 +91,7 @@ def effect_columns(test: PointTest) -> dict[str, str | Float]:
         "effect_size": test.effect,
         "effect_low": limits[0],
         "effect_high": limits[1],
+        **test.further,
     }
 
 
@@ -110,6 +111,7 @@ def point_columns(
         "eta_squared": test.eta_squared,
         "eta_squared_low": test.eta_squared_limits[0],
         "eta_squared_high": test.eta_squared_limits[1],
+        **test.further,
     }
 
 

@@ -7,6 +7,7 @@ import os
 import re
 import shutil
 import warnings
+from collections import ChainMap
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from importlib.util import find_spec
@@ -25,7 +26,7 @@ from hipsta_bids.group.output.demographics import demographics_of
 from hipsta_bids.group.output.figures import draw_figures
 from hipsta_bids.group.output.methods import methods_text
 from hipsta_bids.group.output.shapes import AverageShape
-from hipsta_bids.group.output.steps import blocks
+from hipsta_bids.group.output.steps import blocks, plan_blocks
 from hipsta_bids.group.output.style import KINDS, Drawing, encode
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.io import files, gifti
@@ -88,12 +89,14 @@ def write_results(
 ) -> None:
     """Write tables, maps and text; cohorts and analyses are by surface."""
     cohort, analysis = cohorts[SHEET], analyses[SHEET]
+    meaning = dict(ChainMap(*plan_blocks("columns", analysis.request), dict(tables.COLUMNS)))
     for surface in cohorts:
         tables_of_surface = tables.result_tables(
             surface, cohorts[surface], analyses[surface], settings, averages
         )
         for name, table in tables_of_surface:
-            write_table(folder, name, tables.with_references(table, analysis))
+            described = tables.with_references(table, analysis)
+            write_table(folder, name, described, meaning=meaning)
         _write_further(folder, surface, cohorts[surface], analyses[surface])
     if analysis.found:
         overview = tables.overview_table(analysis.found)
@@ -257,6 +260,7 @@ def stats_of(tested: Iterable[tuple[MapKey, PointTest, Discoveries]]) -> dict[Ma
             test.kind: test.statistic,
             **({"d": test.cohen_d} if test.kind == "t" else {"eta2": test.eta_squared}),
             "pcorrected": discoveries.adjusted,
+            **{stat: test.further[stat] for stat in _MAP_TYPES if stat in test.further},
         }
         for key, test, discoveries in tested
     }
@@ -269,6 +273,7 @@ _MAP_TYPES = {
     "d": ("Other", "Cohen's d"),
     "eta2": ("Other", "partial eta squared"),
     "pcorrected": ("P", "p-value, corrected for the number of points"),
+    "percent": ("Other", "difference in percent of the mean of the reference group"),
 }
 _About = Mapping[MapKey, Mapping[str, Any]]
 

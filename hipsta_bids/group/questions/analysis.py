@@ -48,7 +48,7 @@ def analyze_points(cohort: data.Cohort, analysis: Analysis) -> Analysis:
         compared=cohort,
         classified=cohort,
     )
-    return replace(extend("score", fit(of_points)), skipped=())
+    return replace(extend("summarize", extend("score", fit(of_points))), skipped=())
 
 
 def design(request: Request) -> Analysis:
@@ -169,7 +169,7 @@ def summarize(analysis: Analysis) -> Analysis:
     if maps:
         terms = listed(f"map({name})" for name in maps)
         notes.append(f"summary measures are not tested: {terms} has values at points only")
-    return replace(analysis, measures=measures).noted(notes)
+    return extend("summarize", replace(analysis, measures=measures).noted(notes))
 
 
 def classify(analysis: Analysis) -> Analysis:
