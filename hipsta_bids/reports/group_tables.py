@@ -12,7 +12,7 @@ from scipy import stats
 from hipsta_bids.derivatives.analyses import GroupResults, records, short_contrast, without_effects
 from hipsta_bids.joints import find_sessions, load
 from hipsta_bids.reports import cells
-from hipsta_bids.types import DIFFERENCE, FAMILY, JOINT, SIDES, p_text
+from hipsta_bids.types import DIFFERENCE, FAMILY, JOINT, REGION, SIDES, p_text
 
 _ALPHA = 0.05  # of tests of summary measures and of models, for a word only
 _LEAST_SHARE = 0.01  # share of a map; what survives in less of it is no finding of the same rank
@@ -242,6 +242,17 @@ def slope_of(results: GroupResults, contrast: str) -> str:
     return variable[0] if len(variable) == 1 and variable != ("Intercept",) else ""
 
 
+def family_of(contrast: str, measure: str) -> tuple[str, str]:
+    """Return the family of a test: its contrast, and the map of a mean over a region."""
+    return contrast, measure.partition(REGION)[0] if REGION in measure else ""
+
+
+def families_of(measures: pd.DataFrame) -> pd.Series:
+    """Return the family of each test of summary measures."""
+    pairs = map(family_of, measures["contrast"], measures["measure"])
+    return pd.Series(list(pairs), index=measures.index, dtype=object)
+
+
 def letters_of(measures: pd.DataFrame) -> dict[str, str]:
     """Give letters to the models of summary measures, if there are several."""
     models = measures["model"].unique().tolist() if len(measures) else []
@@ -374,7 +385,8 @@ def summaries(results: GroupResults) -> Mapping[str, Any] | None:
         "rows": records(table[low]),
         "more": records(table[~low]),
         "alpha": _ALPHA,
-        "families": table["contrast"].nunique(),
+        "regional": bool(table["measure"].str.contains(REGION).any()),
+        "families": families_of(table).nunique(),
         "letters": letters_of(results.table("measures")),
         "slopes": _slopes(results, table),
         "repeated": bool((table["visits"] > table["n"]).any()),
