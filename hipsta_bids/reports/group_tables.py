@@ -242,17 +242,6 @@ def slope_of(results: GroupResults, contrast: str) -> str:
     return variable[0] if len(variable) == 1 and variable != ("Intercept",) else ""
 
 
-def family_of(contrast: str, measure: str) -> tuple[str, str]:
-    """Return the family of a test: its contrast, and the map of a mean over a region."""
-    return contrast, measure.partition(REGION)[0] if REGION in measure else ""
-
-
-def families_of(measures: pd.DataFrame) -> pd.Series:
-    """Return the family of each test of summary measures."""
-    pairs = map(family_of, measures["contrast"], measures["measure"])
-    return pd.Series(list(pairs), index=measures.index, dtype=object)
-
-
 def letters_of(measures: pd.DataFrame) -> dict[str, str]:
     """Give letters to the models of summary measures, if there are several."""
     models = measures["model"].unique().tolist() if len(measures) else []
@@ -385,8 +374,8 @@ def summaries(results: GroupResults) -> Mapping[str, Any] | None:
         "rows": records(table[low]),
         "more": records(table[~low]),
         "alpha": _ALPHA,
-        "regional": bool(table["measure"].str.contains(REGION).any()),
-        "families": families_of(table).nunique(),
+        "regions": bool(table["measure"].str.contains(REGION).any()),
+        "families": table["contrast"].nunique(),
         "letters": letters_of(results.table("measures")),
         "slopes": _slopes(results, table),
         "repeated": bool((table["visits"] > table["n"]).any()),

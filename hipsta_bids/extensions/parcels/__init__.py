@@ -8,7 +8,7 @@ EXTENSION = Extension(
     package=__name__,
     meaning="Test means of maps over regions of the sheet.",
     sources=(
-        Source(options=f"{__name__}.options:add_options", make=f"{__name__}.options:make_sources"),
+        Source(options=f"{__name__}.options:add_options", make=f"{__name__}.means:make_sources"),
     ),
     addition=f"{__name__}.means:prepare_tables",
     figures=f"{__name__}.figures:list_figures",

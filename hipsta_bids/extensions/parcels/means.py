@@ -1,5 +1,6 @@
 """Means of maps over regions of each participant's sheet, before registration."""
 
+import argparse
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -9,31 +10,36 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from hipsta_bids.errors import InputError, UsageError
+from hipsta_bids.errors import InputError
 from hipsta_bids.extensions.parcels import EXTENSION, SUBFIELDS, THIRDS
 from hipsta_bids.group.cohort.data import Cohort
 from hipsta_bids.group.cohort.read import THICKNESS
 from hipsta_bids.group.cohort.sources import Reading, Search, Source
+from hipsta_bids.group.model import asymmetry_name
 from hipsta_bids.group.output.results import Analysis
 from hipsta_bids.group.output.tables import read_columns
 from hipsta_bids.group.output.write import write_table
 from hipsta_bids.group.questions.study import Study
 from hipsta_bids.inputs.maps import read_regions
 from hipsta_bids.joints import Writer
-from hipsta_bids.stats.arrays import Bool, Float, Int, SideMaps
+from hipsta_bids.stats.arrays import Bool, SideMaps
+from hipsta_bids.stats.formula import left_side
 from hipsta_bids.types import PARTICIPANT, REGION, SESSION, VisitKey
 
-_THIRDS = ("posterior", "middle", "anterior")
+_ASYMMETRY = asymmetry_name("")
+_ENDS = ("posterior", "middle", "anterior")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Regions(Source):
-    """Regions of the sheet, and the maps whose means are summary measures."""
+    """Regions of the sheet, and maps whose means over these are summary measures."""
 
     choice: str
-    """``subfields``, ``subfields-axis``, or a table of nodes."""
-    measures: tuple[str, ...]
-    """Names that are asked for; of the default maps, thickness is taken."""
+    """``subfields``, ``subfields-axis``, or a file of nodes."""
+    maps: tuple[str, ...]
+    """As asked for; without, thickness."""
+    asymmetry: bool = False
+    """Whether left minus right is a summary measure, too."""
 
     @property
     def record(self) -> Mapping[str, Any]:
@@ -42,86 +48,80 @@ class Regions(Source):
 
     def find(self, search: Search) -> tuple[Source, set[VisitKey]]:
         """Choose the maps."""
-        maps = [name for name in self.measures or (THICKNESS,) if name in search.maps]
-        return replace(self, measures=tuple(maps or sorted(search.maps))), set()
+        maps = [name for name in self.maps or (THICKNESS,) if name in search.maps]
+        return replace(self, maps=tuple(maps or sorted(search.maps))), set()
 
     def add(self, reading: Reading) -> Reading:
-        """Add means over regions to the summary measures."""
-        measured = reading.measured
-        means = {
-            hemi: {
-                f"{measure}{REGION}{region}": mean
-                for measure, region, mean, _ in measure_regions(side, self.choice, self.measures)
-            }
-            for hemi, side in measured.sides.items()
-        }
-        names = list(dict.fromkeys(name for side in means.values() for name in side))
-        if not names:
-            raise UsageError(
-                f"--regions {self.choice}: no map or subfield of the sheets; name a map by"
-                " --measures, or a table with x, y, region"
+        """Add the means to the summary measures."""
+        sides, units = reading.measured.sides, dict(reading.measured.units)
+        tables = {}
+        for hemi, side in sides.items():
+            means = measure_regions(side, self.choice, self.maps)
+            columns = {f"{name}{REGION}{region}": mean for name, region, mean, _ in means}
+            tables[hemi] = pd.DataFrame(columns, index=side.rows)
+        if not any(len(table.columns) for table in tables.values()):
+            raise InputError(
+                f"--regions {self.choice}: the sheets have no map or no subfield for it"
             )
-        _check_names(self.choice, names, means)
-        sides = {
-            hemi: side.with_summary(pd.DataFrame(means[hemi]))
-            for hemi, side in measured.sides.items()
-        }
-        units = {name: measured.units.get(name.partition(REGION)[0], "1") for name in names}
-        measured = replace(measured, sides=sides, units={**measured.units, **units})
-        return replace(reading, measured=measured)
+        empty = pd.concat(tables).isna().all()
+        if self.choice not in {SUBFIELDS, THIRDS} and empty.any():
+            raise InputError(f"{self.choice}: {empty.idxmax()} has no value on any sheet")
+        if self.asymmetry and len(tables) > 1:
+            difference = tables["L"] - tables["R"]
+            difference.columns = difference.columns.str.replace(REGION, _ASYMMETRY + REGION, n=1)
+            tables = {hemi: table.join(difference) for hemi, table in tables.items()}
+        for name in {str(name) for table in tables.values() for name in table}:
+            units[name] = units.get(name.partition(REGION)[0].removesuffix(_ASYMMETRY), "1")
+        sides = {hemi: side.with_summary(tables[hemi]) for hemi, side in sides.items()}
+        return replace(reading, measured=replace(reading.measured, sides=sides, units=units))
 
     def sentences(self, maps: Sequence[str], surfaces: Sequence[str]) -> Iterator[str]:  # noqa: ARG002  (of all)
         """Describe the means."""
-        regions = {SUBFIELDS: "its subfields", THIRDS: "thirds of its subfields"}
-        where = regions.get(self.choice, "regions drawn on the grid")
-        yield f"Means over {where} were taken on each sheet, before registration."
+        kinds = {SUBFIELDS: "its subfields", THIRDS: "thirds of its subfields along the long axis"}
+        yield (
+            f"Means over {kinds.get(self.choice, 'drawn regions')} were taken on each sheet, before"
+            " registration. The false discovery rate of their tests was controlled over regions and"
+            " sides, for each map and contrast."
+        )
 
 
-def _check_names(
-    choice: str, names: Sequence[str], means: Mapping[str, Mapping[str, Float]]
-) -> None:
-    """Refuse regions of a table without any value, and names that differ in case only."""
-    lower = [name.casefold() for name in names]
-    for name in names if choice not in {SUBFIELDS, THIRDS} else ():
-        measure, _, region = name.partition(REGION)
-        if lower.count(name.casefold()) > 1:
-            raise InputError(f"{choice}: two regions are called {region}, but for case; rename one")
-        if not any(np.isfinite(side[name]).any() for side in means.values() if name in side):
-            raise InputError(f"{choice}: no sheet has {measure} in region {region}; draw it anew")
+def make_sources(parsed: argparse.Namespace) -> tuple[Source, ...]:
+    """Return the regions that the option names."""
+    if not parsed.regions:
+        return ()
+    maps = tuple(parsed.measures) or left_side(parsed.formula or "")
+    return (Regions(choice=parsed.regions, maps=maps, asymmetry=parsed.asymmetry),)
 
 
 def find_regions(side: SideMaps, choice: str) -> Iterator[tuple[str, Bool]]:
-    """Find the nodes of regions: of subfields (sheets, x, y), of a table (1, x, y).
+    """Find nodes of regions: of a participant's subfields (sheets, x, y), of a file (1, x, y).
 
-    Thirds are rows of nodes from posterior to anterior, in equal numbers as far as possible.
+    Thirds have rows of nodes in equal numbers, as far as possible.
     """
     if choice not in {SUBFIELDS, THIRDS}:
         regions = read_regions(Path(choice), side.shape)
         yield from zip(regions.names, regions.member[:, None], strict=True)
         return
-    third = np.arange(side.shape[1]) * len(_THIRDS) // side.shape[1]
-    for number, name in enumerate(side.names):
-        nodes = side.subfield[:] == number
+    third = np.arange(side.shape[1]) * len(_ENDS) // side.shape[1]
+    for number, subfield in enumerate(side.names):
+        name, nodes = subfield.replace("/", "_"), side.subfield[:] == number
+        ends = enumerate(_ENDS if choice == THIRDS else ())
+        yield from ((f"{name}_{end}", nodes & (third == i)) for i, end in ends)
         if choice == SUBFIELDS:
             yield name, nodes
-            continue
-        for part, end in enumerate(_THIRDS):
-            yield f"{name}_{end}", nodes & (third == part)
 
 
 def measure_regions(
-    side: SideMaps, choice: str, measures: Sequence[str]
-) -> Iterator[tuple[str, str, Float, Int]]:
-    """Return measure, region, means (sheets,) over nodes with a value, and the nodes' numbers."""
+    side: SideMaps, choice: str, maps: Sequence[str]
+) -> Iterator[tuple[str, str, Any, Any]]:
+    """Return map, region, mean (sheets,) over nodes with a value, and the number of these nodes."""
     for region, nodes in find_regions(side, choice):
-        for measure in measures:
-            if measure in side.maps:
-                values = side.maps[measure]
-                known = np.isfinite(values) & nodes
-                count = known.sum(axis=(1, 2))
-                total = values.sum(axis=(1, 2), dtype=np.float64, where=known)
-                mean = np.where(count > 0, total / np.maximum(count, 1), np.nan)
-                yield measure, region, mean, count
+        for name in (name for name in maps if name in side.maps):
+            values = side.maps[name]
+            valid = nodes & np.isfinite(values)
+            count = valid.sum(axis=(1, 2))
+            total = values.sum(axis=(1, 2), dtype=np.float64, where=valid)
+            yield name, region, np.divide(total, count, where=count > 0, out=total * np.nan), count
 
 
 def prepare_tables(study: Study, analysis: Analysis) -> tuple[Writer, list[str]]:  # noqa: ARG001  (of all)
@@ -132,44 +132,26 @@ def prepare_tables(study: Study, analysis: Analysis) -> tuple[Writer, list[str]]
 
 def _write(folder: Path, *, cohort: Cohort, choices: Sequence[str]) -> None:
     for choice in choices:
-        for name, rows in (("regions", _mean_rows), ("region_nodes", _node_rows)):
-            parts = [rows(cohort, hemi, choice) for hemi in cohort.sides]
-            table = pd.concat(parts, ignore_index=True)
+        for name, make in (("regions", _mean_rows), ("region_nodes", _node_rows)):
+            rows = [part for hemi in cohort.sides for part in make(cohort, hemi, choice)]
+            table = pd.concat(rows, ignore_index=True)
             write_table(folder, name, table, meaning=read_columns(EXTENSION.package))
 
 
-def _mean_rows(cohort: Cohort, hemi: str, choice: str) -> pd.DataFrame:
-    """List means by region and visit; the columns of summary measures name their maps."""
+def _mean_rows(cohort: Cohort, hemi: str, choice: str) -> Iterator[pd.DataFrame]:
+    """List means by region and visit; the names of summary measures have the maps."""
     side = cohort.sides[hemi]
-    visits = cohort.table.iloc[side.rows]
-    names = [str(name).partition(REGION) for name in side.summary.columns]
-    measures = list(dict.fromkeys(measure for measure, is_region, _ in names if is_region))
-    parts = [
-        pd.DataFrame(
-            {
-                PARTICIPANT: visits[PARTICIPANT].to_numpy(),
-                SESSION: visits[SESSION].to_numpy(),
-                "hemi": hemi,
-                "region": region,
-                "measure": measure,
-                "unit": cohort.units.get(measure, "1"),
-                "mean": mean,
-                "n_nodes": count,
-            }
-        )
-        for measure, region, mean, count in measure_regions(side, choice, measures)
-    ]
-    return pd.concat(parts, ignore_index=True)
+    visits = cohort.table.iloc[side.rows][[PARTICIPANT, SESSION]].assign(hemi=hemi)
+    names = [str(name).partition(REGION) for name in side.summary]
+    maps = dict.fromkeys(name for name, is_region, _ in names if is_region)
+    for name, region, mean, count in measure_regions(side, choice, list(maps)):
+        yield visits.assign(region=region, measure=name, mean=mean, n_nodes=count)
 
 
-def _node_rows(cohort: Cohort, hemi: str, choice: str) -> pd.DataFrame:
-    """List the nodes with the region that most sheets have there; the first of equals."""
+def _node_rows(cohort: Cohort, hemi: str, choice: str) -> Iterator[pd.DataFrame]:
+    """List nodes with the region that most sheets have there, the first of equals."""
     side = cohort.sides[hemi]
-    names, counts = [""], [np.zeros(side.shape, dtype=np.int64)]
-    for name, nodes in find_regions(side, choice):
-        names.append(name)
-        counts.append(nodes.sum(axis=0))
-    x, y = np.indices(side.shape)
-    region = np.array(names, dtype=object)[np.argmax(counts, axis=0)]
-    columns = {"node_x": x.ravel() + 1, "node_y": y.ravel() + 1, "region": region.ravel()}
-    return pd.DataFrame({"hemi": hemi, **columns})
+    counts = {name: nodes.sum(axis=0).ravel() for name, nodes in find_regions(side, choice)}
+    table = pd.DataFrame({"": np.zeros(np.prod(side.shape), dtype=np.int64), **counts})
+    x, y = np.indices(side.shape).reshape(2, -1) + 1
+    yield pd.DataFrame({"hemi": hemi, "node_x": x, "node_y": y, "region": table.idxmax(axis=1)})

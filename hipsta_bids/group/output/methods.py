@@ -16,7 +16,7 @@ from hipsta_bids.group.output.steps import blocks
 from hipsta_bids.group.output.tables import opposite_notes
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.protocols import EXPERIMENTAL
-from hipsta_bids.reports.group_tables import demographic_tests, family_of
+from hipsta_bids.reports.group_tables import demographic_tests
 from hipsta_bids.stats import inference
 from hipsta_bids.stats.clusters import TFCE_EXTENT, TFCE_HEIGHT
 from hipsta_bids.stats.contrasts import Contrast
@@ -229,17 +229,12 @@ def _effect_sizes(analysis: Analysis, settings: GroupSettings, cite: Callable[[s
         f" limits from non-central distributions {cite('steiger')}."
     )
     if analysis.measures:
-        families = {
-            family_of(test.contrast.name, name)
-            for names, fit, _ in analysis.measures.values()
-            for test in fit.tests
-            for name in names
-        }
-        regions = ", of means over regions by map" * any(name for _, name in families)
+        tests = [test for _, fit, _ in analysis.measures.values() for test in fit.tests]
+        n_families = len({test.contrast.name for test in tests})
         text += (
             f" Summary measures were tested with the same model{sizes}. Their false discovery"
-            f" rate was controlled over all measures, sides and models of a contrast{regions}"
-            f" (families of tests: {len(families)})."
+            " rate was controlled over all measures, sides and models of a contrast (families of"
+            f" tests: {n_families})."
         )
     return text
 

@@ -15,7 +15,7 @@ from hipsta_bids.group.output import columns, results
 from hipsta_bids.group.output.columns import find_clusters, frame_of
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.reports import cells
-from hipsta_bids.reports.group_tables import families_of, opposite_changes
+from hipsta_bids.reports.group_tables import opposite_changes
 from hipsta_bids.stats.arrays import Float, describe_known
 from hipsta_bids.stats.classify import ClassifierResult
 from hipsta_bids.stats.clusters import edges_of
@@ -23,7 +23,7 @@ from hipsta_bids.stats.formula import file_label
 from hipsta_bids.stats.glm import FittedMaps, PointTest
 from hipsta_bids.stats.inference import Discoveries, MapKey, PermutationTest, control_fdr
 from hipsta_bids.stats.registration import Registration
-from hipsta_bids.types import JOINT, PARTICIPANT, SESSION, p_text
+from hipsta_bids.types import JOINT, PARTICIPANT, REGION, SESSION, p_text
 
 Named = tuple[str, pd.DataFrame]
 """File name without extension, and table."""
@@ -225,10 +225,15 @@ def _measures(cohort: Cohort, analysis: results.Analysis) -> Iterator[Columns]:
 
 
 def with_fdr(table: pd.DataFrame, settings: GroupSettings) -> pd.DataFrame:
-    """Correct the tests of a family (:func:`families_of`) for their number."""
+    """Correct the tests of one contrast for the number of measures, sides and models.
+
+    Means of one map over regions are a family of their own.
+    """
     rules = settings.multiplicity
     method = "bh" if rules.method == "bh" else "fdr2"
-    for _, rows in table.groupby(families_of(table), sort=False):
+    parts = table["measure"].str.partition(REGION)
+    maps = parts[0].where(parts[1] == REGION, "")
+    for _, rows in table.groupby(["contrast", maps], sort=False):
         discoveries = control_fdr(rows["p"].to_numpy(dtype=np.float64), rules.alpha, method)
         one_sided = rows["alternative"].notna() if "alternative" in rows else False
         floor = np.where(one_sided, rows["p"], 0.0)  # see Discoveries.at_least
