@@ -5,6 +5,6 @@
 
 #: Folders, in the order of the help.
 NAMES = (
-    *("repeated", "sites", "consortia", "trials", "norms", "agreement", "maps", "parcels"),
-    *("visits", "regions", "uncertainty", "surrogate", "export"),
+    *("combination", "repeated", "sites", "consortia", "trials", "norms", "agreement", "maps"),
+    *("parcels", "visits", "regions", "uncertainty", "surrogate", "export"),
 )

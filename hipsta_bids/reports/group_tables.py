@@ -10,7 +10,7 @@ import pandas as pd
 from scipy import stats
 
 from hipsta_bids.derivatives.analyses import GroupResults, records, short_contrast, without_effects
-from hipsta_bids.joints import find_sessions, load
+from hipsta_bids.joints import find_sessions, load, load_all
 from hipsta_bids.reports import cells
 from hipsta_bids.types import DIFFERENCE, FAMILY, JOINT, REGION, SIDES, p_text
 
@@ -94,7 +94,7 @@ def findings(results: GroupResults) -> Mapping[str, Any] | None:
         "classification": list(_classification(results)),
         "method": multiplicity.get("method"),
         "alpha": multiplicity.get("alpha"),
-        "joint": _joint(settings),
+        "further": [part for make in load_all("findings") if (part := make(results))],
     }
 
 
@@ -125,17 +125,6 @@ def side_words(hypothesis: str) -> str:
     """Write the alternative of a one-sided test: ``> -0.05`` as *above*, with the margin."""
     sign, margin = hypothesis.split()
     return f"{'above' if sign == '>' else 'below'} {margin.replace('-', cells.MINUS)}"
-
-
-def _joint(settings: Mapping[str, Any]) -> dict[str, Any] | None:
-    """Say what was tested together."""
-    joint = settings.get("joint") or {}
-    if not joint.get("measures"):
-        return None
-    names = [cells.display_name(str(name)) for name in joint["measures"]]
-    sides = ["on the left", "on the right"] if joint.get("sides") else []
-    title = " and ".join(names) + (f", {' and '.join(sides)}," if sides else "")
-    return {**joint, "what": title, "permutations": settings["multiplicity"]["permutations"]}
 
 
 def _side(results: GroupResults, row: Mapping[str, Any]) -> dict[str, Any]:

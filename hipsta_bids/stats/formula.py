@@ -326,7 +326,7 @@ def columns_of(
                 "exclude these participants, or harmonize anew"
             )
         variables[name] = pd.Categorical(variables[name], categories=list(levels_of))
-    if text := [name for name in names if name not in levels and variables[name].dtype == object]:
+    if text := sorted({*names} - {*levels, *variables.select_dtypes("number")}):
         raise ModelError(f"{source}{listed(text)} should be numbers, as where it was made")
     matrix = Formula(closed.text).get_model_matrix(
         variables, na_action="raise", context=dict(CONTEXT)

@@ -240,7 +240,7 @@ class Terms:
         the square.
         """
         places = self._columns_of(frozenset([variable]))
-        if variable not in self.table or len(places) < 2:  # noqa: PLR2004 -- a line is one
+        if variable not in {*self.table} - {*self.levels} or len(places) < 2:  # noqa: PLR2004
             raise ModelError(
                 f"contrast {contrast!r}: {variable!r} is in the formula as a line at most; write it"
                 f" as poly({variable}, 2) or cr({variable}, df=3)"

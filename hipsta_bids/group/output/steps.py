@@ -5,6 +5,7 @@ from dataclasses import replace
 from typing import Any
 
 from hipsta_bids.errors import ModelError
+from hipsta_bids.group.cohort.data import SHEET
 from hipsta_bids.group.output.results import Analysis
 from hipsta_bids.group.request import Request
 from hipsta_bids.joints import Step, find_steps, load
@@ -37,7 +38,6 @@ def _flags(request: Request) -> Iterator[str]:
         COVARIATES[1]: bool(request.model.summaries),
         "summary measures alone": not request.measures.maps,
         "--correction by permutation": settings.multiplicity.method in PERMUTATIONS,
-        "--joint": bool(settings.joint.measures),
     }
     yield from (flag for flag, answer in is_asked.items() if answer)
     yield from request.comparison.sessions.excludes()
@@ -53,6 +53,15 @@ def extend(place: str, analysis: Analysis) -> Analysis:
         if place in step.places:
             analysis = load(step.places[place])(analysis, analysis.request.plans[step.name])
     return analysis
+
+
+def extend_surfaces(analyses: Mapping[str, Analysis]) -> Mapping[str, Analysis]:
+    """Pass the analyses of all surfaces, by name, through what extensions do with all of them."""
+    plans = analyses[SHEET].request.plans
+    for step in _active(analyses[SHEET].request):
+        if "surfaces" in step.places:
+            analyses = load(step.places["surfaces"])(analyses, plans[step.name])
+    return analyses
 
 
 def blocks(place: str, request: Request, *values: object) -> Iterator[Any]:

@@ -27,7 +27,6 @@ from hipsta_bids.group.output.methods import methods_text
 from hipsta_bids.group.output.shapes import AverageShape
 from hipsta_bids.group.output.steps import blocks
 from hipsta_bids.group.output.style import KINDS, Drawing, encode
-from hipsta_bids.group.output.tables import JointMap, joint_peaks, joint_points
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.io import files, gifti
 from hipsta_bids.progress import tell
@@ -35,7 +34,7 @@ from hipsta_bids.stats.arrays import Float, return_memory
 from hipsta_bids.stats.arrays import blocks as split_rows
 from hipsta_bids.stats.glm import FittedMaps, PointTest
 from hipsta_bids.stats.inference import Discoveries, MapKey
-from hipsta_bids.types import FAMILY, JOINT, PARTICIPANT, SESSION
+from hipsta_bids.types import FAMILY, PARTICIPANT, SESSION
 
 _LOGGER = logging.getLogger(__name__)
 
@@ -82,7 +81,6 @@ def write_results(
     exclusions: Sequence[Exclusion],
     *,
     averages: tables.Averages,
-    joint: Sequence[JointMap] = (),
     region: str = "body",
     ratings: Mapping[str, int] | None = None,
     labels: Mapping[str, list[str]],
@@ -120,9 +118,8 @@ def write_results(
         _write_surfaces(folder, cohorts[surface], of_surface)
         tests = stats_of(results.tested_maps(of_surface))
         write_stats(folder, tests, _about_tests(of_surface, settings))
-    for write in blocks("files", analysis.request, cohorts, analyses, labels):
+    for write in blocks("files", analysis.request, cohorts, analyses, labels, averages):
         write(folder)
-    _write_joint(folder, joint, settings, averages)
     text = methods_text(
         cohort,
         analysis,
@@ -322,36 +319,6 @@ def write_stats(folder: Path, maps: Mapping[MapKey, _Stats], about: _About | Non
         names = list(next(iter(sides.values())))
         stacked = {hemi: np.stack([v[stat] for stat in names]) for hemi, v in sides.items()}
         files.write_bytes(folder / f"{name}.dscalar.nii", gifti.cifti_bytes(stacked, names))
-
-
-def _write_joint(
-    folder: Path, joint: Sequence[JointMap], settings: GroupSettings, averages: tables.Averages
-) -> None:
-    """Write tests of several measures together."""
-    if not joint:
-        return
-    write_table(
-        folder,
-        f"{JOINT}_peaks",
-        joint_peaks(joint, settings.multiplicity.neighbors, averages),
-        meaning=tables.JOINT_COLUMNS,
-    )
-    for joint_map in joint:
-        name = tables.map_name(joint_map.key.hemi, joint_map.key.measure, joint_map.key.contrast)
-        parts = {
-            f"p_{title.replace(' ', '_')}": f"p-value of {title} alone, not corrected"
-            for title in joint_map.parts
-        }
-        write_table(
-            folder, name, joint_points(joint_map), meaning={**tables.JOINT_COLUMNS, **parts}
-        )
-    write_stats(
-        folder,
-        {
-            joint_map.key: {"z": joint_map.test.statistic, "pcorrected": joint_map.found.adjusted}
-            for joint_map in joint
-        },
-    )
 
 
 def write_surface(folder: Path, cohort: Cohort, fitted: FittedMaps, hemi: str) -> None:

@@ -12,6 +12,7 @@ from hipsta_bids.group.output.steps import extend
 from hipsta_bids.group.questions.aligning import register_side
 from hipsta_bids.group.questions.summaries import classify_groups, fit_summaries
 from hipsta_bids.group.request import Request
+from hipsta_bids.joints import find_permuting
 from hipsta_bids.progress import each, tell
 from hipsta_bids.stats import inference
 from hipsta_bids.stats.design import Design, build_design
@@ -72,7 +73,7 @@ def design(request: Request) -> Analysis:
         settings.multiplicity,
         settings.glm,
         rows.design.contrasts,
-        joint=bool(settings.joint.measures),
+        further=find_permuting(settings),
     )
     analysis = replace(analysis, design=rows.design, row_model=rows)
     return analysis.noted(_parts_of_outcomes(request))

@@ -16,12 +16,10 @@ from hipsta_bids.group.cohort.data import SHEET
 from hipsta_bids.group.cohort.quality import quality_notes, quality_table
 from hipsta_bids.group.output.results import Analysis
 from hipsta_bids.group.output.shapes import average_shapes, write_shapes
-from hipsta_bids.group.output.steps import blocks, plan_blocks, plan_steps
-from hipsta_bids.group.output.tables import JointMap
+from hipsta_bids.group.output.steps import blocks, extend_surfaces, plan_blocks, plan_steps
 from hipsta_bids.group.output.write import draw, write_results, write_table
 from hipsta_bids.group.questions import study as studies
 from hipsta_bids.group.questions.analysis import analyze_cohort, analyze_points
-from hipsta_bids.group.questions.joint import check_joint, combine_maps
 from hipsta_bids.group.questions.mixing import with_mixes
 from hipsta_bids.group.questions.notes import notes_of
 from hipsta_bids.group.request import Request
@@ -61,7 +59,6 @@ def run_group(options: studies.GroupOptions, settings: GroupSettings) -> studies
 def _analyze(options: studies.GroupOptions, settings: GroupSettings) -> studies.GroupResult:
     """Analyze and write all but the page, for which the memory that it takes is free again."""
     study = studies.read_study(options, settings).with_alignment()
-    check_joint(study.maps, options.comparison, study.settings)
     document, request = _request(study)
     study = _with_labels(study, request)
     templates = studies.read_templates(options.template, study.cohort)
@@ -70,11 +67,9 @@ def _analyze(options: studies.GroupOptions, settings: GroupSettings) -> studies.
         surface: analysis if surface == SHEET else analyze_points(cohort, analysis)
         for surface, cohort in study.cohorts.items()
     }
-    joint = combine_maps(list(analyses.values()), study.settings)
     discoveries = {key: test for part in analyses.values() for key, test in part.found.items()}
-    discoveries |= {key: part.found for key, part in joint.items()}
     analyses[SHEET] = replace(analysis, found=discoveries)
-    return _write(study, analyses, joint=tuple(joint.values()), document=document)
+    return _write(study, extend_surfaces(analyses), document=document)
 
 
 def _request(study: studies.Study) -> tuple[Mapping[str, Any], Request]:
@@ -99,6 +94,7 @@ def _request(study: studies.Study) -> tuple[Mapping[str, Any], Request]:
         groups=groups,
         settings=study.settings,
         measures=study.measures,
+        surfaces=[name for name in study.cohorts if name != SHEET],
         references=references,
         comparison=options.comparison,
         time=study.time.column if study.time else None,
@@ -120,7 +116,6 @@ def _write(
     study: studies.Study,
     analyses: Mapping[str, Analysis],
     *,
-    joint: Sequence[JointMap],
     document: Mapping[str, Any],
 ) -> studies.GroupResult:
     """Write the results of all surfaces."""
@@ -149,7 +144,6 @@ def _write(
             settings,
             exclusions,
             averages={hemi: shape.middle.points for hemi, shape in shapes.items()},
-            joint=joint,
             region=options.sheets.region,
             ratings=study.collection.ratings,
             labels=study.labels,

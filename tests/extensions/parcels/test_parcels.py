@@ -126,8 +126,9 @@ def test_p_values_and_families_are_those_of_statsmodels(dataset):
     rows = table(folder / "measures.tsv")
     regional = rows["measure"].str.contains("_region_")
     assert regional.sum() == 6 * 3  # left, right, mean of both
-    by_region = table(folder / "regions.tsv").groupby(["hemi", "region"])
-    means = {key: part.set_index("participant_id")["mean"] for key, part in by_region}
+    nodes = with_regions(sheets(dataset), "subfields-axis", None)
+    by_region = nodes.groupby(["hemi", "region"])
+    means = {key: part.groupby("participant_id")["thickness"].mean() for key, part in by_region}
     people = table(dataset[0] / "participants.tsv").set_index("participant_id")
     for row in rows[regional].itertuples():
         region = row.measure.removeprefix("thickness_region_")

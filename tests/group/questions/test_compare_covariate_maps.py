@@ -20,7 +20,6 @@ from small_cohorts import (
 
 from hipsta_bids.cli.main import main
 from hipsta_bids.errors import ExitCode
-from hipsta_bids.stats.inference import combine_evidence
 
 FAST = ("--align", "none", "--no-classification", "--no-reports")
 
@@ -70,7 +69,6 @@ def test_permutations_and_asymmetry_have_the_map(study):
     data, out = study
     command = [str(data), str(out), "group", "--formula", "thickness ~ group + map(curvature)"]
     options = ["--correction", "permutation-max", "--permutations", "200", "--asymmetry"]
-    options += ["--joint", "thickness", "--joint-sides"]
     assert main([*command, *options, "--name", "permuted", *FAST]) == ExitCode.OK
     folder = out / "group" / "permuted"
     people = table(data / "participants.tsv")
@@ -93,10 +91,6 @@ def test_permutations_and_asymmetry_have_the_map(study):
     order = left_group["statistic"].abs().argsort()
     assert (np.diff(left_group["p_corrected"].to_numpy()[order]) <= 0).all()
     assert "200 permutations" in (folder / "methods.md").read_text()
-    joint = table(folder / "contrast-MapCurvature_desc-joint_statmap.tsv")
-    sides = [f"hemi-{hemi}_contrast-MapCurvature_desc-thickness_statmap.tsv" for hemi in "LR"]
-    p = np.stack([table(folder / name)["p"] for name in sides])
-    np.testing.assert_allclose(joint["statistic"], combine_evidence(p, "fisher"), rtol=1e-4)
 
 
 @needs("repeated")
