@@ -222,7 +222,7 @@ def _measures(cohort: Cohort, analysis: results.Analysis) -> Iterator[Columns]:
 def with_fdr(table: pd.DataFrame, settings: GroupSettings) -> pd.DataFrame:
     """Correct the tests of one contrast for the number of measures, sides and models.
 
-    Means of one map over regions are a family of their own.
+    Means of one map over regions are a separate family.
     """
     rules = settings.multiplicity
     method = "bh" if rules.method == "bh" else "fdr2"

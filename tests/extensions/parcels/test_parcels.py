@@ -233,7 +233,7 @@ def test_figure_and_page(dataset, drawn):
         assert text in picture
     page = group_page(folder)
     assert "Thickness regions" in page
-    assert "Means over regions of a map are families of their own" in page
+    assert "Means over regions of a map are separate families" in page
     assert "drawn regions" in (folder / "methods.md").read_text()
     nodes = table(folder / "region_nodes.tsv").set_index(["hemi", "node_x", "node_y"])["region"]
     assert len(nodes) == 2 * np.prod(NODES)
