@@ -80,7 +80,8 @@ def _regions(results: GroupResults) -> Mapping[str, Any] | None:
     pictures = [
         picture
         for name, _ in list_figures(results)
-        for picture in embedded(results, name, measure_title(name))
+        for path in sorted((results.folder / "figures").glob(f"{name}*.svg"))
+        for picture in embedded(results, path.stem, measure_title(name))
     ]
     text = (
         "Means over regions of each sheet, before registration. Bold lines enclose regions with a"

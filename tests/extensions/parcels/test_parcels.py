@@ -177,6 +177,17 @@ def test_asymmetry_of_regions(dataset):
 
 
 @pytest.mark.usefixtures("without_figures")
+def test_changes_of_regions_are_those_of_the_cohort(sessions):
+    """Patients lose 0.1 mm per year, others 0.02; sessions 1 and 3 are two years apart."""
+    folder = run(sessions, "paired", "--regions", "subfields", "--paired", "1", "3")
+    rows = table(folder / "measures.tsv").set_index(["contrast", "measure", "hemi"])["estimate"]
+    for region in ("Sub", "CA1"):
+        for hemi in "LR":
+            change = rows["CN-AD", f"thickness_region_{region}", hemi]
+            assert change == pytest.approx(2 * (0.1 - 0.02), abs=0.005)
+
+
+@pytest.mark.usefixtures("without_figures")
 def test_harmonized_regions(dataset):
     data, _ = dataset
     path = data / "participants.tsv"
