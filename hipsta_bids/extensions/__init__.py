@@ -6,5 +6,5 @@
 #: Folders, in the order of the help.
 NAMES = (
     *("combination", "repeated", "sites", "consortia", "trials", "norms", "agreement", "maps"),
-    *("visits", "regions", "uncertainty", "surrogate", "export", "percent"),
+    *("percent", "parcels", "visits", "regions", "uncertainty", "surrogate", "export"),
 )

@@ -112,7 +112,7 @@ def effect_name(effect: str) -> str:
 
 def summary_side(hemi: str, measure: str) -> str:
     """Write the side of a summary measure."""
-    if hemi == "LR" and not measure.endswith("_asymmetry"):
+    if hemi == "LR" and "_asymmetry" not in measure:
         return "mean of both sides"
     return SIDES[hemi]
 

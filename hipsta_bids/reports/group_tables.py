@@ -12,7 +12,7 @@ from scipy import stats
 from hipsta_bids.derivatives.analyses import GroupResults, records, short_contrast, without_effects
 from hipsta_bids.joints import find_sessions, load, load_all
 from hipsta_bids.reports import cells
-from hipsta_bids.types import DIFFERENCE, FAMILY, JOINT, SIDES, p_text
+from hipsta_bids.types import DIFFERENCE, FAMILY, JOINT, REGION, SIDES, p_text
 
 _ALPHA = 0.05  # of tests of summary measures and of models, for a word only
 _LEAST_SHARE = 0.01  # share of a map; what survives in less of it is no finding of the same rank
@@ -363,6 +363,7 @@ def summaries(results: GroupResults) -> Mapping[str, Any] | None:
         "rows": records(table[low]),
         "more": records(table[~low]),
         "alpha": _ALPHA,
+        "regions": bool(table["measure"].str.contains(REGION).any()),
         "families": table["contrast"].nunique(),
         "letters": letters_of(results.table("measures")),
         "slopes": _slopes(results, table),

@@ -20,7 +20,7 @@ from hipsta_bids.stats.clusters import edges_of
 from hipsta_bids.stats.formula import file_label
 from hipsta_bids.stats.inference import Discoveries, MapKey, control_fdr
 from hipsta_bids.stats.registration import Registration
-from hipsta_bids.types import PARTICIPANT, SESSION
+from hipsta_bids.types import PARTICIPANT, REGION, SESSION
 
 Named = tuple[str, pd.DataFrame]
 """File name without extension, and table."""
@@ -220,10 +220,15 @@ def _measures(cohort: Cohort, analysis: results.Analysis) -> Iterator[Columns]:
 
 
 def with_fdr(table: pd.DataFrame, settings: GroupSettings) -> pd.DataFrame:
-    """Correct the tests of one contrast for the number of measures, sides and models."""
+    """Correct the tests of one contrast for the number of measures, sides and models.
+
+    Means of one map over regions are a separate family.
+    """
     rules = settings.multiplicity
     method = "bh" if rules.method == "bh" else "fdr2"
-    for _, rows in table.groupby("contrast", sort=False):
+    parts = table["measure"].str.partition(REGION)
+    maps = parts[0].where(parts[1] == REGION, "")
+    for _, rows in table.groupby(["contrast", maps], sort=False):
         discoveries = control_fdr(rows["p"].to_numpy(dtype=np.float64), rules.alpha, method)
         one_sided = rows["alternative"].notna() if "alternative" in rows else False
         floor = np.where(one_sided, rows["p"], 0.0)  # see Discoveries.at_least
