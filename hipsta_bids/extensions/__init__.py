@@ -5,6 +5,6 @@
 
 #: Folders, in the order of the help.
 NAMES = (
-    *("repeated", "sites", "consortia", "trials", "norms", "agreement", "maps"),
+    *("repeated", "sites", "multilevel", "consortia", "trials", "norms", "agreement", "maps"),
     *("visits", "regions", "uncertainty", "surrogate", "export"),
 )

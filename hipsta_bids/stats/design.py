@@ -57,6 +57,8 @@ class Design:
     members: NDArray[np.bool_] | None = None
     """(rows, levels) of all factors; a point needs ``min_level`` participants in each level."""
     min_level: int = 0
+    random: NDArray[np.str_] = field(default_factory=lambda: np.empty(0, dtype=np.str_))
+    """(rows,) level whose random intercept each row has; empty without these."""
 
 
 def _parsed(text: str) -> Formula:
@@ -97,16 +99,28 @@ def build_design(
     model: formulas.ModelSpec,
     settings: DesignSettings,
     references: Mapping[str, str],
+    *,
+    has_random: bool = False,
 ) -> Design:
-    """Make the design matrix of a model, or raise the reason why it cannot be fitted."""
+    """Make the design matrix of a model, or raise the reason why it cannot be fitted.
+
+    Models with a random intercept are refused unless ``has_random``.
+    """
+    if model.random and not has_random:
+        raise ModelError(
+            f"formula: {model.random_term} cannot be fitted here; remove it, or write"
+            f" {model.random} as a fixed term"
+        )
     closed = closed_formula(model.formula)
     formula = _parsed(closed.text)
     names = sorted(closed.names)
-    formulas.check_names(names, table.columns)
-    variables = _typed(table[names], closed.factors)
+    random = [model.random] if model.random else []
+    formulas.check_names([*names, *random], table.columns)
+    variables = _typed(table[[*names, *random]], closed.factors | {*random})
     complete = variables.notna().all(axis=1).to_numpy()
     dropped = formulas.rows_by_lack(variables, complete)
-    variables = variables.loc[complete].copy()
+    of_random = variables.loc[complete, random]
+    variables = variables.loc[complete, names].copy()
     formulas.check_left(variables, dropped)
     numeric = variables.select_dtypes("number")
     notes = {name: formulas.coding_note(numeric[name]) for name in map(str, numeric.columns)}
@@ -145,6 +159,7 @@ def build_design(
             [variables[name] == level for name in levels_used for level in levels_used[name]]
         ).T,
         min_level=settings.min_level,
+        random=of_random.to_numpy(dtype=np.str_).ravel(),
     )
 
 

@@ -2,7 +2,7 @@
 
 import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from importlib.resources import files
 from typing import Any
@@ -213,7 +213,7 @@ def _measures(cohort: Cohort, analysis: results.Analysis) -> Iterator[Columns]:
                 "hemi": hemi,
                 "measure": names,
                 "unit": [cohort.units.get(name, "1") for name in names],
-                "model": formula,
+                "model": replace(analysis.model, formula=formula).text,
                 "contrast": test.contrast.name,
                 "test": test.kind,
                 "n": participants,

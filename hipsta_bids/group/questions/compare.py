@@ -106,7 +106,8 @@ def _with_labels(study: studies.Study, request: Request) -> studies.Study:
     rows = request.table if request.comparison.sessions.later else request.cohort.table
     source: tuple[str, Mapping[str, Sequence[str]]]
     source = next(plan_blocks("source", request), ("", {}))
-    return with_mixes(study, rows, closed_formula(request.model.formula).names, source=source)
+    names = [*closed_formula(request.model.formula).names, request.model.random]
+    return with_mixes(study, rows, names, source=source)
 
 
 def _write(
@@ -165,7 +166,8 @@ def _write(
 
     measures = modeling.wanted_measures(options.model, options.measures)
     return study.write_folder(
-        folder_name(analysis.model.formula, measures) + options.comparison.sessions.suffix,
+        folder_name(f"{analysis.model.formula} {analysis.model.random_term}", measures)
+        + options.comparison.sessions.suffix,
         notes=notes,
         counts=(analysis.n_participants, len(exclusions)),
         fill=fill,

@@ -72,7 +72,7 @@ def fit_summaries(
         return fits, []
     try:
         adjusted = replace(model, formula=f"{model.formula} + {icv}")
-        larger = build_design(cohort.table, adjusted, settings, references)
+        larger = build_design(cohort.table, adjusted, settings, references, has_random=True)
         larger = replace(larger, contrasts=_same_names(larger, design))
     except ModelError as error:
         return fits, [f"{data.SIZES} are not adjusted for {icv}: {error}"]
