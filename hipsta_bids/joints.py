@@ -90,12 +90,12 @@ class Step:
     """How messages name it."""
     names: tuple[str, ...]
     """Names in Python of its options."""
-    options: str
-    """Function that adds its options to the parser."""
     condition: str
     """Function of a request: whether it is asked."""
     plan: str
     """Function of a request; returns what its functions need."""
+    options: str = ""
+    """Function that adds its options to the parser."""
     excludes: tuple[str, ...] = ()
     """Flags beside which it is refused."""
     settings: str = ""
@@ -120,7 +120,7 @@ class Step:
     """Functions that yield parts of results, by place: ``tables``, ``figures``, ``files``,
     ``methods`` (before the model), ``methods-model`` (after it), ``methods-after`` (at the end),
     ``record``, ``source`` (of labels that a plan rests on), ``columns`` (meanings, by column of
-    tables of tests)."""
+    tables of tests), ``rows`` (what makes the model of rows, with a random intercept)."""
 
 
 @dataclass(frozen=True, kw_only=True)

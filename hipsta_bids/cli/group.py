@@ -69,7 +69,8 @@ def group_parser() -> Parser:
     _add_comparison(parser)
     _add_methods(parser)
     for step in joints.find_steps():
-        joints.load(step.options)(parser)
+        if step.options:
+            joints.load(step.options)(parser)
     questions.add_questions(parser)
     for part in joints.find_parts():
         adder(parser.add_argument_group(part.heading))(

@@ -5,6 +5,7 @@
 
 #: Folders, in the order of the help.
 NAMES = (
-    *("combination", "repeated", "sites", "consortia", "trials", "norms", "agreement", "maps"),
-    *("percent", "parcels", "visits", "regions", "uncertainty", "surrogate", "export"),
+    *("combination", "repeated", "sites", "multilevel", "consortia", "trials", "norms"),
+    *("agreement", "maps", "percent", "parcels", "visits", "regions", "uncertainty"),
+    *("surrogate", "export"),
 )

@@ -129,7 +129,6 @@ class Sessions:
     """Whether groups are classified, by the first rows of participants."""
     reason: ClassVar[str] = "later-session"
     """Of sessions that are not compared."""
-    kind: ClassVar[str] = "linear model"
     sd: ClassVar[str] = "the residual standard deviation"
     """Divisor of Cohen's d."""
 

@@ -2,7 +2,7 @@
 
 import itertools
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -14,7 +14,7 @@ from hipsta_bids.errors import ModelError
 from hipsta_bids.stats import formula as formulas
 from hipsta_bids.stats.contrasts import Contrast
 from hipsta_bids.stats.formula import declared_levels
-from hipsta_bids.stats.grammar import CONTEXT, closed_formula, term_text
+from hipsta_bids.stats.grammar import CONTEXT, ClosedFormula, closed_formula, term_text
 from hipsta_bids.stats.marginal import Terms
 from hipsta_bids.stats.references import references_note
 from hipsta_bids.stats.settings import DefaultModelSettings, DesignSettings
@@ -57,6 +57,8 @@ class Design:
     members: NDArray[np.bool_] | None = None
     """(rows, levels) of all factors; a point needs ``min_level`` participants in each level."""
     min_level: int = 0
+    random: NDArray[np.str_] = field(default_factory=lambda: np.empty(0, dtype=np.str_))
+    """(rows,) level whose random intercept each row has; empty without these."""
 
 
 def _parsed(text: str) -> Formula:
@@ -97,31 +99,32 @@ def build_design(
     model: formulas.ModelSpec,
     settings: DesignSettings,
     references: Mapping[str, str],
+    *,
+    has_random: bool = False,
 ) -> Design:
-    """Make the design matrix of a model, or raise the reason why it cannot be fitted."""
+    """Make the design matrix of a model, or raise the reason why it cannot be fitted.
+
+    Models with a random intercept are refused unless ``has_random``.
+    """
+    if model.random and not has_random:
+        raise ModelError(
+            f"formula: {model.random_term} cannot be fitted here; remove it, or write"
+            f" {model.random} as a fixed term"
+        )
     closed = closed_formula(model.formula)
     formula = _parsed(closed.text)
-    names = sorted(closed.names)
-    formulas.check_names(names, table.columns)
-    variables = _typed(table[names], closed.factors)
-    complete = variables.notna().all(axis=1).to_numpy()
-    dropped = formulas.rows_by_lack(variables, complete)
-    variables = variables.loc[complete].copy()
+    random = [model.random] if model.random else []
+    variables, complete, dropped = _complete_rows(table, closed, random)
+    of_random, variables = variables[random], variables.drop(columns=random)
     formulas.check_left(variables, dropped)
     numeric = variables.select_dtypes("number")
     notes = {name: formulas.coding_note(numeric[name]) for name in map(str, numeric.columns)}
-    declared = {name: levels for name in names if (levels := declared_levels(table[name]))}
+    declared = _declared(table, closed.names)
     levels_used, choices = formulas.set_levels(
         variables, dict(closed.references) | dict(references), settings, declared
     )
     notes |= {"references": references_note(choices)} if choices else {}
-    for name in map(str, numeric.columns):
-        _check_possible(numeric[name], name.casefold())
-    if words := sorted(closed.numbers & set(levels_used)):
-        raise ModelError(
-            f"formula {model.formula!r}: functions take numbers, but {formulas.listed(words)} holds"
-            " names; write it without a function"
-        )
+    _check_numbers(numeric, closed, levels_used)
     _refuse_more_columns(_least_columns(formula, levels_used), len(variables), settings)
     model_matrix = _model_matrix(formula, variables, model.formula)
     terms = Terms(model_matrix, variables, levels_used, model.added_terms)
@@ -145,7 +148,38 @@ def build_design(
             [variables[name] == level for name in levels_used for level in levels_used[name]]
         ).T,
         min_level=settings.min_level,
+        random=of_random.to_numpy(dtype=np.str_).ravel(),
     )
+
+
+def _declared(table: pd.DataFrame, names: Iterable[str]) -> dict[str, list[str]]:
+    """Collect the levels that columns declare."""
+    levels = {name: declared_levels(table[name]) for name in names}
+    return {name: names_of for name, names_of in levels.items() if names_of}
+
+
+def _complete_rows(
+    table: pd.DataFrame, closed: ClosedFormula, random: Sequence[str]
+) -> tuple[pd.DataFrame, NDArray[np.bool_], dict[str, tuple[str, ...]]]:
+    """Take the variables of a model; which rows have all, and the other rows by what they lack."""
+    names = [*sorted(closed.names), *random]
+    formulas.check_names(names, table.columns)
+    variables = _typed(table[names], closed.factors | {*random})
+    complete = variables.notna().all(axis=1).to_numpy()
+    return variables[complete].copy(), complete, formulas.rows_by_lack(variables, complete)
+
+
+def _check_numbers(
+    numeric: pd.DataFrame, closed: ClosedFormula, levels: Mapping[str, Sequence[str]]
+) -> None:
+    """Refuse impossible numbers, and names where functions take numbers."""
+    for name in map(str, numeric.columns):
+        _check_possible(numeric[name], name.casefold())
+    if words := sorted(closed.numbers & set(levels)):
+        raise ModelError(
+            f"formula {closed.text!r}: functions take numbers, but {formulas.listed(words)} holds"
+            " names; write it without a function"
+        )
 
 
 def _doubts(numeric: pd.DataFrame, n_columns: int, n_people: int) -> dict[str, str]:

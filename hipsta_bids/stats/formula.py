@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from hipsta_bids.errors import ModelError, did_you_mean
 from hipsta_bids.stats import contrasts as texts
 from hipsta_bids.stats.contrasts import ContrastSpec, contrast_json, refusal
-from hipsta_bids.stats.grammar import CONTEXT, closed_formula, term_text
+from hipsta_bids.stats.grammar import CONTEXT, closed_formula, split_random, term_text
 from hipsta_bids.stats.references import Reference, choose_reference
 from hipsta_bids.stats.settings import DefaultModelSettings, DesignSettings
 from hipsta_bids.types import MISSING, Float, Int64
@@ -60,6 +60,8 @@ class ModelSpec:
     """Maps that are covariates at each point, as ``map(curvature)`` in the formula."""
     summaries: tuple[str, ...] = ()
     """Summary measures that are covariates of each hemisphere, as ``volume`` in the formula."""
+    random: str = ""
+    """Column whose levels have random intercepts, as ``(1|site)`` in the formula."""
 
     @property
     def added(self) -> tuple[str, ...]:
@@ -72,9 +74,15 @@ class ModelSpec:
         return (*(f"map({name})" for name in self.maps), *self.summaries)
 
     @property
+    def random_term(self) -> str:
+        """``(1|site)``, or empty."""
+        name = self.random if self.random.isidentifier() else f"`{self.random}`"
+        return f"(1|{name})" if self.random else ""
+
+    @property
     def text(self) -> str:
-        """Right-hand side with covariates of each hemisphere."""
-        return " + ".join([self.formula, *self.added_terms])
+        """Right-hand side with covariates of each hemisphere and the random intercept."""
+        return " + ".join(filter(None, [self.formula, *self.added_terms, self.random_term]))
 
 
 def model_from_shortcut(formula: str, contrasts: Sequence[str], name: str) -> dict[str, Any]:
@@ -106,6 +114,7 @@ def parse_model(document: Mapping[str, Any], summaries: Collection[str] = ()) ->
         formula=formula,
         maps=maps,
         summaries=of_hemispheres,
+        random=split_random(_formula(model))[1],
         measures=left_side(str(model.get("Formula") or "")),
         contrasts=_contrasts(node.get("Contrasts", [])),
         dummy=str(dummy.get("Test", "t")) if isinstance(dummy, Mapping) else None,
@@ -146,8 +155,11 @@ def _contrasts(contrasts: object) -> tuple[texts.ContrastSpec, ...]:
 
 
 def split_maps(formula: str) -> tuple[str, tuple[str, ...]]:
-    """Take the terms ``map(NAME)`` out of the right-hand side of a formula, and list the maps."""
-    right = formula.rpartition("~")[2]
+    """Take the terms ``map(NAME)`` out of the right-hand side of a formula, and list the maps.
+
+    A random intercept is taken out, too.
+    """
+    right = split_random(formula)[0].rpartition("~")[2]
     names = tuple(dict.fromkeys(_MAP.findall(f"+{right}")))
     plain = _MAP.sub(" ", f"+{right}")
     if re.search(r"(?<![\w.])map\s*\(", plain):

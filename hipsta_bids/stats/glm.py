@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,14 +73,15 @@ class PointwiseFit:
     coefficients: Float
     """(columns, points) in units of the map per unit of the column."""
     sigma: Float
-    """(points,) residual standard deviation; of a mixed model that of single visits."""
+    """(points,) residual standard deviation; of repeated visits that of single visits."""
     n: Int
     """(points,) rows with a value."""
     tests: tuple[PointTest, ...]
     """In the order of the contrasts."""
     variances: Mapping[str, Float] = field(default_factory=dict)
-    """(points,) components of a mixed model: ``residual`` within participants, ``participant``
-    between them (with random slopes, at the mean time), and ``slope`` per squared unit of time."""
+    """(points,) components of a mixed model: ``residual`` within participants or sites,
+    ``participant`` between them (with random slopes, at the mean time), and ``slope`` per squared
+    unit of time."""
     slopes_p: Float | None = None
     """(points,) p-value of random slopes, where they are fitted."""
 
@@ -373,6 +375,8 @@ def fit_measures(
 class RowModel:
     """A linear model of independent rows of a design."""
 
+    kind: ClassVar[str] = "linear model"
+    """For texts."""
     design: Design
     settings: GlmSettings
 

@@ -41,6 +41,10 @@ _TOKEN = re.compile(
 )
 #: Operators, the closer they bind the larger.
 _OPERATORS = {"+": 1, "-": 1, "*": 2, "/": 2, ":": 3, "**": 4}
+#: A random intercept, with the sign before it, other terms with a bar, and texts.
+_RANDOM = re.compile(r"\+\s*\(\s*1\s*\|\s*([^\W\d]\w*|`[^`\n]+`)\s*\)(?=\s*(?:\+|$))")
+_BAR = re.compile(r"\([^()|]*\|")
+_QUOTED = re.compile(r"`[^`]*`|\"[^\"]*\"|'[^']*'")
 _PLAIN = re.compile(rf"(?!(?:{'|'.join(keyword.kwlist)})$)[^\W\d]\w*")  # needs no backticks
 _PLACEHOLDER = "quoted_column_"
 
@@ -83,6 +87,21 @@ def _check_number(text: str, tokens: Sequence[tuple[str, str]], position: int) -
     powers = [str(power) for power in range(1, _HIGHEST_POWER + 1)]
     if tokens[position][1] not in (powers if is_power else ["0", "1"]):
         _refuse(text, tokens[position][1])
+
+
+def split_random(formula: str) -> tuple[str, str]:
+    """Take the term ``(1|NAME)`` out of a formula, and return the rest and the name, or ``""``."""
+    left, tilde, right = formula.rpartition("~")
+    names = _RANDOM.findall(f"+{right}")
+    plain = _RANDOM.sub(" ", f"+{right}")
+    if len(names) > 1 or _BAR.search(_QUOTED.sub("", plain)):
+        raise UsageError(
+            f"formula {_shortened(right.strip())!r}: of terms with |, only one (1|NAME) can be"
+            " added, as group + age + (1|site)"
+        )
+    if not names:
+        return formula, ""
+    return left + tilde + (re.sub(r"^[\s+]+", "", plain).strip() or "1"), names[0].strip("`")
 
 
 def closed_formula(text: str) -> ClosedFormula:

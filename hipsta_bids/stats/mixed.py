@@ -43,11 +43,18 @@ class Sums:
     squares: Float
     """(points, columns + 1, columns + 1) over sessions."""
     sizes: Float
-    """(sizes,) numbers of sessions of a participant that occur."""
+    """(sizes, 1) numbers of sessions of a participant that occur; or, where these are more than
+    participants, (participants, points) sessions of each."""
     people: Float
     """(sizes, points) participants with that number."""
     person_squares: Float
     """(sizes, points, columns + 1, columns + 1) of each participant's sums, over participants."""
+
+    def is_distinct(self) -> Bool:
+        """(points,) whether the columns leave something of the intercepts to estimate."""
+        inverse = np.linalg.inv(self.squares[:, :-1, :-1])
+        fixed = inverse @ self.person_squares.sum(axis=0)[:, :-1, :-1]
+        return np.asarray(1 - np.trace(fixed, axis1=1, axis2=2) / self.n > glm.MIN_INFORMATION)
 
     def where(self, usable: Bool) -> "Sums":
         """Replace points that cannot be fitted by harmless ones."""
@@ -67,7 +74,7 @@ class Sums:
         matrix for the ratio, (points, columns, columns); the sum of squared residuals with its
         first and second derivative, and log |V| + log |X' V^-1 X| with these, (3, points).
         """
-        sizes = self.sizes[:, None]
+        sizes = self.sizes
         spread = 1 + sizes * ratio
         take = (ratio / spread, 1 / spread**2, -2 * sizes / spread**3)
         off, first, second = (-np.einsum("kp,kpij->pij", w, self.person_squares) for w in take)
@@ -106,20 +113,26 @@ def collect_sums(maps: Float, basis: Float, participants: Int) -> Sums:
     columns[..., :-1] = present[:, :, None] * glm.by_row(basis)
     columns[..., -1] = np.where(present, maps, 0.0)
     sums = glm.sum_by(participants, columns)
-    sizes = np.unique(np.maximum(counts, 1.0))
+    sizes = np.unique(np.maximum(counts, 1.0))[:, None]
     masks = [np.where(counts == size, 1.0, 0.0) for size in sizes]
 
     def squares(rows: Float, weight: Float) -> Float:
         weighted = np.moveaxis(rows * weight[:, :, None], 0, 2)
         return np.asarray(weighted @ np.swapaxes(rows, 0, 1))
 
+    if len(sizes) > len(counts):
+        sizes, people = counts, np.ones(counts.shape)
+        person_squares = sums[..., :, None] * sums[..., None, :]
+    else:
+        people = np.array([mask.sum(axis=0) for mask in masks])
+        person_squares = np.array([squares(sums, mask) for mask in masks])
     return Sums(
         n=present.sum(axis=0),
         repeated=np.asarray((counts > 1).any(axis=0)),
         squares=squares(columns, np.ones(maps.shape)),
         sizes=sizes,
-        people=np.array([mask.sum(axis=0) for mask in masks]),
-        person_squares=np.array([squares(sums, mask) for mask in masks]),
+        people=people,
+        person_squares=person_squares,
     )
 
 
@@ -155,12 +168,16 @@ def fit_mixed(
     matrix: Float,
     participants: Sequence[str] | NDArray[np.str_],
     contrasts: Sequence[Contrast],
-    settings: LongitudinalSettings,
+    settings: LongitudinalSettings | GlmSettings,
     *,
     times: Float | None = None,
     covariates: Float | None = None,
+    within: bool = False,
 ) -> glm.PointwiseFit:
     """Fit ``value = matrix @ coefficients + participant + residual`` at each point.
+
+    ``participants`` are levels of any grouping, as sites. Effect sizes are in standard deviations
+    of single rows or, ``within`` levels, of the residual.
 
     With times, participants also have a separate slope, correlated with the intercept, except
     at points whose restricted likelihood slopes do not raise: there intercepts alone are fitted.
@@ -180,7 +197,8 @@ def fit_mixed(
         np.asarray(participants), return_inverse=True, return_counts=True
     )
     if counts.max() == 1:
-        raise ModelError("longitudinal model: no participant has two sessions; use a linear model")
+        unit = "level has two rows" if within else "participant has two sessions"
+        raise ModelError(f"mixed model: no {unit}; use a linear model")
     if times is not None and counts.max() < _SLOPE_SESSIONS:
         raise ModelError(
             "longitudinal model: no participant has three sessions, so that slopes cannot be"
@@ -195,8 +213,8 @@ def fit_mixed(
             part = _larger_where_better(part, full)
         parts.append(part)
     whole = {name: np.concatenate([part[name] for part in parts], axis=-1) for name in parts[0]}
-    # The standard deviation of single visits: effect sizes are those of independent rows.
-    sigma = np.sqrt(whole["residual"] + whole["participant"])
+    # That of single visits: effect sizes are those of independent rows.
+    sigma = np.sqrt(whole["residual"] + (0.0 if within else whole["participant"]))
     return glm.PointwiseFit(
         coefficients=inverse @ whole["scores"],
         sigma=sigma,
@@ -280,6 +298,7 @@ def _fit(
     columns = basis.shape[-1]
     usable = np.linalg.eigvalsh(sums.squares[:, :-1, :-1])[:, 0] > glm.MIN_INFORMATION
     usable &= (sums.n > columns + 1) & sums.repeated
+    usable &= sums.where(usable).is_distinct()
     sums = sums.where(usable)
     ratio = best_ratio(sums)
     scores, inverse, information_first, residual, penalty = sums.at(ratio)
@@ -373,6 +392,7 @@ class RowsOfPeople(glm.RowModel):
 class RepeatedRows(RowsOfPeople):
     """A mixed model of random intercepts, and perhaps slopes."""
 
+    kind = "linear mixed model"
     times: Float | None
     """(rows,) of each visit, if known."""
     slopes: bool

@@ -17,7 +17,7 @@ def request(*, sessions=None, maps=(), summaries=(), measured=("thickness",), me
     settings = SimpleNamespace(multiplicity=SimpleNamespace(method=method))
     return SimpleNamespace(
         settings=settings,
-        model=SimpleNamespace(maps=maps, summaries=summaries),
+        model=SimpleNamespace(maps=maps, summaries=summaries, random=""),
         measures=SimpleNamespace(maps=measured),
         comparison=SimpleNamespace(sessions=sessions or Sessions()),
     )

@@ -313,3 +313,23 @@ def test_numbers_in_brackets_of_c_are_levels():
     assert found.columns[3:] == ("C(dose)[T.5]", "C(dose)[T.10]", "C(dose)[T.15]")
     assert set(found.notes) == {"references"}
     assert list(design("group + dose", table=table).notes) == ["dose", "references"]
+
+
+def test_random_intercepts_are_refused_where_nothing_fits_them():
+    """As without the extension that fits them."""
+    with pytest.raises(
+        ModelError, match=r"\(1\|sex\) cannot be fitted here; remove it, or write sex"
+    ):
+        design("group + (1|sex)")
+
+
+def test_rows_without_a_level_of_a_random_intercept_are_left_out():
+    table = participants().assign(site=lambda table: np.arange(len(table)) % 4)
+    table["site"] = table["site"].astype(object)
+    table.loc[table.index[2], "site"] = None
+    spec = parse_model(model_from_shortcut("group + (1|site)", [], "test"))
+    found = build_design(table, spec, SETTINGS, {}, has_random=True)
+    assert spec.text == "group + (1|site)"
+    assert found.columns == ("Intercept", "group[T.DAT]", "group[T.MCI]")
+    assert dict(found.dropped) == {"site": (table.index[2],)}
+    assert found.random.tolist() == [str(i % 4) for i in range(len(table)) if i != 2]

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from hipsta_bids.errors import HipstaError, ModelError, UsageError
 from hipsta_bids.stats.design import build_design
 from hipsta_bids.stats.formula import model_from_shortcut, parse_model
-from hipsta_bids.stats.grammar import closed_formula, without_variable
+from hipsta_bids.stats.grammar import closed_formula, split_random, without_variable
 from hipsta_bids.stats.settings import DesignSettings
 
 N = 40
@@ -319,3 +319,16 @@ def test_names_with_blanks_keep_their_backticks():
     assert without_variable("`age at scan`*`lambda` + group", "group") == (
         "1 + `age at scan` + `lambda` + `age at scan`:`lambda`"
     )
+
+
+def test_random_intercepts_are_taken_out():
+    """One term (1|NAME), added to other terms; any other term with a bar is refused."""
+    assert split_random("group * age + (1 | site)") == ("group * age", "site")
+    assert split_random("thickness ~ (1|`site id`) + age") == ("thickness ~age", "site id")
+    assert split_random("(1|site)") == ("1", "site")
+    quoted = "C(dose, contr.treatment('(a|b)'))"
+    assert split_random(quoted) == (quoted, "")
+    more = ("(age|site)", "(1|a) + (1|b)", "(1|a:b)", "(0 + age|site)", "age - (1|site)")
+    for text in (*more, "age * (1|site)", "(1||site)", "(1|1)"):
+        with pytest.raises(UsageError, match=r"only one \(1\|NAME\) can be added"):
+            split_random(text)

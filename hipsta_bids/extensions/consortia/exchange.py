@@ -376,6 +376,8 @@ def _check_model(analysis: Analysis, settings: GroupSettings) -> None:
         problem = "of --longitudinal cannot be combined; use --paired"
     elif analysis.model.added:
         problem = "with map() cannot be combined; remove the term"
+    elif analysis.model.random:
+        problem = f"with {analysis.model.random_term} cannot be combined; remove the term"
     elif analysis.is_adjusted:
         problem = "of harmonized values cannot be combined; leave --harmonize out"
     elif settings.glm.covariance != "ordinary":

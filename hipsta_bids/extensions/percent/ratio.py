@@ -13,6 +13,7 @@ from hipsta_bids.group.model import Groups
 from hipsta_bids.group.output.citations import escaped
 from hipsta_bids.group.output.results import Analysis
 from hipsta_bids.group.output.tables import read_columns
+from hipsta_bids.group.questions.analysis import row_models
 from hipsta_bids.group.questions.summaries import fit_summaries
 from hipsta_bids.group.request import Request
 from hipsta_bids.stats import contrasts as texts
@@ -80,11 +81,11 @@ def percent_of(
 def add_percent(analysis: Analysis, groups: Groups) -> Analysis:
     """Add percent differences to the tests of maps and summary measures."""
     request, units = analysis.request, analysis.compared.units
-    rows_of = request.comparison.sessions.row_models(
-        request.table, request.time, request.groups, request.settings
-    )
+    rows_of = row_models(request)
     confidence, (pairs, model) = request.settings.glm.confidence, _means_of(analysis, groups)
-    design = build_design(request.table, model, request.settings.design, request.references)
+    design = build_design(
+        request.table, model, request.settings.design, request.references, has_random=True
+    )
     fitted, measures = dict(analysis.fitted), dict(analysis.measures)
     for hemi, side in analysis.fitted.items():
         names = [name for name in side.fits if units.get(name) in _UNITS]

@@ -111,7 +111,6 @@ class Longitudinal(AllSessions):
     """All sessions, with random intercepts or slopes of participants."""
 
     has_changes = True
-    kind = "linear mixed model"
     sd = "the standard deviation of single visits"
 
     @property
@@ -171,7 +170,6 @@ class Longitudinal(AllSessions):
 class Visits(Longitudinal):
     """All sessions, as categories with any covariance."""
 
-    kind = "linear model"
     sd = "the root of the mean variance of visits"
     endpoint: tuple[str, ...] = ()
     """Of a trial: ``ancova``, ``mmrm`` or ``clda``, the baseline's session, and later ones."""

@@ -192,8 +192,8 @@ def _models(analysis: Analysis, settings: GroupSettings, cite: Callable[[str], s
     fits = [fit for maps in analysis.fitted.values() for fit in maps.fits.values()]
     sessions = analysis.comparison.sessions
     text = (
-        f"A {sessions.kind}, {code(analysis.model.text)}, was fitted at each point of the sheet"
-        f"{sessions.subject}{f' (reference levels: {levels})' if levels else ''}."
+        f"A {analysis.row_model.kind}, {code(analysis.model.text)}, was fitted at each point of the"
+        f" sheet{sessions.subject}{f' (reference levels: {levels})' if levels else ''}."
     )
     if analysis.model.maps:
         text += f" Maps were covariates, with the value of each point {cite('point-covariates')}."

@@ -2,6 +2,7 @@
 
 import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import replace
 from functools import cache
 from importlib.resources import files
 from typing import Any
@@ -208,7 +209,7 @@ def _measures(cohort: Cohort, analysis: results.Analysis) -> Iterator[Columns]:
                 "hemi": hemi,
                 "measure": names,
                 "unit": [cohort.units.get(name, "1") for name in names],
-                "model": formula,
+                "model": replace(analysis.model, formula=formula).text,
                 "contrast": test.contrast.name,
                 "test": test.kind,
                 "n": participants,

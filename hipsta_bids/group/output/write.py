@@ -290,7 +290,7 @@ def _about_tests(analysis: results.Analysis, settings: GroupSettings) -> _About:
             "Contrast": key.contrast,
             "ContrastWeights": dict(zip(names, test.contrast.weights.T.tolist(), strict=True)),
             "Model": analysis.model.text,
-            "Mixed": analysis.comparison.sessions.is_repeated,
+            "Mixed": analysis.comparison.sessions.is_repeated or bool(analysis.model.random),
             "DegreesOfFreedom": [float(df.min()), float(df.max())] if len(df) else None,
             "DegreesOfFreedomNumerator": test.contrast.n_rows if test.kind == "F" else None,
             "NumberOfParticipants": analysis.n_participants,

@@ -8,7 +8,7 @@ from hipsta_bids.errors import ModelError
 from hipsta_bids.group import model as modeling
 from hipsta_bids.group.cohort import data
 from hipsta_bids.group.output.results import Analysis
-from hipsta_bids.group.output.steps import extend
+from hipsta_bids.group.output.steps import extend, plan_blocks
 from hipsta_bids.group.questions.aligning import register_side
 from hipsta_bids.group.questions.summaries import classify_groups, fit_summaries
 from hipsta_bids.group.request import Request
@@ -55,7 +55,13 @@ def design(request: Request) -> Analysis:
     """Make the design, and the model of its rows."""
     _check_covariates(request)
     cohort, settings = request.cohort, request.settings
-    matrix = build_design(request.table, request.model, settings.design, request.references)
+    matrix = build_design(
+        request.table,
+        request.model,
+        settings.design,
+        request.references,
+        has_random=any(plan_blocks("rows", request)),
+    )
     analysis = Analysis(
         request=request,
         design=matrix,
@@ -67,7 +73,7 @@ def design(request: Request) -> Analysis:
     matrix = extend("design", analysis).design
     if request.comparison.sessions.later or not matrix.contrasts:
         matrix = replace(matrix, contrasts=with_mean(matrix))
-    rows = _row_models(request)(matrix)
+    rows = row_models(request)(matrix)
     _check_margins(rows.design, cohort, request.measures)
     inference.check_permutations(
         settings.multiplicity,
@@ -164,7 +170,7 @@ def summarize(analysis: Analysis) -> Analysis:
         names=() if maps else request.measures.summaries,
         references=request.references,
         icv=request.icv,
-        rows_of=_row_models(request),
+        rows_of=row_models(request),
     )
     if maps:
         terms = listed(f"map({name})" for name in maps)
@@ -194,10 +200,11 @@ LINE: tuple[Callable[[Analysis], Analysis], ...] = (
 )
 
 
-def _row_models(request: Request) -> Callable[[Design], RowModel]:
+def row_models(request: Request) -> Callable[[Design], RowModel]:
     """Choose the model of the rows."""
-    sessions = request.comparison.sessions
-    return sessions.row_models(request.table, request.time, request.groups, request.settings)
+    sessions, settings = request.comparison.sessions, request.settings
+    rows_of = sessions.row_models(request.table, request.time, request.groups, settings)
+    return next(plan_blocks("rows", request), rows_of)
 
 
 def _check_covariates(request: Request) -> None:

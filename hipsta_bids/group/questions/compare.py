@@ -109,7 +109,8 @@ def _with_labels(study: studies.Study, request: Request) -> studies.Study:
     rows = request.table if request.comparison.sessions.later else request.cohort.table
     source: tuple[str, Mapping[str, Sequence[str]]]
     source = next(plan_blocks("source", request), ("", {}))
-    return with_mixes(study, rows, closed_formula(request.model.formula).names, source=source)
+    names = [*closed_formula(request.model.formula).names, request.model.random]
+    return with_mixes(study, rows, names, source=source)
 
 
 def _write(

@@ -79,7 +79,8 @@ def unequal_spread(analysis: results.Analysis, settings: GlmSettings) -> Iterato
     """
     groups, worst = analysis.groups, dict[str, tuple[float, str]]()
     named = groups is not None and groups.column in closed_formula(analysis.model.formula).names
-    if not named or settings.covariance != "ordinary" or analysis.comparison.sessions.is_repeated:
+    is_mixed = analysis.comparison.sessions.is_repeated or analysis.model.random
+    if not named or settings.covariance != "ordinary" or is_mixed:
         return
     for hemi, fitted in analysis.fitted.items():
         members = results.members_of(analysis, results.rows_of(analysis, fitted))

@@ -65,7 +65,7 @@ def fit_summaries(
                 data.participants_with(np.isfinite(maps), participants),
             )
 
-    fit(model.text, rows_of(design), lambda name: name not in covariates)
+    fit(model.formula, rows_of(design), lambda name: name not in covariates)
     if not any(
         data.grows_with_head(str(name)) for columns, *_ in fits.values() for name in columns
     ):
@@ -76,7 +76,9 @@ def fit_summaries(
         return fits, [f"{data.SIZES} are not adjusted{error}"]
     if larger is None:
         return fits, []
-    fit(adjusted.text, rows_of(larger), lambda n: data.grows_with_head(n) and n not in covariates)
+    fit(
+        adjusted.formula, rows_of(larger), lambda n: data.grows_with_head(n) and n not in covariates
+    )
     return fits, [f"{data.SIZES} are also tested with head size ({icv})"]
 
 
@@ -94,7 +96,7 @@ def _with_head_size(
         return model, None
     adjusted = replace(model, formula=f"{model.formula} + {icv}")
     try:
-        larger = build_design(cohort.table, adjusted, *coding)
+        larger = build_design(cohort.table, adjusted, *coding, has_random=True)
         return adjusted, replace(larger, contrasts=_same_names(larger, design))
     except ModelError as error:
         raise ModelError(f" for {icv}: {error}") from error

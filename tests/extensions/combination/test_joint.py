@@ -146,7 +146,7 @@ def test_visits_as_categories_are_not_tested_together():
     request = SimpleNamespace(
         settings=GroupSettings().changed(joint={"measures": ("a", "b")}),
         options={},
-        model=SimpleNamespace(maps=(), summaries=()),
+        model=SimpleNamespace(maps=(), summaries=(), random=""),
         measures=SimpleNamespace(maps=("a", "b")),
         comparison=SimpleNamespace(sessions=Visits()),
     )
