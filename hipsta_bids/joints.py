@@ -97,6 +97,8 @@ class Step:
     """Function of a request; returns what its functions need."""
     excludes: tuple[str, ...] = ()
     """Flags beside which it is refused."""
+    contrasts: str = ""
+    """Function of the texts of contrasts; returns texts of the contrasts that are fitted."""
     settings: str = ""
     """Function of the parsed options and the settings; returns the settings, or refuses both."""
     setting: str = ""
@@ -109,8 +111,9 @@ class Step:
     """Keys of the record of inputs, by the names of options that are paths."""
     places: Mapping[str, str] = field(default_factory=dict)
     """Functions of an analysis and the plan, which return the analysis, by place of the line:
-    ``design`` (after it), ``adjust`` (registered maps, before sessions are compared), ``score``
-    (after the fit), ``classify`` (before it)."""
+    ``design`` (after it), ``adjust`` (registered maps, before sessions are compared), ``tests``
+    (after the contrasts of the design, after each fit of maps, before its correction, and after
+    the fit of summary measures), ``score`` (after the fit), ``classify`` (before it)."""
     blocks: Mapping[str, str] = field(default_factory=dict)
     """Functions that yield parts of results, by place: ``tables``, ``figures``, ``files``,
     ``methods`` (before the model), ``methods-after`` (after it), ``record``, ``source`` (of

@@ -18,6 +18,9 @@ from hipsta_bids.types import parts_of
 if TYPE_CHECKING:
     from hipsta_bids.stats.inference import Discoveries, MapKey
 
+#: Of the estimate, where a test has them.
+LIMITS = ("limit_low", "limit_high")
+
 
 @dataclass(frozen=True, eq=False)
 class Frame:
@@ -79,6 +82,7 @@ def test_columns(test: PointTest) -> dict[str, str | Float]:
         "df": test.df,
         "p": test.p,
         **({"alternative": test.contrast.hypothesis} if test.contrast.side else {}),
+        **({} if test.limits is None else dict(zip(LIMITS, test.limits, strict=True))),
     }
 
 
@@ -139,7 +143,8 @@ def peak_table(
         "p_corrected": discoveries.adjusted.ravel(),
         **effect_columns(test),
     }
-    del values["estimate"], values["se"]
+    for name in ("estimate", "se", *LIMITS):
+        values.pop(name, None)
     clusters = find_clusters(discoveries.rejected.ravel(), test.statistic, frame.subfield, edges)
     return pd.DataFrame(
         [

@@ -27,6 +27,13 @@ def plan_steps(request: Request) -> Request:
     return replace(request, plans=plans)
 
 
+def fitted_contrasts(texts: tuple[str, ...]) -> tuple[str, ...]:
+    """Return texts of the contrasts that are fitted, by the texts of the user."""
+    for step in find_steps():
+        texts = load(step.contrasts)(texts) if step.contrasts else texts
+    return texts
+
+
 def _flags(request: Request) -> Iterator[str]:
     """Name what the core is asked beyond the default."""
     settings = request.settings

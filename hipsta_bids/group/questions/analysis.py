@@ -71,7 +71,7 @@ def design(request: Request) -> Analysis:
         rows.design.contrasts,
         joint=bool(settings.joint.measures),
     )
-    return replace(analysis, design=rows.design, row_model=rows)
+    return extend("tests", replace(analysis, design=rows.design, row_model=rows))
 
 
 def align(analysis: Analysis) -> Analysis:
@@ -111,14 +111,16 @@ def fit(analysis: Analysis) -> Analysis:
         difference = data.asymmetry_maps(compared, maps, relative)
         contrasts = with_mean(rows.design)
         fitted[modeling.BOTH] = fit_maps(modeling.BOTH, difference, rows, contrasts=contrasts)
+    changes = {"compared": compared, "classified": compared, "fitted": fitted}
+    analysis = extend("tests", replace(analysis, **changes))
     found = inference.correct(
-        fitted,
+        analysis.fitted,
         rows,
         compared.table,
         request.settings.multiplicity,
         report=partial(tell, "permutations"),
     )
-    return replace(analysis, compared=compared, classified=compared, fitted=fitted, found=found)
+    return replace(analysis, found=found)
 
 
 def repeat_unregistered(analysis: Analysis) -> Analysis:
@@ -154,7 +156,7 @@ def summarize(analysis: Analysis) -> Analysis:
     measures, notes = fit_summaries(
         analysis.compared,
         request.model,
-        analysis.design,
+        analysis.row_model.design,
         request.settings.design,
         names=() if maps else request.measures.summaries,
         references=request.references,
@@ -164,7 +166,7 @@ def summarize(analysis: Analysis) -> Analysis:
     if maps:
         terms = listed(f"map({name})" for name in maps)
         notes.append(f"summary measures are not tested: {terms} has values at points only")
-    return replace(analysis, measures=measures).noted(notes)
+    return extend("tests", replace(analysis, measures=measures)).noted(notes)
 
 
 def classify(analysis: Analysis) -> Analysis:

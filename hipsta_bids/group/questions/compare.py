@@ -15,7 +15,7 @@ from hipsta_bids.group.cohort.data import SHEET
 from hipsta_bids.group.cohort.quality import quality_notes, quality_table
 from hipsta_bids.group.output.results import Analysis
 from hipsta_bids.group.output.shapes import average_shapes, write_shapes
-from hipsta_bids.group.output.steps import blocks, plan_blocks, plan_steps
+from hipsta_bids.group.output.steps import blocks, fitted_contrasts, plan_blocks, plan_steps
 from hipsta_bids.group.output.tables import JointMap
 from hipsta_bids.group.output.write import draw, write_results, write_table
 from hipsta_bids.group.questions import study as studies
@@ -80,7 +80,7 @@ def _request(study: studies.Study) -> tuple[Mapping[str, Any], Request]:
     """Choose the model, as a document and as what the line is asked."""
     options, cohort = study.options, study.cohort
     document, model, groups, references = modeling.choose_model(
-        options.model,
+        replace(options.model, contrasts=fitted_contrasts(options.model.contrasts)),
         cohort.table,
         study.settings,
         comparison=options.comparison,
@@ -96,6 +96,7 @@ def _request(study: studies.Study) -> tuple[Mapping[str, Any], Request]:
         comparison=options.comparison,
         time=study.time.column if study.time else None,
         icv=study.icv,
+        contrasts=options.model.contrasts,
         options=options.further,
     )
     return document, plan_steps(request)
