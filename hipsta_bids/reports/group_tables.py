@@ -86,6 +86,7 @@ def findings(results: GroupResults) -> Mapping[str, Any] | None:
         "sites": "sites" in results.record,
         "signed": set(results.record["contrasts"]) > set(sided) or not sided,
         "margins": [(str(name), side_words(text)) for name, text in sided.items()],
+        "limits": 1 - 2 * multiplicity["alpha"] if "limit_low" in measures else None,
         "summaries": _summaries(results),
         "visible": _VISIBLE_ROWS,
         "letters": letters_of(measures),
@@ -229,7 +230,9 @@ def _summaries(results: GroupResults) -> list[dict[str, Any]]:
         reach = stats.t.isf((1 - model.get("confidence", 0.95)) / 2, df) * low["se"]
         limits = {"low": low["estimate"] - reach, "high": low["estimate"] + reach}
         for end, values in limits.items():
-            low[f"estimate_{end}"] = low.get(f"limit_{end}", values).where(lambda v: v.notna(), values)
+            low[f"estimate_{end}"] = low.get(f"limit_{end}", values).where(
+                lambda v: v.notna(), values
+            )
     return records(low)
 
 

@@ -25,8 +25,8 @@ def describe(parser: Parser) -> None:
     """Describe what contrasts can be, in the help."""
     parser.add_argument_group(
         "conjunction and equivalence",
-        'write --contrast "A & B" to test that A and B are both above zero, and --contrast'
-        ' "|A| < 0.1" to test that A is within -0.1 and 0.1, in the unit of the measure',
+        'Conjunction: --contrast "A & B", both above zero. Equivalence: --contrast "|A| < 0.1",'
+        " A between -0.1 and 0.1 in the unit of the measure.",
     )
 
 

@@ -5,8 +5,9 @@ several contrasts the minimum statistic against the conjunction null (Nichols et
 bounds of one contrast the two one-sided tests of equivalence (Schuirmann 1987).
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,9 +16,16 @@ from scipy import special
 from hipsta_bids.extensions.conjunctions.texts import Plan
 from hipsta_bids.group.output.citations import escaped, joined
 from hipsta_bids.group.output.results import Analysis
+from hipsta_bids.reports.cells import with_unit
 from hipsta_bids.stats.arrays import Float
 from hipsta_bids.stats.contrasts import Contrast
 from hipsta_bids.stats.glm import PointTest, PointwiseFit
+
+#: Fields of a test that are of the part with the largest p-value.
+_PICKED = (
+    *("p", "df", "estimate", "se"),
+    *("cohen_d", "cohen_d_limits", "eta_squared", "eta_squared_limits"),
+)
 
 
 @dataclass(frozen=True)
@@ -37,10 +45,10 @@ class Conjunction(Contrast):
     @property
     def margin_within(self) -> float | None:
         """Margin of equivalence; ``None`` if the parts are no bounds of one contrast."""
-        low, *others = self.parts
+        low, high = self.parts[0], self.parts[-1]
         is_pair = [part.side for part in self.parts] == ["greater", "less"]
-        if is_pair and low.margin == -others[0].margin and (low.weights == others[0].weights).all():
-            return others[0].margin
+        if is_pair and low.margin == -high.margin < 0 and (low.weights == high.weights).all():
+            return high.margin
         return None
 
     @property
@@ -59,26 +67,24 @@ def combine(analysis: Analysis, planned: tuple[Plan, frozenset[str]]) -> Analysi
     plan, hidden = planned
     level = analysis.request.settings.multiplicity.alpha
 
+    def joined_parts(by_name: Mapping[str, Any], join: Callable[..., Any]) -> tuple[Any, ...]:
+        """Join the parts of conjunctions, and drop hidden parts."""
+        conjunctions = {
+            name: join(name, [by_name[part] for part in parts])
+            for name, parts in plan.items()
+            if by_name.keys() >= set(parts)
+        }
+        remaining = {name: value for name, value in by_name.items() if name not in hidden}
+        return tuple((remaining | conjunctions).values())
+
     def of_fit(fit: PointwiseFit) -> PointwiseFit:
         tests = {test.contrast.name: test for test in fit.tests}
-        together = [
-            combine_tests(name, [tests[part] for part in parts], level)
-            for name, parts in plan.items()
-            if tests.keys() >= set(parts)
-        ]
-        kept = [test for name, test in tests.items() if name not in hidden]
-        return replace(fit, tests=(*kept, *together))
+        return replace(fit, tests=joined_parts(tests, partial(combine_tests, level=level)))
 
     contrasts = {contrast.name: contrast for contrast in analysis.design.contrasts}
-    together = [
-        conjoin(name, [contrasts[part] for part in parts])
-        for name, parts in plan.items()
-        if contrasts.keys() >= set(parts)
-    ]
-    kept = [contrast for name, contrast in contrasts.items() if name not in hidden]
     return replace(
         analysis,
-        design=replace(analysis.design, contrasts=(*kept, *together)),
+        design=replace(analysis.design, contrasts=joined_parts(contrasts, conjoin)),
         fitted={
             hemi: replace(side, fits={name: of_fit(fit) for name, fit in side.fits.items()})
             for hemi, side in analysis.fitted.items()
@@ -101,7 +107,7 @@ def combine_tests(name: str, tests: Sequence[PointTest], level: float) -> PointT
     """Test at each point that all one-sided alternatives hold.
 
     Statistic (positive in the direction of the alternative), estimate and effect size are of the
-    part with the largest p-value. Limits of the estimate hold at 1 - 2 ``level``.
+    part with the largest p-value. Of equivalence, limits of the estimate hold at 1 - 2 ``level``.
     """
     weakest = np.argmax([test.p for test in tests], axis=0)  # of a missing test, NaN
 
@@ -110,42 +116,53 @@ def combine_tests(name: str, tests: Sequence[PointTest], level: float) -> PointT
         places = np.expand_dims(weakest, tuple(range(stacked.ndim - 1)))
         return np.asarray(np.take_along_axis(stacked, places, axis=0)[0], dtype=np.float64)
 
-    names = ("p", "df", "estimate", "se", "cohen_d", "cohen_d_limits")
-    names += ("eta_squared", "eta_squared_limits")
-    picked = {field: pick([getattr(test, field) for test in tests]) for field in names}
+    picked = {field: pick([getattr(test, field) for test in tests]) for field in _PICKED}
     signs = [1.0 if test.contrast.side == "greater" else -1.0 for test in tests]
     directed = [sign * test.statistic for sign, test in zip(signs, tests, strict=True)]
     reach = special.stdtrit(picked["df"], 1 - level) * picked["se"][0]
     limits = np.stack([picked["estimate"][0] - reach, picked["estimate"][0] + reach])
     contrast = conjoin(name, [test.contrast for test in tests])
     return replace(
-        tests[0], contrast=contrast, statistic=pick(directed), limits=limits, **picked
+        tests[0],
+        contrast=contrast,
+        statistic=pick(directed),
+        limits=None if contrast.margin_within is None else limits,
+        **picked,
     )
 
 
 def methods(analysis: Analysis, cite: Callable[[str], str]) -> Iterator[str]:
     """Write how conjunctions and equivalence were tested."""
-    found = [c for c in analysis.design.contrasts if isinstance(c, Conjunction)]
-    within = [escaped(c.name) for c in found if c.margin_within is not None]
-    others = [
+    contrasts = [c for c in analysis.design.contrasts if isinstance(c, Conjunction)]
+    names = [
+        *analysis.measured.maps,
+        *(n for names, *_ in analysis.measures.values() for n in names),
+    ]
+    unit = analysis.cohort.units.get(names[0], "1")
+    within = [
+        f"{escaped(c.name)}: {with_unit(f'{c.margin_within:g}', unit)}"
+        for c in contrasts
+        if c.margin_within is not None
+    ]
+    joint = [
         f"{escaped(c.name)} ({escaped(joined([part.name for part in c.parts]))})"
-        for c in found
+        for c in contrasts
         if c.margin_within is None
     ]
     level = 1 - 2 * analysis.request.settings.multiplicity.alpha
     text = ""
-    if others:
+    if joint:
         text += (
             f"Conjunctions were tested by the minimum statistic {cite('conjunction')}:"
-            f" {'; '.join(others)}. The p-value of a conjunction is the largest of its one-sided"
+            f" {'; '.join(joint)}. The p-value of a conjunction is the largest of its one-sided"
             " p-values, so that all its contrasts have to hold. Estimates and effect sizes are"
             " of the contrast with the largest p-value. "
         )
     if within:
         text += (
-            f"Equivalence ({joined(within)}) was tested by two one-sided tests {cite('tost')}"
-            f" {cite('equivalence')}, with {level:.0%} limits of the difference. A point or measure"
-            " without significance is not shown to be equivalent, which is no evidence of a"
+            f"Equivalence was tested by two one-sided tests {cite('tost')} {cite('equivalence')},"
+            f" with {level:.0%} limits of the difference and these margins: {'; '.join(within)}."
+            " Without significance, equivalence is not shown, which is no evidence of a"
             " difference. "
         )
     yield text.strip()

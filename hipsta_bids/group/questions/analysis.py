@@ -111,8 +111,8 @@ def fit(analysis: Analysis) -> Analysis:
         difference = data.asymmetry_maps(compared, maps, relative)
         contrasts = with_mean(rows.design)
         fitted[modeling.BOTH] = fit_maps(modeling.BOTH, difference, rows, contrasts=contrasts)
-    changes = {"compared": compared, "classified": compared, "fitted": fitted}
-    analysis = extend("tests", replace(analysis, **changes))
+    analysis = replace(analysis, compared=compared, classified=compared, fitted=fitted)
+    analysis = extend("tests", analysis)
     found = inference.correct(
         analysis.fitted,
         rows,

@@ -54,7 +54,10 @@ def test_conjunction_has_the_largest_p():
     singles = fit_points(values, matrix, contrasts, GlmSettings()).tests
     test = combine_tests("both", singles, 0.05)
     df = 37
-    t = [singles[0].estimate[0] / singles[0].se[0], (singles[1].estimate[0] - 0.9) / singles[1].se[0]]
+    t = [
+        singles[0].estimate[0] / singles[0].se[0],
+        (singles[1].estimate[0] - 0.9) / singles[1].se[0],
+    ]
     p = np.stack([stats.t.sf(t[0], df), stats.t.cdf(t[1], df)])
     np.testing.assert_allclose(test.p, p.max(axis=0), rtol=1e-10)
     np.testing.assert_allclose(test.statistic, np.minimum(t[0], -t[1]), rtol=1e-10)
@@ -120,7 +123,9 @@ def test_each_part_is_fitted_once():
     assert texts.fitted_contrasts(asked) == ("A", "low = A > 0.1", "A > 0", "B > 0", "C > 0")
 
 
-@pytest.mark.parametrize("text", ["|A| > 0.1", "|A| < 0", "|A| <= 0.1", "|A|", "|A < 0.1", "|| < 1"])
+@pytest.mark.parametrize(
+    "text", ["|A| > 0.1", "|A| < 0", "|A| <= 0.1", "|A|", "|A < 0.1", "|| < 1"]
+)
 def test_other_bounds_are_refused(text):
     with pytest.raises(ModelError, match="write equivalence as"):
         texts.fitted_contrasts([text])
