@@ -12,6 +12,7 @@ from importlib import import_module
 from importlib.resources import files
 from importlib.util import find_spec
 from itertools import chain
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -103,6 +104,8 @@ class Step:
     """Function of the parsed options and the settings; returns the settings, or refuses both."""
     setting: str = ""
     """Setting that asks it, too, as ``table.name``."""
+    permutes: str = ""
+    """Setting that asks it, as ``table.name``, of a step that permutes."""
     records: tuple[str, ...] = ()
     """Keys of the record, ``None`` in analyses that do not ask it."""
     comparison: tuple[str, ...] = ()
@@ -112,12 +115,14 @@ class Step:
     places: Mapping[str, str] = field(default_factory=dict)
     """Functions of an analysis and the plan, which return the analysis, by place of the line:
     ``design`` (after it), ``adjust`` (registered maps, before sessions are compared), ``tests``
-    (after the contrasts of the design, after each fit of maps, before its correction, and after
-    the fit of summary measures), ``score`` (after the fit), ``classify`` (before it)."""
+    (after ``design`` and each fit of maps, before its correction), ``score`` (after the fit),
+    ``summarize`` (after the fit of summary measures), ``classify`` (before it). Of ``surfaces``,
+    the last place, functions take and return the analyses of all surfaces, by name."""
     blocks: Mapping[str, str] = field(default_factory=dict)
     """Functions that yield parts of results, by place: ``tables``, ``figures``, ``files``,
-    ``methods`` (before the model), ``methods-after`` (after it), ``record``, ``source`` (of
-    labels that a plan rests on)."""
+    ``methods`` (before the model), ``methods-model`` (after it), ``methods-after`` (at the end),
+    ``record``, ``source`` (of labels that a plan rests on), ``columns`` (meanings, by column of
+    tables of tests)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -256,6 +261,9 @@ class Extension:
     """Sections of the page of an analysis, as ``module:tuple``."""
     participant_sections: str = ""
     """Sections of the page of a participant."""
+    findings: str = ""
+    """Sentences on discoveries: function of the results of a comparison; returns a template and
+    its values, ``None`` without any."""
     addition: str = ""
     """What each comparison adds: function of study and analysis; as ``Part.make``."""
     figures: str = ""
@@ -373,3 +381,16 @@ def find_questions() -> tuple[Question, ...]:
 def find_steps() -> tuple[Step, ...]:
     """Find what extensions add to the line of an analysis."""
     return _gather("steps")
+
+
+def fitted_contrasts(texts: tuple[str, ...]) -> tuple[str, ...]:
+    """Return texts of the contrasts that are fitted, by the texts of the user."""
+    for step in find_steps():
+        texts = load(step.contrasts)(texts) if step.contrasts else texts
+    return texts
+
+
+def find_permuting(settings: Any) -> dict[str, bool]:  # noqa: ANN401  (of the group level)
+    """Find the flags of steps that permute, and whether settings ask them."""
+    steps = (step for step in find_steps() if step.permutes)
+    return {step.flag: bool(attrgetter(step.permutes)(settings)) for step in steps}

@@ -24,7 +24,7 @@ from hipsta_bids.derivatives.names import (
 from hipsta_bids.derivatives.results import LAYERS, NODES, POSITION, STATE
 from hipsta_bids.errors import EXIT_MEANINGS
 from hipsta_bids.geometry.catalog import MAPS, PER_SUBFIELD, SECTIONS, SUMMARY, Column
-from hipsta_bids.group.output.tables import COLUMNS, JOINT_COLUMNS, read_columns
+from hipsta_bids.group.output.tables import COLUMNS, read_columns
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.joints import find_extensions, is_present, load
 from hipsta_bids.reports.page import read_table
@@ -227,7 +227,7 @@ def _named(rows: Iterable[tuple[str, str, str]]) -> Iterator[tuple[str, str, str
 def _group_columns() -> Iterator[tuple[str, str]]:
     """Explain the columns of the group level whose names do not follow a rule of the page."""
     ruled = re.compile(r".+_(low|high|se|cv_sd)|(p|below_)\d+")
-    columns = {**JOINT_COLUMNS, **COLUMNS}
+    columns = dict(COLUMNS)
     for extension in find_extensions():
         if extension.has("columns.toml"):
             columns = {**read_columns(extension.package), **columns}

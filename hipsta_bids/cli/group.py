@@ -235,7 +235,7 @@ def _add_methods(parser: Parser) -> None:
 
 
 def _add_tests(add: Callable[..., None]) -> None:
-    """Add the options of corrections, permutations and joint tests."""
+    """Add the options of corrections and permutations."""
     add(
         "--correction",
         "",
@@ -258,13 +258,6 @@ def _add_tests(add: Callable[..., None]) -> None:
         "one family of tests, for permutations too (default: map)",
         choices=["map", "hemispheres", "all"],
     )
-    add(
-        "--joint",
-        "MEASURE...",
-        "also test these maps together at each point, as thickness curvature, by permutation"
-        " (non-parametric combination, family-wise error)",
-    )
-    add("--joint-sides", "", "with --joint: left and right together, too")
 
 
 def _add_reports(parser: Parser) -> None:
@@ -415,7 +408,6 @@ def _settings(parsed: argparse.Namespace) -> "GroupSettings":
             "base": tuple(parsed.base) or None,
             "added": () if parsed.no_classification else None,
         },
-        "joint": {"measures": tuple(parsed.joint) or None, "sides": parsed.joint_sides or None},
     }
     places = [choice.settings for choice in joints.find_sessions()]
     for place in (*places, *(question.settings for question in joints.find_questions())):

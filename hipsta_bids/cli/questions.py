@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 _COMPARISON_ONLY = (
     *("asymmetry", "model", "contrast"),
     *("permutations", "blocks", "fdr_scope", "base", "no_classification"),
-    *("joint", "joint_sides"),
 )
 
 
@@ -58,10 +57,10 @@ def run_comparison(
     for question in joints.find_questions():
         refuse(parsed, question.dependents, f"without {question.without}")
     multiplicity = settings.multiplicity
-    if not settings.joint.measures and not multiplicity.method.startswith("permutation"):
-        refuse(
-            parsed, ("permutations", "blocks"), "without permutations, by --correction or --joint"
-        )
+    permuting = joints.find_permuting(settings)
+    if not any(permuting.values()) and not multiplicity.method.startswith("permutation"):
+        flags = " or ".join(["--correction", *permuting])
+        refuse(parsed, ("permutations", "blocks"), f"without permutations, by {flags}")
     elif multiplicity.permutations * multiplicity.alpha < 1:
         raise UsageError(
             f"{multiplicity.permutations} permutations cannot give p of"

@@ -5,6 +5,7 @@
 
 #: Folders, in the order of the help.
 NAMES = (
-    *("repeated", "sites", "consortia", "trials", "norms", "agreement", "maps"),
-    *("visits", "regions", "uncertainty", "surrogate", "export", "conjunctions"),
+    *("combination", "repeated", "sites", "consortia", "trials", "norms", "agreement", "maps"),
+    *("conjunctions", "percent", "parcels", "visits", "regions", "uncertainty", "surrogate"),
+    "export",
 )

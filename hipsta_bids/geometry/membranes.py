@@ -150,17 +150,17 @@ def _alternative(
     """Find the nodes of another kind of membrane for the same tunnel at nearly the same price."""
     if edit.cost < ALTERNATIVE_COST:
         return None
-    tree = cKDTree(edit.nodes)
     for dearer_price, alternative in dearer:
         if dearer_price > ALTERNATIVE_PRICE * price:
             break
-        near = np.asarray(tree.query(alternative.nodes)[0]).min() <= ALTERNATIVE_REACH
-        if near and alternative.kind == "cut" != edit.kind:
+        gap = np.asarray(cKDTree(edit.nodes).query(alternative.nodes)[0]).min()
+        if gap > ALTERNATIVE_REACH or alternative.kind == edit.kind:
+            continue
+        if alternative.kind == "cut":
             return alternative.nodes
-        if near and alternative.kind == "fill" != edit.kind:
-            filled = state.copy()
-            filled[tuple(alternative.nodes.T)] = True
-            return _thicken(filled, np.zeros(state.shape, dtype=np.float32), alternative.nodes)
+        filled = state.copy()
+        filled[tuple(alternative.nodes.T)] = True
+        return _thicken(filled, np.zeros(state.shape, dtype=np.float32), alternative.nodes)
     return None
 
 

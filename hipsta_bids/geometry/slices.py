@@ -382,7 +382,7 @@ def _bounds(body: Body, margin: float, labeled: tuple[bool, bool]) -> digital.Bo
     """Box round the sheet in the body's slices, and in one slice more where labels go on."""
     levels = np.flatnonzero(body.inside.any(axis=(1, 2)))
     first = max(int(levels[0]) - labeled[0], 0)
-    last = min(int(levels[-1]) + labeled[1], len(body.inside) - 1)
+    last = int(levels[-1]) + labeled[1]
     index = digital.positions(body.tissue[first : last + 1] > 0) + np.array([first, 0, 0])
     room = np.ceil([0, margin, margin]).astype(int)
     low, high = index.min(axis=0) - room, index.max(axis=0) + 1 + room

@@ -1,7 +1,7 @@
 """Which model is fitted: the user's, or the paper's default."""
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -176,7 +176,7 @@ class Sessions:
         if not covariates:
             return sides
         return {
-            hemi: replace(side, covariates={name: side.maps[name] for name in covariates})
+            hemi: replace(side, covariates={name: side.covariate(name) for name in covariates})
             for hemi, side in sides.items()
         }
 
@@ -275,9 +275,11 @@ def choose_model(
     *,
     comparison: Comparison | None = None,
     visits: VisitTime | None = None,
+    summaries: Collection[str] = (),
 ) -> tuple[Mapping[str, Any], formulas.ModelSpec, Groups | None, dict[str, str]]:
     """Return the model as a BIDS Stats Model and read, the groups, and reference levels.
 
+    Terms that are no columns of the table may be summary measures of each hemisphere.
     The request names reference levels; the design chooses the others by the rule of
     ``find_groups``.
     """
@@ -288,7 +290,8 @@ def choose_model(
     document = model_document(
         request, table, groups, settings, comparison=comparison, visits=visits
     )
-    model = formulas.parse_model(document)
+    columns = set(map(str, table.columns))
+    model = formulas.parse_model(document, set(summaries) - columns)
     if visits is not None and visits.labels and VISIT in closed_formula(model.formula).names:
         references[VISIT] = visits.labels[0]
     return document, model, groups, references

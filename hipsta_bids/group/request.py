@@ -1,6 +1,6 @@
 """What an analysis is asked: data, model and settings, and plans of extensions."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -25,6 +25,8 @@ class Request:
     """For classification, and for figures by group."""
     settings: GroupSettings
     measures: Measures
+    surfaces: Sequence[str] = ()
+    """Maps with points of their own, which are analyzed after the sheets."""
     references: Mapping[str, str]
     """Reference levels of factors, as ``choose_model`` gives them."""
     comparison: Comparison = field(default_factory=Comparison)

@@ -36,7 +36,6 @@ class GroupSettings(tables.ExtendedSettings):
     longitudinal: statistics.LongitudinalSettings = statistics.LongitudinalSettings()
     asymmetry: AsymmetrySettings = AsymmetrySettings()
     multiplicity: statistics.MultiplicitySettings = statistics.MultiplicitySettings()
-    joint: statistics.JointSettings = statistics.JointSettings()
     shapes: ShapeSettings = ShapeSettings()
     classification: statistics.ClassificationSettings = statistics.ClassificationSettings()
 

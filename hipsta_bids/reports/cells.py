@@ -112,7 +112,7 @@ def effect_name(effect: str) -> str:
 
 def summary_side(hemi: str, measure: str) -> str:
     """Write the side of a summary measure."""
-    if hemi == "LR" and not measure.endswith("_asymmetry"):
+    if hemi == "LR" and "_asymmetry" not in measure:
         return "mean of both sides"
     return SIDES[hemi]
 
@@ -122,7 +122,11 @@ def effect_text(row: Mapping[str, Any]) -> str:
     if row["measure"] == JOINT:
         return str(row["measures"])
     limits = f"{number_text(row['effect_low'])} to {number_text(row['effect_high'])}"
-    return f"{effect_name(row['effect'])} {number_text(row['effect_size'])} ({limits})"
+    text = f"{effect_name(row['effect'])} {number_text(row['effect_size'])} ({limits})"
+    if np.isfinite(row.get("percent", np.nan)):
+        percent, low, high = (number_text(row[f"percent{end}"]) for end in ("", "_low", "_high"))
+        text += f"; {percent} % ({low} to {high})"
+    return text
 
 
 def _size(row: Mapping[str, Any]) -> str:

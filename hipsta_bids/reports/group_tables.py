@@ -10,9 +10,9 @@ import pandas as pd
 from scipy import stats
 
 from hipsta_bids.derivatives.analyses import GroupResults, records, short_contrast, without_effects
-from hipsta_bids.joints import find_sessions, load
+from hipsta_bids.joints import find_sessions, load, load_all
 from hipsta_bids.reports import cells
-from hipsta_bids.types import DIFFERENCE, FAMILY, JOINT, SIDES, p_text
+from hipsta_bids.types import DIFFERENCE, FAMILY, JOINT, REGION, SIDES, p_text
 
 _ALPHA = 0.05  # of tests of summary measures and of models, for a word only
 _LEAST_SHARE = 0.01  # share of a map; what survives in less of it is no finding of the same rank
@@ -95,7 +95,7 @@ def findings(results: GroupResults) -> Mapping[str, Any] | None:
         "classification": list(_classification(results)),
         "method": multiplicity.get("method"),
         "alpha": multiplicity.get("alpha"),
-        "joint": _joint(settings),
+        "further": [part for make in load_all("findings") if (part := make(results))],
     }
 
 
@@ -127,17 +127,6 @@ def side_words(hypothesis: str) -> str:
     for sign, word in ((">", "above"), ("<", "below"), ("-", cells.MINUS)):
         hypothesis = hypothesis.replace(sign, word)
     return hypothesis
-
-
-def _joint(settings: Mapping[str, Any]) -> dict[str, Any] | None:
-    """Say what was tested together."""
-    joint = settings.get("joint") or {}
-    if not joint.get("measures"):
-        return None
-    names = [cells.display_name(str(name)) for name in joint["measures"]]
-    sides = ["on the left", "on the right"] if joint.get("sides") else []
-    title = " and ".join(names) + (f", {' and '.join(sides)}," if sides else "")
-    return {**joint, "what": title, "permutations": settings["multiplicity"]["permutations"]}
 
 
 def _side(results: GroupResults, row: Mapping[str, Any]) -> dict[str, Any]:
@@ -229,10 +218,8 @@ def _summaries(results: GroupResults) -> list[dict[str, Any]]:
         df = low["df"].where(np.isfinite(low["df"]), np.inf)
         reach = stats.t.isf((1 - model.get("confidence", 0.95)) / 2, df) * low["se"]
         limits = {"low": low["estimate"] - reach, "high": low["estimate"] + reach}
-        for end, values in limits.items():
-            low[f"estimate_{end}"] = low.get(f"limit_{end}", values).where(
-                lambda v: v.notna(), values
-            )
+        limits = {end: low.get(f"limit_{end}", v).fillna(v) for end, v in limits.items()}
+        low = low.assign(**{f"estimate_{end}": values for end, values in limits.items()})
     return records(low)
 
 
@@ -383,6 +370,7 @@ def summaries(results: GroupResults) -> Mapping[str, Any] | None:
         "rows": records(table[low]),
         "more": records(table[~low]),
         "alpha": _ALPHA,
+        "regions": bool(table["measure"].str.contains(REGION).any()),
         "families": table["contrast"].nunique(),
         "letters": letters_of(results.table("measures")),
         "slopes": _slopes(results, table),

@@ -100,7 +100,7 @@ class SideMaps:
     mesh: Mesh | None = None
     """Surface of the points if they are not on the grid: x are its vertices then, and y is 1."""
     covariates: Mapping[str, Float] = field(default_factory=dict)
-    """(sheets, x, y) maps that are covariates of the model at each point, by name."""
+    """(sheets, x, y) covariates of the model at each point, by name: maps, or summary measures."""
 
     first: "SideMaps | None" = None
     """Values at the baseline, a covariate at each point: the sheets of the same participants."""
@@ -116,6 +116,13 @@ class SideMaps:
     def shape(self) -> tuple[int, int]:
         """Nodes along x and y."""
         return self.subfield.shape[1], self.subfield.shape[2]
+
+    def covariate(self, name: str) -> Float:
+        """Return a map, or a summary measure at each point (sheets, x, y)."""
+        if name in self.maps:
+            return self.maps[name]
+        values = self.summary[name].to_numpy(dtype=np.float64)
+        return np.broadcast_to(values[:, None, None], self.subfield.shape)
 
     def only(self, measures: Sequence[str]) -> "SideMaps":
         """Keep some maps."""

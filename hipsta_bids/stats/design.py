@@ -124,7 +124,7 @@ def build_design(
         )
     _refuse_more_columns(_least_columns(formula, levels_used), len(variables), settings)
     model_matrix = _model_matrix(formula, variables, model.formula)
-    terms = Terms(model_matrix, variables, levels_used, model.maps)
+    terms = Terms(model_matrix, variables, levels_used, model.added_terms)
     matrix, columns = terms.matrix, terms.columns
     _check_matrix(matrix, columns, variables.index, settings)
     people = table.loc[complete, PARTICIPANT].nunique() if PARTICIPANT in table else len(matrix)

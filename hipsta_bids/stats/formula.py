@@ -2,7 +2,7 @@
 
 import re
 import unicodedata
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -58,11 +58,23 @@ class ModelSpec:
     """Left-hand side: what the model is fitted to; empty for the default."""
     maps: tuple[str, ...] = ()
     """Maps that are covariates at each point, as ``map(curvature)`` in the formula."""
+    summaries: tuple[str, ...] = ()
+    """Summary measures that are covariates of each hemisphere, as ``volume`` in the formula."""
+
+    @property
+    def added(self) -> tuple[str, ...]:
+        """Names of covariates that are measures of each hemisphere."""
+        return (*self.maps, *self.summaries)
+
+    @property
+    def added_terms(self) -> tuple[str, ...]:
+        """The terms of these covariates, which contrasts can name."""
+        return (*(f"map({name})" for name in self.maps), *self.summaries)
 
     @property
     def text(self) -> str:
-        """Right-hand side with the maps."""
-        return " + ".join([self.formula, *(f"map({name})" for name in self.maps)])
+        """Right-hand side with covariates of each hemisphere."""
+        return " + ".join([self.formula, *self.added_terms])
 
 
 def model_from_shortcut(formula: str, contrasts: Sequence[str], name: str) -> dict[str, Any]:
@@ -80,15 +92,20 @@ def model_from_shortcut(formula: str, contrasts: Sequence[str], name: str) -> di
     return {"Name": name, "BIDSModelVersion": texts.VERSION, "Nodes": [node]}
 
 
-def parse_model(document: Mapping[str, Any]) -> ModelSpec:
-    """Read a BIDS Stats Model: one node at dataset level, with ``Model.X`` or ``Model.Formula``."""
+def parse_model(document: Mapping[str, Any], summaries: Collection[str] = ()) -> ModelSpec:
+    """Read a BIDS Stats Model: one node at dataset level, with ``Model.X`` or ``Model.Formula``.
+
+    Terms that are names of ``summaries`` are covariates of each hemisphere.
+    """
     node, model = _node(document)
     dummy = node.get("DummyContrasts")
     formula, maps = split_maps(_formula(model))
+    formula, of_hemispheres = _split_summaries(formula, summaries)
     return ModelSpec(
         name=str(node.get("Name") or document.get("Name") or "model"),
         formula=formula,
         maps=maps,
+        summaries=of_hemispheres,
         measures=left_side(str(model.get("Formula") or "")),
         contrasts=_contrasts(node.get("Contrasts", [])),
         dummy=str(dummy.get("Test", "t")) if isinstance(dummy, Mapping) else None,
@@ -142,6 +159,21 @@ def split_maps(formula: str) -> tuple[str, tuple[str, ...]]:
             f"formula {right.strip()!r}: add map(NAME) to other terms, as group + map(curvature)"
         )
     return re.sub(r"^[\s+]+", "", plain).strip() or "1", names
+
+
+def _split_summaries(formula: str, summaries: Collection[str]) -> tuple[str, tuple[str, ...]]:
+    """Take the terms that are summary measures out of a right-hand side, and list them."""
+    names = tuple(name for name in closed_formula(formula).names if name in summaries)
+    plain = f"+{formula}"
+    for name in names:
+        plain = re.sub(rf"\+\s*{re.escape(name)}\s*(?=\+|$)", " ", plain)
+    plain = re.sub(r"^[\s+]+", "", plain).strip() or "1"
+    if inside := [name for name in closed_formula(plain).names if name in summaries]:
+        raise ModelError(
+            f"formula {formula!r}: {inside[0]} is a summary measure; add it to other terms, as"
+            f" group + {inside[0]}"
+        )
+    return plain, names
 
 
 def left_side(formula: str) -> tuple[str, ...]:
@@ -298,7 +330,7 @@ def columns_of(
                 "exclude these participants, or harmonize anew"
             )
         variables[name] = pd.Categorical(variables[name], categories=list(levels_of))
-    if text := [name for name in names if name not in levels and variables[name].dtype == object]:
+    if text := sorted({*names} - {*levels, *variables.select_dtypes("number")}):
         raise ModelError(f"{source}{listed(text)} should be numbers, as where it was made")
     matrix = Formula(closed.text).get_model_matrix(
         variables, na_action="raise", context=dict(CONTEXT)

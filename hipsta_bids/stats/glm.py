@@ -51,8 +51,8 @@ class PointTest:
     """(points,) partial: share of the variance that the covariates leave."""
     eta_squared_limits: Float
     """(2, points)"""
-    limits: Float | None = None
-    """(2, points) of the estimate, of tests that are reported with an interval."""
+    further: Mapping[str, Float] = field(default_factory=dict)
+    """(points,) effect sizes of extensions, by column of tables."""
 
     @property
     def kind(self) -> str:

@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import ContextVar
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 import numpy as np
 import pandas as pd
@@ -513,16 +514,20 @@ def check_permutations(
     settings: GlmSettings,
     contrasts: Sequence[Contrast],
     *,
-    joint: bool = False,
+    further: Mapping[str, bool] = MappingProxyType({}),
 ) -> None:
-    """Refuse permutations where rows cannot be exchanged, and of one-sided tests."""
-    if (rules.method in PERMUTATIONS or joint) and settings.covariance != "ordinary":
+    """Refuse permutations where rows cannot be exchanged, and of one-sided tests.
+
+    ``further`` are flags of other tests that permute, and whether they are asked.
+    """
+    permuted = rules.method in PERMUTATIONS or any(further.values())
+    if permuted and settings.covariance != "ordinary":
         raise ModelError("permutations assume equal variances; set glm.covariance to ordinary")
     one_sided = [contrast.name for contrast in contrasts if contrast.side]
-    if one_sided and (rules.method in PERMUTATIONS or joint):
+    if permuted and one_sided:
         raise ModelError(
-            f"contrast {one_sided[0]!r}: one-sided tests are not permuted; use --correction fdr2,"
-            " without --joint"
+            f"contrast {one_sided[0]!r}: one-sided tests are not permuted; use --correction fdr2"
+            + "".join(f", without {flag}" for flag in further)
         )
 
 

@@ -45,12 +45,12 @@ class Terms:
         matrix: ModelMatrix,
         table: pd.DataFrame,
         levels: Mapping[str, Sequence[str]],
-        maps: Sequence[str] = (),
+        added: Sequence[str] = (),
     ) -> None:
         self.matrix: Float = np.asarray(matrix, dtype=np.float64)
         self.columns = tuple(str(column) for column in matrix.columns)
-        #: Columns of the design, and those of maps, which only points have.
-        self.names = (*self.columns, *(f"map({name})" for name in maps))
+        #: Columns of the design, and covariates of each hemisphere.
+        self.names = (*self.columns, *added)
         self.spec, self.table, self.levels = matrix.model_spec, table, levels
         self._grids: dict[tuple[tuple[str, object], ...], Float] = {}
 
@@ -240,7 +240,7 @@ class Terms:
         the square.
         """
         places = self._columns_of(frozenset([variable]))
-        if variable not in self.table or len(places) < 2:  # noqa: PLR2004 -- a line is one
+        if variable not in {*self.table} - {*self.levels} or len(places) < 2:  # noqa: PLR2004
             raise ModelError(
                 f"contrast {contrast!r}: {variable!r} is in the formula as a line at most; write it"
                 f" as poly({variable}, 2) or cr({variable}, df=3)"

@@ -176,18 +176,6 @@ class MultiplicitySettings(tables.SettingsTable):
     """Neighbors of a point on the sheet, 4 or 8."""
 
 
-class JointSettings(tables.SettingsTable):
-    """Tests of several measures together, by permutation (non-parametric combination)."""
-
-    measures: tables.Texts = ()
-    """Maps that are tested together at each point; empty for no joint test."""
-    combine: Literal["fisher", "tippett"] = "fisher"
-    """``fisher`` adds up the evidence of all measures, ``tippett`` takes the strongest (Winkler et
-    al. 2016)."""
-    sides: bool = False
-    """Whether the left and the right map of a measure are combined too, point by point."""
-
-
 class ClassificationSettings(tables.SettingsTable):
     """Logistic models and how well they discriminate groups."""
 

@@ -241,6 +241,8 @@ SIDES = {"L": "left", "R": "right", "LR": "left minus right", "both": "both side
 DIFFERENCE, BOTH_SIDES = "LR", "both"
 #: Name of the map that tests several measures together, among those of measures.
 JOINT = "joint"
+#: Between a map and a region in names of means over regions, which are summary measures.
+REGION = "_region_"
 #: SD of a normal distribution over its median absolute deviation; scipy.stats takes .6 s to import.
 MAD_TO_SD = 1.4826
 #: Columns at a repair are hatched if thickness is farther off its neighbors, mm.

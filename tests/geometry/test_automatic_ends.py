@@ -5,8 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from geometry_cases import degrees_between, rigid, rotation, short_phantom
+from scipy.special import ndtr
 
 from hipsta_bids.errors import GeometryError
+from hipsta_bids.geometry import automatic_ends
 from hipsta_bids.geometry.body import extract_body
 from hipsta_bids.geometry.ends import find_end_planes
 from hipsta_bids.protocols.load import load_protocol
@@ -226,3 +228,34 @@ def test_the_published_rule_needs_a_slice_of_the_body():
     volume = replace(volume, tissue=np.where(volume.tissue == Tissue.CA1, 0, volume.tissue))
     with pytest.raises(GeometryError, match="no slice has both CA1 and CA2/CA3"):
         ends_of(volume, BodySettings(end_rule="last-slice"))
+
+
+def test_profiles_of_a_box_have_its_area_and_spread():
+    """8 x 3 mm in slices of 1.2 mm; half is left at the ends, which the Gaussian blurs."""
+    tissue = np.zeros((30, 20, 20), dtype=np.uint8)
+    tissue[5:25, 2:18, 4:14] = Tissue.CA1
+    turn = rotation(0, 25) @ rotation(2, 40)
+    affine = np.eye(4)
+    affine[:3, :3] = turn * [0.4, 1.2, 0.3]
+    volume = LabelVolume(tissue=tissue, part=tissue * 0, affine=affine, protocol=HIPPUNFOLD)
+    levels, area, spread = automatic_ends._profile(volume, tissue, turn[:, 1])
+    inner = np.abs(levels - 9.5 * 1.2) < 5
+    np.testing.assert_allclose(area["CA1"][inner], 8 * 3, rtol=3e-3)
+    expected = np.sqrt((0.4**2 * (20**2 - 1) + 0.3**2 * (10**2 - 1)) / 12)
+    np.testing.assert_allclose(spread["CA1"][inner], expected, rtol=1e-3)
+    ends = np.interp([1.5 * 1.2, 17.5 * 1.2], levels, area["sheet"])
+    np.testing.assert_allclose(ends, 12, rtol=0.02)
+    assert area["sheet"].sum() * 0.25 == pytest.approx(8 * 3 * 16 * 1.2, rel=1e-3)
+
+
+@pytest.mark.parametrize("ramp", [0.0, 1.5])
+def test_sections_with_a_part_of_the_labels_are_left_out_beyond_what_smoothing_takes(ramp):
+    """Shares of 0.9 and more are whole; the loss grows from 0 to 1 below that."""
+    depth = np.arange(-16, 40) * 0.25
+    area = 30 * (np.clip(depth / ramp, 0, 1) if ramp else ndtr(depth))
+    lost = automatic_ends._grazed(depth, area, (depth < 0) * 1.0, BODY)
+    fine = np.arange(0.125, 3, 0.25)
+    blurred = np.clip((0.9 - ndtr(fine)) / 0.1, 0, 1).sum() * 0.25
+    grazed = np.clip((0.9 - fine / (ramp or 1e-9)) / 0.1, 0, 1).sum() * 0.25
+    assert lost == pytest.approx(max(grazed - blurred, 0), abs=0.02)
+    assert lost * 0.5 == automatic_ends._grazed(depth, area, (depth < 0) * 0.5, BODY)

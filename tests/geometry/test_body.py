@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from geometry_cases import rigid, short_phantom
+from geometry_cases import plain_body, rigid, short_phantom, straight_ends
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
@@ -211,3 +211,24 @@ def test_the_side_is_unknown_without_ca1(arc):
         tissue=tissue, part=arc.volume.part, affine=arc.volume.affine, protocol=FREESURFER
     )
     assert np.isnan(check_side(extract_body(volume, BodySettings()), "R"))
+
+
+def test_a_body_leaves_its_end_planes_along_its_last_four_millimeters():
+    """The line through its positions; weights fall to zero at the reach. Other pieces are none."""
+    tissue = np.zeros((30, 12, 24), dtype=np.uint8)
+    for level in range(24):
+        first = 4 + level**2 // 40
+        tissue[first : first + 8, 2:6, level] = Tissue.CA1
+    affine = np.diag([0.5, 0.5, 0.5, 1.0])
+    affine[:3, 2], affine[2, 3] = [0.1, -0.2, 0.5], 0.25
+    whole = plain_body(tissue, affine, straight_ends(12.0))
+    for noise in ((0, slice(7, 11)), (29, slice(7, 11))):
+        tissue[noise] = Tissue.CA1
+    body = plain_body(tissue, affine, straight_ends(12.0))
+    _, points = whole.inside_points()
+    for end, level, sign in (("posterior", 0.0, 1), ("anterior", 12.0, -1)):
+        depth = sign * (points[:, 2] - level)
+        near = depth < 4
+        fit = np.polyfit(depth[near], points[near, :2], 1, w=np.sqrt(4 - depth[near]))[0]
+        step = np.array([-fit[0], -fit[1], -sign])
+        np.testing.assert_allclose(body.outward[end], step / np.linalg.norm(step), atol=1e-9)

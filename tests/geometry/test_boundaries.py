@@ -299,3 +299,19 @@ def test_published_boundaries_are_the_zero_lines(case, operator):
     thickness = np.linalg.norm(step, axis=3).sum(axis=2)
     # Without end faces x does not converge beside the edges; in the middle half 2 mm are 2 mm.
     assert np.nanmedian(thickness[10:31]) == pytest.approx(2.0, abs=0.05)
+
+
+def test_directions_at_an_edge_are_continued_from_inside():
+    """Along a line on which one component rises, and the other does so too, from its start."""
+    starts = np.array([[0.0, 0, 0], [2.0, 5, 0]])
+    steps = []
+
+    def flow(points):
+        steps.append(points[:, 0] - starts[:, 0])
+        return np.column_stack([np.ones(2), 0.3 * points[:, 0], np.zeros(2)])
+
+    found = boundaries._direction_at_edge(flow, starts, -2.0)
+    np.testing.assert_allclose(steps[1:], [[-1, -1], [-2, -2], [-3, -3]])
+    np.testing.assert_allclose(
+        found, [[1, 0, 0], np.array([1, 0.6, 0]) / np.hypot(1, 0.6)], atol=1e-12
+    )

@@ -4,10 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from sheet_cases import grid, sheet_of
+from sheet_cases import grid, plates, sheet_of
 
+from hipsta_bids.geometry import bumps
 from hipsta_bids.geometry.bumps import GAP, REACH, check_bumps, check_swollen_ends, predictor
 from hipsta_bids.settings import CheckSettings
+from hipsta_bids.types import MAD_TO_SD
 
 CHECKS = CheckSettings()
 LENGTH, WIDTH, THICKNESS = 20.0, 20.0, 1.8
@@ -139,3 +141,37 @@ def test_lines_are_predicted_exactly_without_what_is_near():
         values = np.random.default_rng(row).normal(size=21)
         slope = np.polyfit(at, values, 1, w=weight)
         assert matrix[row] @ values == pytest.approx(np.polyval(slope, at[row]))
+
+
+def test_a_bump_on_plates_has_a_known_score():
+    """Its height in SDs of departures from lines along either axis, over the least roughness."""
+    points = plates().points.copy()
+    points[20, 9, :, 2] *= np.linspace(1, 1.5, 9)  # the exterior wall stands out by 0.85 mm
+    points[20, 9, :, 2] = np.linspace(0, 1.7 + 0.85, 9)
+    (found,) = check_bumps(sheet_of(points), CHECKS)
+    sizes = [np.linalg.norm(np.append(predictor(n, step)[row], 1.0))
+             for n, step, row in ((41, 0.3, 20), (21, 0.4, 9))]  # fmt: skip
+    assert found.value == pytest.approx(0.85 / np.sqrt(np.prod(sizes)) / CHECKS.smooth_wall)
+    np.testing.assert_allclose(found.points, [points[20, 9, -1]])
+    outward = bumps._stand_out(points[:, :, [0, -1]], predictor(21, 0.4))[20, 9]
+    np.testing.assert_allclose(outward, [0, 0.85 / sizes[1]], atol=1e-12)
+    for share, count in ((6.5 / 8, 0), (6.7 / 8, 1)):  # three times the gap are 6.6 mm
+        assert len(check_bumps(sheet_of(points * [1, share, 1]), CHECKS)) == count
+
+
+def test_roughness_is_half_of_the_wall_and_half_of_the_band():
+    departure = np.arange(15.0)[:, None, None] * [[1, -2], [-1, 2], [1, 2]]
+    wall, band = 7.0, np.r_[2, 2.5, 3, 3.5, 4:11, 10.5, 11, 11.5, 12]
+    expected = MAD_TO_SD * np.sqrt((band**2 + wall**2) / 2)
+    np.testing.assert_allclose(bumps._roughness(departure)[:, 0, 0], expected)
+
+
+def test_an_end_is_compared_with_rows_three_to_eight_millimeters_farther_in():
+    """Over 4.5 mm along x, which are nine columns, of which five are thicker by 1 mm."""
+    rows = np.where(np.arange(21) < 2, 1.0, 0.0) + np.where(np.arange(21) >= 8, 5.0, 0.0)
+    rows[2], rows[3] = 9.0, -9.0  # one of five: the median does not mind
+    sheet = pipe(exterior=np.outer(np.abs(np.arange(41) - 20) < 3, rows))
+    posterior, _ = check_swollen_ends(sheet, CHECKS)
+    assert posterior.value == pytest.approx(5 / 9, abs=1e-3)
+    assert len(posterior.points) == 2 * 9
+    assert np.ptp(posterior.points[:, 2]) == pytest.approx(1.0)

@@ -13,6 +13,7 @@ from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.body import extract_body
 from hipsta_bids.geometry.checks import (
     _rank_correlation,
+    _share_beyond,
     check_end_labels,
     check_label_order,
     check_thickness,
@@ -236,3 +237,11 @@ def test_a_dentate_gyrus_that_ends_before_the_sheet_is_no_missing_label(arc):
 
 def test_short_head_and_tail_labels_are_enough(arc):
     assert not any(found.raised for found in check_end_labels(arc.volume, arc.body, CHECKS))
+
+
+def test_voxels_count_on_the_side_of_a_plane_where_they_lie():
+    assert _share_beyond(np.array([0.5, 1.5, -0.5]), 0.25) == pytest.approx(0.5)
+    # A voxel lies on both sides of the plane, or partly beyond the reach of 3 mm.
+    assert _share_beyond(np.array([0.2, 1.5]), 0.5) == pytest.approx(0.3 / 1.7)
+    assert _share_beyond(np.array([3.0, -3.2]), 0.5) == pytest.approx(0.3 / 0.5)
+    assert _share_beyond(np.array([4.0, -4.0]), 0.5) == 0

@@ -64,3 +64,10 @@ def test_smoothing_keeps_a_slope_of_walls_and_lowers_noise(sheet):
     moves = columns.find_walls(sheet, np.eye(4), slope).moves[2:-2, :, 1]
     expected = 0.03 * (sheet.points[2:-2, :, 0, 1] - 10)
     assert moves == pytest.approx(expected, abs=BENT)
+
+
+def test_columns_are_continued_in_equal_steps(sheet):
+    points, depth = columns._continued(sheet)
+    steps = np.linspace(-columns.BEYOND, HIGH - LOW + columns.BEYOND, 101)  # of 0.05 mm
+    np.testing.assert_allclose(depth[3, 4], steps, atol=1e-12)
+    np.testing.assert_allclose(points[3, 4, :, 0], LOW + steps)

@@ -108,6 +108,7 @@ def test_labels_that_the_sheet_does_not_cover_are_flagged(start, short):
     assert (medial.reason, lateral.reason, lateral.value) == ("edge-lost", "edge-lost", 0.0)
     assert medial.value == pytest.approx(short / (12 - start + short), abs=0.015)
     assert medial.raised == (short > 0)
+    assert f"({medial.value:.0%}) too small" in medial.text
     if medial.raised:
         assert medial.points[:, 0].max() == pytest.approx(start - 1.5, abs=0.4)
         assert medial.share > 0.9

@@ -11,10 +11,12 @@ from skimage import measure
 from hipsta_bids.geometry.digital import (
     NEIGHBORS,
     are_simple,
+    box_around,
     euler_number,
     grow,
     positions,
     shrink,
+    to_ras,
     widened,
 )
 
@@ -164,3 +166,13 @@ def test_start_arrays_are_left_alone():
     grow(start, allowed, field, 3)
     shrink(allowed, start & allowed, field, 3)
     np.testing.assert_array_equal(start, before)
+
+
+def test_places_of_voxels_follow_from_all_of_the_affine():
+    affine = np.array([[0.0, -2.0, 0.5, 10.0], [1.0, 0.0, 0.0, 20.0], [0.0, 0.1, 3.0, 30.0]])
+    np.testing.assert_allclose(to_ras(np.array([[1, 2, 3]]), affine), [[7.5, 21.0, 39.2]])
+
+
+def test_boxes_have_a_voxel_to_spare_where_the_grid_has_one():
+    around = box_around(np.array([[0, 3, 5], [2, 7, 5]]))
+    assert around == (slice(0, 4), slice(2, 9), slice(4, 7))

@@ -1,20 +1,24 @@
 """The working grid between two planes, and the smoothed mask on it."""
 
+from contextlib import nullcontext
 from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from geometry_cases import plain_body, resampled, rigid, rotation, straight_ends
+from geometry_cases import field_of, plain_body, resampled, rigid, rotation, straight_ends
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import CubicSpline
 
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry import digital
+from hipsta_bids.geometry import grid as grids
 from hipsta_bids.geometry.ends import EndPlanes
-from hipsta_bids.geometry.grid import continued_nodes, in_plane_voxel, smooth_body
+from hipsta_bids.geometry.grid import WedgeGrid, continued_nodes, in_plane_voxel, smooth_body
+from hipsta_bids.geometry.outlines import SLIT_HALF_WIDTH, TOUCH_DISTANCE
 from hipsta_bids.protocols.protocol import Tissue
+from hipsta_bids.settings import CheckSettings
 
 EXACT = 1e-9  # rounding of coordinates of some ten mm
 
@@ -260,3 +264,137 @@ def test_cross_sections_of_thick_slices_go_on_wherever_the_plane_lies(offset):
     grid = SimpleNamespace(node_points=nodes.copy, across=np.eye(3)[:2])
     read = continued_nodes(grid, thick, 0.0)
     np.testing.assert_allclose(read[:, :2], nodes[:, :2], atol=0.02)  # the box does not change
+
+
+def test_nodes_between_tilted_planes_lie_where_they_are_said_to():
+    grid = WedgeGrid(
+        shape=(5, 7, 21),
+        spacing=0.5,
+        origin=np.array([1.0, 2.0, 3.0]),
+        across=np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]),
+        axis=np.array([1.0, 0.0, 0.0]),
+        posterior=np.array([1.0, 0.1, 0.2]),
+        anterior=np.array([11.0, -0.1, 0.3]),
+    )
+    # The planes lie 1.8 and 11.7 mm above the middle.
+    assert grid.step == pytest.approx(9.9 / 20)
+    middle = grid.to_ras(np.array([[2.0, 3.0, 0.0], [2.0, 3.0, 5.0], [4.0, 1.0, 20.0]]))
+    expected = [[2.8, 3.0, 4.5], [2.8 + 9.9 / 4, 3.0, 4.5], [12.9 - 1.0, 4.0, 3.5]]
+    np.testing.assert_allclose(middle, expected, atol=EXACT)
+
+
+def test_the_grid_ends_at_its_margins():
+    """On multiples of 0.35 mm from a voxel, 1.9 mm and less than a step more round the body."""
+    body = box_body(tilt=20.0)
+    grid = resampled(body).grid
+    points = body.inside_points()[1]
+    nodes = grid.to_nodes(points)
+    room = np.array([nodes.min(axis=0), np.array(grid.shape) - 1 - nodes.max(axis=0)])[:, :2]
+    assert (room * 0.35 >= 1.9 - EXACT).all()
+    assert (room * 0.35 < 1.9 + 0.35).all()
+    nearest = np.rint(body.to_voxels(body.ends.posterior.point))
+    voxel = body.affine[:3, :3] @ nearest + body.affine[:3, 3]
+    shift = (voxel - grid.origin) @ grid.across.T / 0.35
+    np.testing.assert_allclose(shift, np.rint(shift), atol=1e-6)
+    hands = [np.linalg.det(resampled(body, hemi=hemi).grid.frame) for hemi in "LR"]
+    assert hands == pytest.approx([1, -1])
+
+
+@pytest.mark.parametrize(("degrees", "across"), [(59, True), (61, False)])
+def test_slices_lie_across_the_body_up_to_sixty_degrees(degrees, across):
+    turn = np.eye(4)
+    turn[:3, :3] = rotation(0, degrees)
+    body = plain_body(np.ones((3, 3, 3)), turn @ np.diag([0.4, 0.5, 2.0, 1.0]), straight_ends(9.0))
+    assert grids.cut_across(body) is across
+
+
+@pytest.mark.parametrize("skew", [0.0, 0.3])
+def test_motion_of_cross_sections_behind_a_plane(skew):
+    """A rectangle that moves and changes linearly with the depth, in both directions."""
+    change = np.array([[0.05, 0.04], [-0.02, -0.06]])
+    grid = np.indices((60, 44, 36)).reshape(3, -1).T * 0.25
+    affine = np.diag([0.25, 0.25, 0.25, 1.0])
+    affine[:3, 3] = [-7.5, -5.5, 0.1]
+    points = grid + affine[:3, 3]
+    depth = points[:, 2:]
+    flat = points[:, :2] - depth * [skew, -0.5 * skew]
+    local = np.einsum("nij,nj->ni", np.linalg.inv(np.eye(2) + depth[..., None] * change), flat)
+    tissue = (np.abs(local) < [4.0, 2.2]).all(axis=1).reshape(60, 44, 36)
+    body = plain_body(tissue, affine, replace(straight_ends(20.0), half_slice=0.125))
+    inward = np.array([skew, -0.5 * skew, 1.0])
+    turn = rotation(2, 30)
+    center, across, found = grids._motion(body, "posterior", inward, turn[:2])
+    np.testing.assert_allclose(center, 0.0, atol=0.1)
+    np.testing.assert_allclose(across, turn[:2], atol=EXACT)
+    np.testing.assert_allclose(found, turn[:2, :2] @ change @ turn[:2, :2].T, atol=0.025)
+    if not skew:  # what lies a millimeter beyond the plane is read from this place in it
+        body = replace(body, ends=replace(straight_ends(9.0), half_slice=0.125))
+        nodes = np.array([[2.0, 1.0, -1.0], [3.0, -1.5, -2.0]])
+        read = continued_nodes(SimpleNamespace(node_points=nodes.copy, across=turn[:2]), body, 0.0)
+        places = [np.linalg.inv(np.eye(2) + node[2] * change) @ node[:2] for node in nodes]
+        np.testing.assert_allclose(read, np.column_stack([places, [0, 0]]), atol=0.08)
+
+
+def test_filling_and_parting_of_labels_is_undone():
+    kind = np.random.default_rng(4).choice(5, size=(12, 11, 10), p=[0.4, 0.3, 0.1, 0.1, 0.1])
+    parts = {"slits": kind == 2, "cavities": kind == 3, "separated": kind == 4}
+    after, before = (
+        grids._smooth(np.isin(kind, kinds).astype(np.float32), 1.1) for kinds in ((1, 2, 3), (1, 4))
+    )
+    field = replace(field_of(kind > 0), values=after, smoothing=1.1, **parts)
+    np.testing.assert_allclose(grids.before_mending(field).values, before, atol=1e-5)
+
+
+def test_smoothing_keeps_quadratic_functions():
+    """What a Gaussian adds, its second pass adds again."""
+    a, b, _ = np.indices((41, 41, 3)) - 20.0
+    values = (0.01 * (a**2 - 2 * b**2 + a * b) + 0.1 * a).astype(np.float32)
+    smooth = grids._smooth(values, 1.5)[12:-12, 12:-12]
+    np.testing.assert_allclose(smooth, values[12:-12, 12:-12], atol=1e-4)
+    np.testing.assert_allclose(grids._slope(3 * a + 2 * b)[1:-1], np.sqrt(13), atol=1e-6)
+
+
+@pytest.mark.parametrize(("edge", "touch"), [(0.43, False), (0.38, True)])
+def test_slits_lie_between_ends_that_touch(edge, touch):
+    """Planes of subiculum and CA3 two voxels apart, and another one farther away."""
+    tissue = np.zeros((9, 30, 9), dtype=np.uint8)
+    tissue[:, 5], tissue[:, 7], tissue[:, 14] = Tissue.SUBICULUM, Tissue.CA3, Tissue.SUBICULUM
+    body = plain_body(tissue, np.diag([edge, edge, edge, 1.0]), straight_ends(20.0))
+    places = edge * np.arange(3.0, 16.0, 0.08)
+    points = np.column_stack([4 * edge + 0 * places, places, 4 * edge + 0 * places])
+    gaps = np.abs(places - 5 * edge), np.abs(places - 7 * edge)
+    expected = np.maximum(*gaps) < TOUCH_DISTANCE + 0.5 * edge
+    expected &= np.abs(gaps[0] - gaps[1]) < 2 * SLIT_HALF_WIDTH
+    np.testing.assert_array_equal(grids._between_turns(body, points), expected & touch)
+    assert expected.sum() > 10
+
+
+@pytest.mark.parametrize(
+    ("times", "edge", "refused"),
+    [
+        ((1, 1, 1), 0.89, None),
+        ((1, 1, 1), 0.91, "voxels of 0.91 mm are too coarse"),
+        ((2, 2, 1), 0.5, "voxels of 0.50 mm were resampled from about 1.00 mm"),
+        ((1, 3, 1), 0.4, None),  # along one axis: thick slices
+        ((3, 1, 4), 0.2, "from about 0.80 mm"),
+        ((5, 5, 5), 0.2, None),
+    ],
+)
+def test_labels_that_were_resampled_are_refused(times, edge, refused):
+    tissue = np.random.default_rng(0).integers(2, 4, (8, 9, 7)).astype(np.uint8)
+    for axis, count in enumerate(times):
+        tissue = np.repeat(tissue, count, axis=axis)
+    volume = SimpleNamespace(tissue=tissue, affine=rigid() @ np.diag([edge, edge, edge, 1.0]))
+    with pytest.raises(GeometryError, match=refused) if refused else nullcontext():
+        grids.check_voxel(volume, CheckSettings())
+
+
+def test_filled_nodes_are_known_to_the_field(arc):
+    index = np.argwhere(arc.body.inside)
+    height = arc.body.ends.height(arc.body.inside_points()[1], "posterior")
+    index = index[np.abs(height - np.median(height)) < 3][::200]  # mm; nodes at ends lie closer
+    field = resampled(replace(arc.body, filled=index))
+    points = index @ arc.body.affine[:3, :3].T + arc.body.affine[:3, 3]
+    nodes = np.argwhere(field.slits).astype(float)
+    distance = np.linalg.norm(field.grid.to_ras(nodes)[:, None] - points, axis=-1).min(axis=1)
+    assert distance.max() <= 0.5 * np.sqrt(3) * 0.4 + 1e-6  # half the diagonal of a voxel

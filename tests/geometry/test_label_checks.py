@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from hipsta_bids.cli import main
 from hipsta_bids.errors import ExitCode, GeometryError
+from hipsta_bids.geometry import label_checks
 from hipsta_bids.geometry.label_checks import check_label_image, naming_causes, note_position
 from hipsta_bids.inputs.labels import read_label_volume
 from hipsta_bids.phantom import (
@@ -301,3 +302,21 @@ def test_a_dry_run_says_what_is_wrong(tmp_path, capsys):
     assert line.startswith("sub-01 L freesurfer, will be refused: the order of subiculum")
     assert last == "labels of 2 hemispheres checked, problems in 1"
     assert not (tmp_path / "out").exists()
+
+
+def test_winding_of_three_groups_is_that_of_their_triangle():
+    """4 3^0.5 area / sum of squared edges, seen along z; NaN if that is nearly edge-on."""
+    spread = np.random.default_rng(1).normal(size=(50, 3))
+    spread -= spread.mean(axis=0)
+    for first, second, third, wanted in (
+        ([0, 0, 0], [2, 0, 0], [1, 3**0.5, 0], 1.0),
+        ([2, 0, 0], [0, 0, 0], [1, 3**0.5, 0], -1.0),
+        ([0, 0, 5], [3, 0, 5], [0, 3, 5], 0.75**0.5),
+        ([0, 0, 0], [1, 0, 0], [3, 0, 0], 0.0),
+        ([0, 0, 0], [1, 0, 2.4], [0, 1, 0], np.nan),
+        ([0, 0, 0], [1, 0, 2.2], [0, 1, 0], 2 * 3**0.5 / (2 * 4.84 + 4)),
+    ):
+        groups = [corner + spread for corner in (first, second, third)]
+        for few, expected in ((0, wanted), (1, np.nan)):
+            found = label_checks._winding([groups[0], groups[1], groups[2][few:]], np.eye(3)[2])
+            assert found == pytest.approx(expected, abs=1e-12, nan_ok=True)

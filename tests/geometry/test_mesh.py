@@ -1,5 +1,7 @@
 """The closed surface and its tetrahedra: sphere, planar caps, orientation, volume, quality."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from geometry_cases import box_mesh, field_of, ribbon_mask, short_phantom
@@ -265,3 +267,11 @@ def test_box_volumes():
     mesh = box_mesh((2, 3, 4), (1.0, 2.0, 3.0))
     volumes = tetra_volumes(mesh.vertices, mesh.tetrahedra)
     np.testing.assert_allclose(volumes, 6.0 / (24 * 6), rtol=1e-12)  # rounding
+
+
+def test_the_sharpest_fold_is_the_edge_with_the_smallest_angle():
+    """A wedge with a ridge of 2 mm, far from the origin; its other angles are larger."""
+    points = np.array([[0, 0, 0], [0, 2, 0], [5, 0, 1], [5, 2, 1], [5, 0, -1], [5, 2, -1.0]])
+    faces = [[0, 3, 1], [0, 2, 3], [0, 1, 5], [0, 5, 4], [2, 5, 3], [2, 4, 5], [0, 4, 2], [1, 3, 5]]
+    wedge = SimpleNamespace(vertices=np.add(points, [50, -30, 20]), triangles=np.array(faces))
+    np.testing.assert_allclose(meshing._sharpest_fold(wedge), [50, -29, 20])

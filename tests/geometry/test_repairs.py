@@ -5,10 +5,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from grids import straight_grid
 from test_columns import BENT, HIGH, LOW, at, flat_sheet, plate_field
 
-from hipsta_bids.geometry.grid import Field, _smooth, before_mending
 from hipsta_bids.geometry.measures import column_area
 from hipsta_bids.geometry.repairs import doubtful_columns, repair_metrics
 from hipsta_bids.geometry.topology import SolidField, repaired_columns
@@ -76,26 +74,3 @@ def test_a_stump_is_doubtful_and_a_filled_gap_is_not():
         marked = doubtful_columns(sheet, gap, [flag])
         assert marked[0, 0] == flagged
         assert not marked[3:].any()
-
-
-def test_filled_labels_are_taken_off_a_smooth_field_again():
-    grid = straight_grid((24, 24, 24))
-    whole = np.zeros(grid.shape, dtype=np.float32)
-    whole[8:16] = 1
-    gap, slit = (np.zeros(grid.shape, dtype=bool) for _ in range(2))
-    gap[8:10, 4:9], slit[12:14, 16:18] = True, True
-    field = Field(
-        grid=grid, values=_smooth(whole, 1.5) - 0.5, smoothing=1.5, cavities=gap, slits=slit
-    )
-    labeled = np.where(slit | gap, 0, whole).astype(np.float32)
-    found = before_mending(field).values
-    np.testing.assert_allclose(found, _smooth(labeled, 1.5) - 0.5, atol=1e-5)
-
-
-def test_turns_that_were_parted_touch_again():
-    grid = straight_grid((24, 24, 24))
-    parted, whole = np.zeros(grid.shape, dtype=bool), np.ones(grid.shape, dtype=np.float32)
-    parted[11:13] = True
-    values = _smooth(np.where(parted, 0, whole).astype(np.float32), 1.5) - 0.5
-    field = Field(grid=grid, values=values, smoothing=1.5, separated=parted)
-    np.testing.assert_allclose(before_mending(field).values, _smooth(whole, 1.5) - 0.5, atol=1e-5)

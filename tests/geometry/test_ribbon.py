@@ -7,7 +7,7 @@ import pytest
 from geometry_cases import plain_body, straight_ends
 from scipy import ndimage
 
-from hipsta_bids.geometry import slices
+from hipsta_bids.geometry import ribbon, slices
 from hipsta_bids.geometry.outlines import DISTANCE_REACH, SLIT_HALF_WIDTH, cut_rings, outline_slice
 from hipsta_bids.geometry.ribbon import (
     LEAST_HALF_THICKNESS,
@@ -322,3 +322,21 @@ def test_outlines_of_labels_give_nodes_too():
     nodes = ribbon_nodes(drawn, np.where(drawn > 0, fine, np.nan), FINE)
     radius, _ = polar(nodes)
     assert np.abs(radius[10:-10, -1] - radius[10:-10, 0]).mean() == pytest.approx(WALL, abs=0.05)
+
+
+def test_near_nodes_weigh_more_in_the_move_of_a_pixel():
+    """One over the squared distance and a quarter, of the six nearest."""
+    places = np.array([[0.0, 0], [1, 0], [2, 0], [3, 0], [4, 0], [5, 0], [9, 0]])[:, None]
+    moves = np.zeros((7, 1, 2))
+    moves[2], moves[6] = [0, 6.0], [0, 1e6]
+    found = moves_between(places - 0.5 * moves, places + 0.5 * moves, np.array([[0.0, 0.0]]))
+    weight = 1 / (np.arange(6) ** 2 + 0.25)
+    np.testing.assert_allclose(found, [[0, 6 * weight[2] / weight.sum()]])
+
+
+def test_what_rises_laterally_has_a_covariance_with_the_ranks():
+    ranks = np.full((4, 5), np.nan)
+    points = np.array([[1.2, 0.9], [1, 2], [0.6, 3.4], [3, 9]])
+    assert ribbon._rises(np.ones(4), points, ranks) == 0
+    ranks[1, 1:4] = [1, 2, 6]
+    assert ribbon._rises(np.array([1.0, 0, 2, 100]), points, ranks) == pytest.approx(-2 + 6)

@@ -196,3 +196,10 @@ def test_sheets_refuse_wrong_shapes():
     assert not Sheet(points=points, valid=np.ones((4, 3), dtype=bool)).points.flags.writeable
     with pytest.raises(ValueError, match=r"Sheet\.valid: shape"):
         Sheet(points=points, valid=np.ones((3, 4), dtype=bool))
+
+
+def test_rows_of_the_head_and_the_tail_are_as_far_apart_as_those_of_the_body():
+    grid = SheetSettings(y_nodes=5, y_extent=0.8)
+    np.testing.assert_allclose(sheet_levels(grid)[1], [-0.8, -0.4, 0, 0.4, 0.8], atol=EXACT)
+    rows = sheet_levels(grid, "whole")[1]
+    np.testing.assert_allclose(rows, 0.4 * np.arange(-4, 7), atol=EXACT)

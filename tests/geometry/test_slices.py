@@ -7,6 +7,8 @@ import pytest
 from geometry_cases import plain_body, solve_case, straight_ends
 from scipy import ndimage
 
+from hipsta_bids.geometry import outlines
+from hipsta_bids.geometry import slices as shapes
 from hipsta_bids.geometry.measures import measure_thickness
 from hipsta_bids.geometry.outlines import DISTANCE_REACH, SLIT_HALF_WIDTH, outline_slice
 from hipsta_bids.geometry.shares import SheetShare
@@ -313,3 +315,75 @@ def test_thickness_on_thick_slices_across_the_axis(kind):
     turn = np.array([[1, 0, 0], [0, np.cos(tilt), np.sin(tilt)], [0, -np.sin(tilt), np.cos(tilt)]])
     case = solve_case(phantom, voxel_size=(0.4, 2.0, 0.4), grid_rotation=turn)
     assert measure_thickness(case.sheet).mean() == pytest.approx(2.0, abs=0.04)
+
+
+def test_a_step_of_the_registration_of_ramps_is_their_shift():
+    """The ridge holds back two per cent; across the slope nothing moves."""
+    at = np.indices((40, 44)) * PIXEL
+    ramps = [0.6 * (at[0] - shift) + 0.8 * at[1] for shift in (0.0, 1.0, 3.0)]
+    images = np.stack(ramps).astype(np.float32)
+    flow = shapes._improved(images, np.zeros((2, 2, 40, 44), dtype=np.float32), PIXEL)
+    shift = 0.6 * np.array([1.0, 2.0]) / PIXEL / (1 + shapes.FLOW_RIDGE)
+    middle = flow[:, :, 16:-16, 16:-16] - np.multiply.outer([0.6, 0.8], shift)[..., None, None]
+    np.testing.assert_allclose(middle, 0, atol=1e-4)
+
+
+def test_linear_functions_survive_other_pixels():
+    number, row, column = np.indices((3, 9, 8)).astype(np.float32)
+    images = 10 * number + 2 * row - 3 * column
+    shrunk = shapes._shrunk(images, 4)
+    np.testing.assert_allclose(shrunk[:, :2], images[:, 1:8:4, 1:8:4] - 0.5)
+    np.testing.assert_allclose(shrunk[:, 2], images[:, 8, 1::4] - 1.5)  # the border is repeated
+    number, row, column = np.indices((3, 18, 16)).astype(np.float32)
+    doubled = shapes._doubled(np.stack([images, -images]), (18, 16))[..., 1:-1, 1:-1]
+    expected = (20 * number + 2 * row - 3 * column + 0.5)[:, 1:-1, 1:-1]
+    np.testing.assert_allclose(doubled, [expected, -expected])
+    moved = shapes._moved(images, np.stack([0.25 + 0 * images, 0.5 + 0 * images]))
+    np.testing.assert_allclose(moved[:, :-1, :-1], images[:, :-1, :-1] + 0.5 - 1.5)
+
+
+@pytest.mark.parametrize("smoothing", [0.0, 0.4, 1.0])
+def test_shapes_between_slices_follow_paths_and_shares(smoothing, monkeypatch):
+    """Edges across the first axis, in places whose path through the slices is known."""
+    monkeypatch.setattr(shapes, "PATH_SMOOTHING", smoothing)
+    places = np.array([10.0, 13.0, 12.0, 15.0])
+    flows = np.zeros((2, 3, 20, 16), dtype=np.float32)
+    flows[0] = np.diff(places)[:, None, None]
+    bends = np.zeros((2, 4, 20, 16), dtype=np.float32)
+    bends[0, 1:3] = np.diff(places, 2)[:, None, None]
+    edges = np.indices((4, 40, 32))[1] - places[:, None, None]
+    stack = shapes._SliceStack(
+        outlines=edges.astype(np.float32),
+        ends=np.full((2, 4, 40, 32), -9.0, dtype=np.float32),
+        flows=flows,
+        bends=bends,
+        settings=SETTINGS,
+    )
+    levels = np.array([0.25, 1.0, 1.5, 2.75, 3.5, -0.5])
+    straight = np.array([10.75, 13.0, 12.5, 14.25, 15.75, 9.25])
+    before, after = np.diff(places, 2)
+    cubic = np.array([-before * 3 / 128, 0, -(before + after) / 16, -after * 3 / 128, 0, 0])
+    spline = np.array([before / 384, before / 6, (before + after) / 48, after / 384, 0, 0])
+    bent = smoothing * spline + (1 - smoothing) * cubic
+    pixels = np.tile(np.array([[14.0], [11.0]]), len(levels)).astype(np.float32)
+    found = stack.blend(levels.astype(np.float32), pixels)
+    np.testing.assert_allclose(found, 14.0 - straight - bent, atol=1e-4)
+
+
+def test_places_of_ribbons_give_flows_and_bends():
+    line = np.stack(np.broadcast_arrays(np.linspace(4, 30, 9)[:, None], [11, 12, 13]), axis=-1)
+    ribbons = [line, line + np.array([2.0, 1.0]), line + np.array([3.0, 5.0]), None, line]
+    flows = np.full((2, 4, 16, 16), 7.0, dtype=np.float32)
+    bends = np.zeros((2, 5, 16, 16), dtype=np.float32)
+    shapes._align(flows, bends, ribbons, SETTINGS)
+    steps = np.array([[2.0, 1.0, 7.0, 7.0], [1.0, 4.0, 7.0, 7.0]])
+    np.testing.assert_allclose(flows, steps[..., None, None] + 0 * flows, rtol=1e-5)
+    expected = np.array([[0.0, -1.0, 0, 0, 0], [0.0, 3.0, 0, 0, 0]])
+    np.testing.assert_allclose(bends, expected[..., None, None] + 0 * bends, atol=1e-5)
+
+
+def test_pixels_have_their_distance_from_a_segment():
+    found = outlines._segment_distance((4, 9), np.array([2, 3]), np.array([2, 6]))
+    row, column = np.indices((4, 9))
+    beyond = np.maximum(np.maximum(3 - column, column - 6), 0)
+    np.testing.assert_allclose(found, np.hypot(row - 2, beyond))

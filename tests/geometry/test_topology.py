@@ -372,3 +372,72 @@ def test_each_slit_is_an_edit_with_its_nodes():
     field = SimpleNamespace(separated=None, slits=slits, cavities=None)
     edits = topology._before_smoothing(field)
     assert [(edit.kind, len(edit.nodes)) for edit in edits] == [("slit", 1), ("slit", 2)]
+
+
+def test_a_filled_hole_is_as_thick_as_the_wall_beside_it():
+    """Plates of 5 and, farther away, 9 nodes; the membrane lies in the middle of the first."""
+    state = np.zeros((44, 24, 44), dtype=bool)
+    state[2:42, 9:14, 2:42] = state[31:42, 7:16, 2:42] = True
+    state[10:13, 9:14, 30:33] = False
+    whole = state.copy()
+    whole[10:13, 9:14, 30:33] = True
+    nodes = np.stack(np.meshgrid([10, 11, 12], [11], [30, 31, 32], indexing="ij"), -1).reshape(
+        -1, 3
+    )
+    state[tuple(nodes.T)] = True
+    lifted = np.full(state.shape, -1.0, dtype=np.float32)
+    added = membranes._thicken(state, lifted, nodes)
+    np.testing.assert_array_equal(state, whole)
+    assert len(added) == 5 * 9
+
+
+def test_stumps_of_a_cut_lie_along_the_line_between_them():
+    solid = np.zeros((9, 9, 12), dtype=bool)
+    cut = np.array([[4, 5, 6], [5, 5, 6]])
+    solid[3, 5, 4] = solid[6, 5, 8] = True
+    assert membranes._stumps_along(cut[:1], solid) == 0
+    assert membranes._stumps_along(cut, solid) == pytest.approx(16 / 25)
+
+
+def test_cuts_between_turns_that_touch_sever_nothing(monkeypatch):
+    """Whether they touch is asked at the place of the cut."""
+    mask, _, where = with_bridge()
+    monkeypatch.setattr(membranes, "SEVER_ALONG", -1.0)
+    places = []
+
+    def touch(points):
+        places.append(SPACING * np.array(where) - points.mean(axis=0))
+        return True
+
+    field = field_of(mask, spacing=SPACING)
+    solid = topology.repair_topology(field, TOPOLOGY, lambda _: "", touch)
+    assert only_repair(solid, "cut").excess < np.inf
+    assert np.linalg.norm(places, axis=1).max() < 2.5
+
+
+def test_fills_across_the_axis_cost_more_away_from_the_ends():
+    solid = np.zeros((20, 20, 40), dtype=bool)
+    across = np.argwhere(np.ones((5, 5, 1), dtype=bool)) + np.array([5, 5, 20])
+    for shift, dear in ((0, True), (-12, True), (-13, False), (11, True), (12, False)):
+        factor = membranes._implausibility("fill", across + np.array([0, 0, shift]), solid)
+        assert factor == (membranes.ACROSS_FACTOR if dear else 1)
+    assert membranes._implausibility("fill", across[:, [0, 2, 1]], solid) == 1
+    assert membranes._implausibility("fill", across[:3], solid) == 1
+
+
+def test_changes_beyond_the_end_planes_are_known():
+    nodes = membranes.FIRST + np.array([[4, 4, level] for level in (2, 3, 16, 17)])
+    field = SimpleNamespace(beyond=3, grid=SimpleNamespace(shape=(9, 9, 20)))
+    between = topology._between_planes(membranes.Edit("cut", nodes), field)
+    assert between.tolist() == [False, True, True, False]
+
+
+def test_a_body_continues_two_nodes_before_and_behind_a_cut_or_beyond_an_end():
+    nodes = np.array([[4, b, 10] for b in range(1, 11)])
+    for first, last, continues in ((8, 12, True), (9, 12, False), (8, 11, False)):
+        solid = np.zeros((9, 12, 16), dtype=bool)
+        solid[4, 1, first : last + 1] = True  # and the node beside it: two of ten
+        assert membranes._continues(nodes, solid) is continues
+        assert not membranes._continues(nodes + np.array([0, 0, 2]), solid)
+    solid[4, 1, 10:14] = True
+    assert membranes._continues(nodes + np.array([0, 0, 2]), solid)

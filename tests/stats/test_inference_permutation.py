@@ -8,6 +8,7 @@ import pytest
 from scipy import stats
 
 from hipsta_bids.errors import ModelError
+from hipsta_bids.stats import exchangeability
 from hipsta_bids.stats.clusters import sheet_edges
 from hipsta_bids.stats.contrasts import Contrast
 from hipsta_bids.stats.exchangeability import Visits, choose_exchange
@@ -225,3 +226,96 @@ def test_blocks_move_whole_and_visits_stay_at_home(order):
     np.testing.assert_array_equal(inside[:, 0], visits.people)
     assert (inside[:, 1] != visits.times).sum() > 20
     assert sorted(map(tuple, inside)) == sorted(map(tuple, basis))
+
+
+@pytest.mark.parametrize("contrast", [GROUP, Contrast("both", np.eye(3)[1:])])
+def test_designs_are_split_into_tested_and_other_columns(contrast):
+    """Tested columns give the estimate over its standard error's factor; together they span."""
+    _, matrix, maps = case()
+    designs = np.stack([matrix, matrix * [1, 2, 3]])
+    tested, nuisance = exchangeability.split(designs, contrast)
+    for part, design in zip(np.concatenate([tested, nuisance], axis=-1), designs, strict=True):
+        np.testing.assert_allclose(part.T @ part, np.eye(3), atol=1e-9)
+        np.testing.assert_allclose(part @ (part.T @ design), design, atol=1e-9)
+        estimate = contrast.weights @ np.linalg.lstsq(design, maps, rcond=None)[0]
+        spread = contrast.weights @ np.linalg.inv(design.T @ design) @ contrast.weights.T
+        gained = np.sum(estimate * np.linalg.solve(spread, estimate), axis=0)
+        scores = part[:, : contrast.n_rows].T @ maps
+        np.testing.assert_allclose(np.sum(scores**2, axis=0), gained, rtol=1e-9)
+    assert exchangeability.spans_constant(matrix, contrast)
+    assert not exchangeability.spans_constant(matrix, Contrast("mean", np.eye(3)[0]))
+    assert exchangeability.spans_constant(matrix[:, :1], Contrast("map", np.array([0.0, 1.0])))
+
+
+@pytest.mark.parametrize("count", [7, 5000, 70_000])
+def test_keys_are_the_order_of_rows(count):
+    key = np.random.default_rng(count).random(count)
+    rows = np.arange(count)[:, None].astype(float)
+    np.testing.assert_array_equal(exchangeability.shuffle(rows, None, key)[:, 0], np.argsort(key))
+    inside = exchangeability.shuffle(rows[:5], np.array([1, 0, 1, 0, 1]), np.arange(5) * -1.0)
+    assert inside[:, 0].tolist() == [4, 3, 2, 1, 0]
+    flipped = exchangeability.flip(rows[1:4], np.array([0.49, 0.5, 0.51]))
+    assert flipped[:, 0].tolist() == [-1, 2, 3]
+
+
+def two_visits(people, between=0.0):
+    """A group of every second participant, and a number that changes by two, with times."""
+    who = np.repeat(np.arange(people), 2)
+    change = np.tile([-1.0, 1.0], people) + np.sqrt(between) * np.where(who // 2 % 2, 1, -1)
+    return who, np.column_stack([np.ones(len(who)), who % 2, change])
+
+
+def test_exchange_is_chosen_by_classes_and_by_what_changes():
+    group, change = Contrast("group", np.eye(3)[1]), Contrast("change", np.eye(3)[2])
+    for people, wanted in ((4, "flip"), (5, "whole")):
+        who, matrix = two_visits(people)
+        assert choose_exchange(matrix, group, Visits(who), "auto") == wanted
+        assert choose_exchange(matrix, change, Visits(who), "auto") == "within"
+    # Of the sum of squares 1 / 11 and 12 / 112 lie between participants.
+    for between, wanted in ((0.1, "within"), (0.12, "flip")):
+        who, matrix = two_visits(40, between)
+        assert choose_exchange(matrix, change, Visits(who), "auto") == wanted
+        assert choose_exchange(matrix, change, Visits(who, slopes=True), "auto") == "flip"
+    with pytest.raises(ModelError, match="change differs between participants, which"):
+        choose_exchange(matrix, change, Visits(who), "within")
+    with pytest.raises(ModelError, match="change is the same in all participants, which"):
+        choose_exchange(matrix, change, Visits(who), "whole")
+    assert choose_exchange(matrix, change, Visits(who), "flip") == "flip"
+    assert choose_exchange(matrix, group, Visits(who), "whole") == "whole"
+    who, matrix = two_visits(40)
+    visits = Visits(who, np.tile([0.0, 2.0], 40), blocks=who % 2)
+    assert visits.classes().tolist() == [[2] * 80, (who % 2).tolist()]
+    signs = visits.shuffle(matrix, "flip", np.where(np.arange(80) < 20, 0.1, 0.9), np.zeros(80))
+    np.testing.assert_array_equal(signs, matrix * np.where(who < 20, -1, 1)[:, None])
+    text = exchangeability.exchange_text(matrix, [group, change, GROUP], visits, "auto")
+    assert text == (
+        "For group, group, participants with the same number of visits were exchanged; for change,"
+        " visits were exchanged within participants"
+    )
+    # A curve of time that all have, or that all of a block have, differs between nobody.
+    own = np.where(who % 2, 3.0, 1.0) * visits.times[:, None].T
+    for tested, is_varying in ((own, False), (own + who // 2 % 2, True)):
+        assert exchangeability.varies_between(tested.T, visits) == is_varying
+    assert exchangeability.varies_between(own.T, replace(visits, blocks=None))
+    assert not exchangeability.varies_inside(np.column_stack([who % 2, who]), who)
+    assert exchangeability.varies_inside(np.column_stack([who % 2, who]), who % 2)
+
+
+def test_effects_that_blocks_determine_are_refused():
+    random = np.random.default_rng(0)
+    who, matrix = two_visits(20)
+    maps, none = random.standard_normal((40, 3)), np.empty((0, 2), dtype=np.int64)
+    few = MultiplicitySettings(method="permutation-max", permutations=120)
+    group, change = Contrast("group", np.eye(3)[1]), Contrast("change", np.eye(3)[2])
+    for visits in (None, Visits(who)):
+        part = PermutationPart(maps, matrix, np.arange(40), none, visits)
+        with pytest.raises(ModelError, match="group does not vary inside the blocks"):
+            permute_parts([part], group, settings=few, blocks=who % 2)
+        done = []
+        blocks = who // 2 % 2
+        (found,) = permute_parts([part], change, settings=few, blocks=blocks, report=done.append)
+        assert done == [0, 50, 100]
+        assert np.isnan(found.p_enhanced).all()
+    mean = Contrast("mean", np.eye(3)[0])  # signs are flipped, blocks or not
+    (found,) = permute_parts([part], mean, settings=few, blocks=who)
+    assert (found.p_max >= found.p_uncorrected).all()

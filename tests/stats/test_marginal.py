@@ -61,7 +61,8 @@ def estimate(formula, *contrasts):
     """Test contrasts in one design; by name."""
     table = people()
     spec = parse_model(model_from_shortcut(formula, list(contrasts), "test"))
-    design = build_design(table, spec, DesignSettings(), {"group": "CN"})
+    references = {"group": "CN"} if "group" in formula else {}
+    design = build_design(table, spec, DesignSettings(), references)
     y = table["y"].to_numpy()[design.rows, None]
     tests = fit_points(y, design.matrix, design.contrasts, GlmSettings()).tests
     return {test.contrast.name: test for test in tests}
@@ -192,3 +193,63 @@ def test_contrasts_without_sense_are_refused_in_one_line(contrast, said):
     with pytest.raises(ModelError, match=said) as caught:
         estimate("group + sex + age", contrast)
     assert "\n" not in str(caught.value)
+
+
+def weights_of(formula, *contrasts):
+    """Weights other than zero by column, of contrasts or, without these, of columns."""
+    spec = parse_model(model_from_shortcut(formula, list(contrasts), "m"))
+    table = people().assign(part=np.resize(["F", "M"], 150))
+    design = build_design(table, spec, DesignSettings(), {})
+    names = [*design.columns, "map(c)", "map(d)"]
+    return {
+        c.name: {names[i]: c.weights[0, i] for i in np.flatnonzero(c.weights[0])}
+        for c in design.contrasts
+    }
+
+
+@pytest.mark.parametrize(
+    ("formula", "names"),
+    [
+        ("group + sex", ["CN-AD", "CN-MCI", "F-M"]),
+        ("sex + part", ["F-M", "part F-M"]),
+        ("C(carrier) * age", ["carrier 0-1", "age", "carrier 0-1:age"]),
+        ("sex * part", ["F-M", "part F-M", "sex[T.M]:part[T.M]"]),
+        ("0 + sex", ["sex[F]", "sex[M]"]),
+        ("age * carrier + map(c)", ["age", "carrier", "age:carrier", "map(c)"]),
+        ("sex + sex:age:carrier", ["F-M", "sex[F]:age:carrier", "sex[M]:age:carrier"]),
+        ("poly(age, 2)", ["poly(age, 2)[1]", "poly(age, 2)[2]"]),
+    ],
+)
+def test_columns_are_tested_by_names_that_say_what_they_are(formula, names):
+    assert list(weights_of(formula)) == names
+
+
+def test_weights_of_slopes_and_maps():
+    assert weights_of("sex * age")["F-M:age"] == {"sex[T.M]:age": pytest.approx(-1)}
+    both = weights_of("sex + map(c) + map(d)", "x = sex[F] - 3*map(d)", "m = 4*map(c)")
+    assert both == {"x": {"Intercept": 1, "map(d)": -3}, "m": {"map(c)": 4}}
+
+
+def test_bends_are_tested_apart_from_the_line():
+    """The one row of a parabola has the coefficient of the square; others are an F of the rest."""
+    table = people()
+    square = np.polyfit(table["age"], table["y"], 2)[0]
+    for formula in ("age + I(age ** 2)", "poly(age, 2)"):
+        bend = estimate(formula, "nonlinear(age)")["nonlinear(age)"]
+        assert bend.estimate[0, 0] == pytest.approx(square, rel=1e-6)
+    splines = "cr(age, df=4, constraints='center') + sex"
+    test = estimate(splines, "nonlinear(age)")["nonlinear(age)"]
+    reduced = smf.ols("y ~ age + sex", table).fit()
+    f, _, df = smf.ols(f"y ~ {splines}", table).fit().compare_f_test(reduced)
+    assert (test.contrast.n_rows, test.statistic[0]) == (df, pytest.approx(f, rel=1e-6))
+    for formula, contrast, text in (
+        ("age + sex", "nonlinear(age)", "is in the formula as a line at most"),
+        ("group", "nonlinear(group)", "is in the formula as a line at most"),
+        ("I(age ** 2) + I(age ** 3)", "nonlinear(age)", "no line of 'age' is in the formula"),
+        ("poly(age, 2) * sex", "age | sex=M", "age is no line, so that it has no slope"),
+        ("sex + log(age)", "sex | age=0", "the formula has no value there"),
+        ("sex + age", "sex | age=inf", "age is a number, not 'inf'"),
+        ("sex + age", "nonlinear(age) - age", "nothing is called 'nonlinear"),
+    ):
+        with pytest.raises(ModelError, match=text):
+            estimate(formula, contrast)

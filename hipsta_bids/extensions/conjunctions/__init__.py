@@ -16,10 +16,10 @@ EXTENSION = Extension(
             contrasts=f"{__name__}.texts:fitted_contrasts",
             plan=f"{__name__}.texts:plan_conjunctions",
             excludes=("--correction by permutation", "--joint"),
-            places={"tests": f"{__name__}.together:combine"},
+            places=dict.fromkeys(("tests", "summarize"), f"{__name__}.together:combine"),
             blocks={
+                "columns": f"{__name__}.together:meaning",
                 "methods-after": f"{__name__}.together:methods",
-                "record": f"{__name__}.together:record",
             },
         ),
     ),

@@ -17,8 +17,8 @@ _AND, _SIGN = (re.compile(rf"{sign}(?![^\[]*\])") for sign in (r"\s*&\s*", "[<>]
 _WITHIN = re.compile(
     r"\|\s*(?P<body>[^|]+?)\s*\|\s*<\s*(?P<margin>(?:\d+\.?\d*|\.\d+)(?:e-?\d+)?)(?P<ending>\s*\|.*)?"
 )
-#: Names of the parts of each conjunction, by its name.
-Plan = Mapping[str, tuple[str, ...]]
+#: Names of parts by conjunction, and names of the contrasts that are no conjunctions.
+Plan = tuple[Mapping[str, Sequence[str]], Sequence[str]]
 
 
 def describe(parser: Parser) -> None:
@@ -30,45 +30,41 @@ def describe(parser: Parser) -> None:
     )
 
 
-def fitted_contrasts(texts: Sequence[str]) -> tuple[str, ...]:
-    """Return texts of contrasts with conjunctions as their parts, each part once."""
-    plain = [text for text in texts if not _split(text)[1]]
-    return (*plain, *(text for name, text in _parts(texts).items() if name not in _names(plain)))
-
-
 def is_asked(request: "Request") -> bool:
     """Check for conjunctions."""
-    return bool(_parts(request.contrasts))
+    return any(_split(text)[1] for text in request.contrasts)
 
 
-def plan_conjunctions(request: "Request") -> tuple[Plan, frozenset[str]]:
-    """Return conjunctions, and the names of parts that are no results by themselves."""
+def fitted_contrasts(texts: Sequence[str]) -> tuple[str, ...]:
+    """Return texts of contrasts with conjunctions as their parts, each part once."""
+    parts = list(chain.from_iterable(_split(text)[1] for text in texts))
+    if not parts:
+        return tuple(texts)
+    plain = [text for text in texts if not _split(text)[1]]
+    names = set(map(_name, plain))
+    return (*plain, *{_name(part): part for part in parts if _name(part) not in names}.values())
+
+
+def plan_conjunctions(request: "Request") -> Plan:
+    """Return conjunctions and other contrasts; ModelError if names of files are the same."""
     from hipsta_bids.stats.formula import check_labels  # noqa: PLC0415  (start-up time)
 
-    splits = [_split(text) for text in request.contrasts]
-    pairs = zip(request.contrasts, splits, strict=True)
-    plain = _names([text for text, (_, parts) in pairs if not parts])
-    check_labels([*plain, *(name for name, parts in splits if parts)])
-    plan = {name: tuple(_names(parts)) for name, parts in splits if parts}
-    return plan, frozenset(chain.from_iterable(plan.values())) - frozenset(plain)
+    splits = {text: _split(text) for text in request.contrasts}
+    names = {text: name if parts else _name(text) for text, (name, parts) in splits.items()}
+    check_labels([names[text] for text in request.contrasts])
+    plan = {names[text]: [*map(_name, parts)] for text, (_, parts) in splits.items() if parts}
+    return plan, [name for name in names.values() if name not in plan]
 
 
-def _parts(texts: Sequence[str]) -> dict[str, str]:
-    """Return the texts of all parts by their names."""
-    parts = list(chain.from_iterable(_split(text)[1] for text in texts))
-    return dict(zip(_names(parts), parts, strict=True))
-
-
-def _names(texts: Sequence[str]) -> list[str]:
+def _name(text: str) -> str:
     from hipsta_bids.stats.contrasts import contrast_json  # noqa: PLC0415  (start-up time)
 
-    return [str(contrast_json(text)["Name"]) for text in texts]
+    return str(contrast_json(text)["Name"])
 
 
 def _split(text: str) -> tuple[str, list[str]]:
     """Return the name of a conjunction and its one-sided parts; no parts of other contrasts."""
-    match = _NAMED.fullmatch(text)
-    name, body = match.groups() if match else ("", text)
+    name, body = _NAMED.fullmatch(text).groups()  # type: ignore[union-attr]  # fits any text
     pieces = _AND.split(body)
     if len(pieces) == 1 and not body.startswith("|"):
         return "", []
@@ -76,10 +72,10 @@ def _split(text: str) -> tuple[str, list[str]]:
     return (name or " and ".join(names)).strip(), list(chain.from_iterable(parts))
 
 
-def _sided(piece: str) -> tuple[str, tuple[str, ...]]:
-    """Return the name and the one-sided contrasts of what stands between signs."""
+def _sided(piece: str) -> tuple[str, list[str]]:
+    """Return the name and the one-sided contrasts of the text between two signs."""
     if not piece.startswith("|"):
-        return piece, (piece if _SIGN.search(piece) else f"{piece} > 0",)
+        return piece, [piece if _SIGN.search(piece) else f"{piece} > 0"]
     match = _WITHIN.fullmatch(piece)
     if match is None or not float(match["margin"]):
         raise ModelError(
@@ -87,5 +83,6 @@ def _sided(piece: str) -> tuple[str, tuple[str, ...]]:
             " above zero"
         )
     body, margin, ending = match.groups(default="")
-    parts = (f"{body} > -{margin}{ending}", f"{body} < {margin}{ending}")
-    return f"{body} within {margin}{ending}", parts
+    return f"{body} within {margin}{ending}", [
+        f"{body} {bound}{margin}{ending}" for bound in ("> -", "< ")
+    ]

@@ -1,7 +1,7 @@
 """Tests of conjunctions: at each point, all one-sided alternatives have to hold.
 
-The p-value is the largest of the parts (Berger 1982, Technometrics 24:295-300): of
-several contrasts the minimum statistic against the conjunction null (Nichols et al. 2005), of two
+The p-value is the largest of the parts (Berger 1982, Technometrics 24:295-300): of several
+contrasts the minimum statistic against the conjunction null (Nichols et al. 2005), of two
 bounds of one contrast the two one-sided tests of equivalence (Schuirmann 1987).
 """
 
@@ -16,14 +16,13 @@ from scipy import special
 from hipsta_bids.extensions.conjunctions.texts import Plan
 from hipsta_bids.group.output.citations import escaped, joined
 from hipsta_bids.group.output.results import Analysis
-from hipsta_bids.reports.cells import with_unit
-from hipsta_bids.stats.arrays import Float
+from hipsta_bids.group.output.tables import read_columns
 from hipsta_bids.stats.contrasts import Contrast
 from hipsta_bids.stats.glm import PointTest, PointwiseFit
 
 #: Fields of a test that are of the part with the largest p-value.
 _PICKED = (
-    *("p", "df", "estimate", "se"),
+    *("p", "df", "estimate", "se", "statistic"),
     *("cohen_d", "cohen_d_limits", "eta_squared", "eta_squared_limits"),
 )
 
@@ -43,37 +42,37 @@ class Conjunction(Contrast):
         return 1
 
     @property
-    def margin_within(self) -> float | None:
-        """Margin of equivalence; ``None`` if the parts are no bounds of one contrast."""
+    def is_equivalence(self) -> bool:
+        """Whether the parts are two bounds of one contrast, at the same distance from zero."""
         low, high = self.parts[0], self.parts[-1]
         is_pair = [part.side for part in self.parts] == ["greater", "less"]
-        if is_pair and low.margin == -high.margin < 0 and (low.weights == high.weights).all():
-            return high.margin
-        return None
+        is_symmetric = low.margin == -high.margin < 0
+        return is_pair and is_symmetric and np.array_equal(low.weights, high.weights)
 
     @property
     def hypothesis(self) -> str:
         """What the test shows."""
-        if self.margin_within is not None:
-            return f"equivalent within {self.margin_within:g}"
+        if self.is_equivalence:
+            return f"equivalent within {self.parts[-1].margin:g}"
         texts = [part.hypothesis for part in self.parts]
         if len(set(texts)) == 1:
             return f"{texts[0]} in each of {len(texts)} contrasts"
         return " and ".join(texts)
 
 
-def combine(analysis: Analysis, planned: tuple[Plan, frozenset[str]]) -> Analysis:
+def combine(analysis: Analysis, planned: Plan) -> Analysis:
     """Replace parts by conjunctions, in the design and wherever all parts are tested."""
-    plan, hidden = planned
+    plan, plain = planned
     level = analysis.request.settings.multiplicity.alpha
 
     def joined_parts(by_name: Mapping[str, Any], join: Callable[..., Any]) -> tuple[Any, ...]:
-        """Join the parts of conjunctions, and drop hidden parts."""
+        """Join the parts of conjunctions, and drop parts that are no results by themselves."""
         conjunctions = {
             name: join(name, [by_name[part] for part in parts])
             for name, parts in plan.items()
             if by_name.keys() >= set(parts)
         }
+        hidden = {part for parts in plan.values() for part in parts}.difference(plain)
         remaining = {name: value for name, value in by_name.items() if name not in hidden}
         return tuple((remaining | conjunctions).values())
 
@@ -82,25 +81,20 @@ def combine(analysis: Analysis, planned: tuple[Plan, frozenset[str]]) -> Analysi
         return replace(fit, tests=joined_parts(tests, partial(combine_tests, level=level)))
 
     contrasts = {contrast.name: contrast for contrast in analysis.design.contrasts}
-    return replace(
-        analysis,
-        design=replace(analysis.design, contrasts=joined_parts(contrasts, conjoin)),
-        fitted={
-            hemi: replace(side, fits={name: of_fit(fit) for name, fit in side.fits.items()})
-            for hemi, side in analysis.fitted.items()
-        },
-        measures={
-            key: (names, of_fit(fit), n) for key, (names, fit, n) in analysis.measures.items()
-        },
-    )
+    fitted = {
+        hemi: replace(side, fits={name: of_fit(fit) for name, fit in side.fits.items()})
+        for hemi, side in analysis.fitted.items()
+    }
+    measures = {key: (names, of_fit(fit), n) for key, (names, fit, n) in analysis.measures.items()}
+    design = replace(analysis.design, contrasts=joined_parts(contrasts, conjoin))
+    return replace(analysis, design=design, fitted=fitted, measures=measures)
 
 
 def conjoin(name: str, parts: Sequence[Contrast]) -> Conjunction:
-    """Make a contrast of one-sided contrasts."""
-    conjunction = Conjunction(name, parts[0].weights, "all", parts=tuple(parts))
-    if conjunction.margin_within is not None:
-        return conjunction
-    return replace(conjunction, weights=np.concatenate([part.weights for part in parts]))
+    """Make a contrast of one-sided contrasts; of equivalence, it has one row."""
+    first = Conjunction(name, parts[0].weights, "all", parts=tuple(parts))
+    weights = np.concatenate([part.weights for part in parts])
+    return first if first.is_equivalence else replace(first, weights=weights)
 
 
 def combine_tests(name: str, tests: Sequence[PointTest], level: float) -> PointTest:
@@ -109,66 +103,42 @@ def combine_tests(name: str, tests: Sequence[PointTest], level: float) -> PointT
     Statistic (positive in the direction of the alternative), estimate and effect size are of the
     part with the largest p-value. Of equivalence, limits of the estimate hold at 1 - 2 ``level``.
     """
+    signs = {"greater": 1.0, "less": -1.0}
+    tests = [replace(t, statistic=signs[t.contrast.side] * t.statistic) for t in tests]
     weakest = np.argmax([test.p for test in tests], axis=0)  # of a missing test, NaN
-
-    def pick(values: Sequence[Float]) -> Float:
-        stacked = np.stack(values)
+    picked = {}
+    for field in _PICKED:
+        stacked = np.stack([getattr(test, field) for test in tests])
         places = np.expand_dims(weakest, tuple(range(stacked.ndim - 1)))
-        return np.asarray(np.take_along_axis(stacked, places, axis=0)[0], dtype=np.float64)
+        picked[field] = np.take_along_axis(stacked, places, axis=0)[0]
+    contrast, further = conjoin(name, [test.contrast for test in tests]), {}
+    if contrast.is_equivalence:
+        estimate, reach = picked["estimate"][0], special.stdtrit(picked["df"], 1 - level)
+        reach = reach * picked["se"][0]
+        further = {"limit_low": estimate - reach, "limit_high": estimate + reach}
+    return replace(tests[0], contrast=contrast, further=further, **picked)
 
-    picked = {field: pick([getattr(test, field) for test in tests]) for field in _PICKED}
-    signs = [1.0 if test.contrast.side == "greater" else -1.0 for test in tests]
-    directed = [sign * test.statistic for sign, test in zip(signs, tests, strict=True)]
-    reach = special.stdtrit(picked["df"], 1 - level) * picked["se"][0]
-    limits = np.stack([picked["estimate"][0] - reach, picked["estimate"][0] + reach])
-    contrast = conjoin(name, [test.contrast for test in tests])
-    return replace(
-        tests[0],
-        contrast=contrast,
-        statistic=pick(directed),
-        limits=None if contrast.margin_within is None else limits,
-        **picked,
-    )
+
+def meaning(planned: Plan) -> Iterator[Mapping[str, str]]:  # noqa: ARG001  (as of all steps)
+    """Return the meaning of the columns."""
+    yield read_columns(__package__)
 
 
 def methods(analysis: Analysis, cite: Callable[[str], str]) -> Iterator[str]:
     """Write how conjunctions and equivalence were tested."""
     contrasts = [c for c in analysis.design.contrasts if isinstance(c, Conjunction)]
-    names = [
-        *analysis.measured.maps,
-        *(n for names, *_ in analysis.measures.values() for n in names),
-    ]
-    unit = analysis.cohort.units.get(names[0], "1")
-    within = [
-        f"{escaped(c.name)}: {with_unit(f'{c.margin_within:g}', unit)}"
-        for c in contrasts
-        if c.margin_within is not None
-    ]
-    joint = [
-        f"{escaped(c.name)} ({escaped(joined([part.name for part in c.parts]))})"
-        for c in contrasts
-        if c.margin_within is None
-    ]
-    level = 1 - 2 * analysis.request.settings.multiplicity.alpha
-    text = ""
-    if joint:
-        text += (
+    if joint := [c for c in contrasts if not c.is_equivalence]:
+        parts = [f"{c.name} ({joined([part.name for part in c.parts])})" for c in joint]
+        yield (
             f"Conjunctions were tested by the minimum statistic {cite('conjunction')}:"
-            f" {'; '.join(joint)}. The p-value of a conjunction is the largest of its one-sided"
-            " p-values, so that all its contrasts have to hold. Estimates and effect sizes are"
-            " of the contrast with the largest p-value. "
+            f" {escaped('; '.join(parts))}. The p-value of a conjunction is the largest of its"
+            " one-sided p-values, so that all its contrasts have to hold. Estimates and effect"
+            " sizes are of the contrast with the largest p-value."
         )
-    if within:
-        text += (
-            f"Equivalence was tested by two one-sided tests {cite('tost')} {cite('equivalence')},"
-            f" with {level:.0%} limits of the difference and these margins: {'; '.join(within)}."
-            " Without significance, equivalence is not shown, which is no evidence of a"
-            " difference. "
+    if within := [c.name for c in contrasts if c.is_equivalence]:
+        level = 1 - 2 * analysis.request.settings.multiplicity.alpha
+        yield (
+            f"Equivalence ({escaped(joined(within))}) was tested by two one-sided tests"
+            f" {cite('tost')} {cite('equivalence')}, with {level:.0%} limits of the difference."
+            " Without significance, equivalence is not shown, which is no evidence of a difference."
         )
-    yield text.strip()
-
-
-def record(analysis: Analysis) -> Iterator[tuple[str, Any]]:
-    """Record the parts of conjunctions."""
-    plan, _ = analysis.request.plans["conjunctions"]
-    yield "conjunctions", plan

@@ -374,7 +374,7 @@ def _check_model(analysis: Analysis, settings: GroupSettings) -> None:
     problem = None
     if analysis.comparison.sessions.is_repeated:
         problem = "of --longitudinal cannot be combined; use --paired"
-    elif analysis.model.maps:
+    elif analysis.model.added:
         problem = "with map() cannot be combined; remove the term"
     elif analysis.is_adjusted:
         problem = "of harmonized values cannot be combined; leave --harmonize out"

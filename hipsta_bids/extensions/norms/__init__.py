@@ -25,7 +25,10 @@ EXTENSION = Extension(
             settings=f"{__name__}.options:check_normative",
             comparison=("normative",),
             plan=f"{__name__}.scoring:choose_reference",
-            excludes=("map() in the formula",),
+            excludes=(
+                "map() in the formula",
+                "summary measures in the formula",
+            ),
             places={"score": f"{__name__}.scoring:score_cohort"},
             blocks={
                 "tables": f"{__name__}.scoring:tables",

@@ -13,7 +13,7 @@ from hipsta_bids.extensions.norms import EXTENSION, STEP
 from hipsta_bids.extensions.norms.wscores import ScoredMaps, w_scores
 from hipsta_bids.group.cohort import data
 from hipsta_bids.group.output.results import Analysis
-from hipsta_bids.group.output.tables import entity_label, read_columns
+from hipsta_bids.group.output.tables import Averages, entity_label, read_columns
 from hipsta_bids.group.output.write import can_write_parquet
 from hipsta_bids.group.request import Request
 from hipsta_bids.group.settings import GroupSettings
@@ -166,6 +166,7 @@ def score_files(
     cohorts: Mapping[str, data.Cohort],
     analyses: Mapping[str, Analysis],
     labels: Mapping[str, list[str]],  # noqa: ARG001  (as of all steps)
+    averages: Averages,  # noqa: ARG001  (as of all steps)
 ) -> Iterator[Writer]:
     """Write maps of scores of all surfaces."""
     for surface, analysis in analyses.items():

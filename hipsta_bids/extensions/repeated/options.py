@@ -32,8 +32,9 @@ def add_options(add: Callable[..., None]) -> None:
 
 
 def given_settings(parsed: argparse.Namespace) -> Mapping[str, Mapping[str, Any]]:
-    """Return the random effects that an option names."""
-    return {"longitudinal": {"random": parsed.longitudinal}}
+    """Return the random effects that an option names; without a name, as set."""
+    random = parsed.longitudinal if parsed.longitudinal != "auto" else None
+    return {"longitudinal": {"random": random}}
 
 
 def choose_sessions(parsed: argparse.Namespace, settings: "GroupSettings") -> "Sessions | None":

@@ -14,6 +14,7 @@ from hipsta_bids.extensions.repeated.methods import random_effects, slopes_text,
 from hipsta_bids.extensions.repeated.mmrm import visit_model
 from hipsta_bids.group.cohort.covariates import order_sessions
 from hipsta_bids.group.model import AllSessions, Cite, Groups, Sessions, VisitTime
+from hipsta_bids.group.output.steps import COVARIATES
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.stats.arrays import Bool, Int, SideMaps, some_sheets
 from hipsta_bids.stats.design import VISIT, Design
@@ -25,7 +26,7 @@ from hipsta_bids.types import PARTICIPANT, SESSION
 #: Analyses of end points: adjusted for the baseline as a covariate, or with equal arms there.
 _ENDPOINTS = ("ancova", "mmrm", "clda")
 #: What cannot be done with visits as categories.
-_EXCLUDED = ("--correction by permutation", "--joint", "map() in the formula")
+_EXCLUDED = ("--correction by permutation", "--joint", *COVARIATES)
 
 
 def _check_sessions(table: pd.DataFrame, named: Sequence[str], option: str) -> None:
@@ -97,7 +98,7 @@ class Pair(Sessions):
             common, a, b = np.intersect1d(rows[first], rows[second], return_indices=True)
             if len(common):
                 changes = _change(side, common, first[a], second[b])
-                baseline = {name: side.maps[name][first[a]] for name in covariates}
+                baseline = {name: side.covariate(name)[first[a]] for name in covariates}
                 compared[hemi] = replace(changes, covariates=baseline)
         if sides and not compared:
             raise ModelError(

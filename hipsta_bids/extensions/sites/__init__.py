@@ -18,7 +18,7 @@ EXTENSION = Extension(
             setting="harmonization.column",
             condition=f"{__name__}.planning:is_asked",
             plan=f"{__name__}.planning:plan_sites",
-            excludes=("map() in the formula", "--endpoint"),
+            excludes=("map() in the formula", "summary measures in the formula", "--endpoint"),
             places={
                 "design": f"{__name__}.planning:without_tests_of_sites",
                 "adjust": f"{__name__}.harmonize:adjust",

@@ -15,7 +15,7 @@ from hipsta_bids.extensions.sites.saved import SavedEffects
 from hipsta_bids.group.cohort.data import Cohort
 from hipsta_bids.group.output import style
 from hipsta_bids.group.output.results import Analysis, digests
-from hipsta_bids.group.output.tables import read_columns
+from hipsta_bids.group.output.tables import Averages, read_columns
 from hipsta_bids.io import files
 from hipsta_bids.joints import Writer
 from hipsta_bids.reports.cells import display_name
@@ -127,6 +127,7 @@ def effect_files(
     cohorts: Mapping[str, Cohort],  # noqa: ARG001  (as of all steps)
     analyses: Mapping[str, Analysis],
     labels: Mapping[str, list[str]],
+    averages: Averages,  # noqa: ARG001  (as of all steps)
 ) -> Iterator[Writer]:
     """Write parameters for other participants."""
     harmonizations = [part_of(analysis) for analysis in analyses.values()]

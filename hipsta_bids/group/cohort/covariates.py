@@ -100,7 +100,7 @@ def read_covariates(
     for column in described.keys() & set(joined.columns):
         joined[column] = _with_levels(joined[column], described[column])
     for column in joined.columns.difference([PARTICIPANT, SESSION]):
-        if joined[column].dtype == object:
+        if not isinstance(joined[column].dtype, pd.CategoricalDtype):
             joined[column] = _without_codes(joined[column], settings.design.missing_codes, spelled)
     folded = joined.columns.str.casefold()
     pair = joined.columns[folded.duplicated(keep=False) & folded.isin(_known_columns(settings))]

@@ -13,6 +13,7 @@ from hipsta_bids.errors import ModelError
 from hipsta_bids.group.model import BOTH, Sessions, asymmetry_name
 from hipsta_bids.settings import SheetSettings
 from hipsta_bids.stats.arrays import Bool, Float, Int, SideMaps
+from hipsta_bids.types import REGION
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,15 +62,32 @@ class Cohort:
 def summary_values(cohort: Cohort, hemi: str, names: Sequence[str] | None = None) -> pd.DataFrame:
     """Summary measures by visit.
 
-    One row per visit of the cohort's table, NaN where missing.
+    One row per visit of the cohort's table, NaN where missing. Asymmetries of regions, which both
+    sides have, are of both only.
     """
     if hemi == BOTH:
-        left, right = (summary_values(cohort, side, names) for side in BOTH)
+        left, right = (_side_values(cohort, side, names) for side in BOTH)
         return (left + right) / 2
+    values = _side_values(cohort, hemi, names)
+    return values.loc[:, ~values.columns.str.contains(asymmetry_name("") + REGION)]
+
+
+def _side_values(cohort: Cohort, hemi: str, names: Sequence[str] | None) -> pd.DataFrame:
     side = cohort.sides[hemi]
     table = side.summary.set_axis(cohort.table.index[side.rows])
     selected = table if names is None else table[[name for name in names if name in table.columns]]
     return selected.reindex(cohort.table.index)
+
+
+def covariate_values(cohort: Cohort, hemi: str, names: Sequence[str]) -> pd.DataFrame:
+    """Summary measures that are covariates, by visit: one row per visit, NaN where missing."""
+    if hemi == BOTH:
+        left, right = (covariate_values(cohort, side, names) for side in BOTH)
+        return (left + right) / 2
+    side = cohort.sides[hemi]
+    columns = {name: side.covariates[name][:, 0, 0] for name in names}
+    table = pd.DataFrame(columns, index=cohort.table.index[side.rows])
+    return table.reindex(cohort.table.index)
 
 
 def hemispheres(cohort: Cohort) -> list[str]:

@@ -1,7 +1,7 @@
 """Reads the participant level's tables of many hemispheres into arrays, for chosen measures."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from hipsta_bids.protocols import EXPERIMENTAL
 from hipsta_bids.settings import SheetSettings
 from hipsta_bids.stats.arrays import MOST_KEPT, Float, SideMaps, blocks
 from hipsta_bids.stats.formula import listed
-from hipsta_bids.types import PARTICIPANT, SESSION, VisitKey
+from hipsta_bids.types import PARTICIPANT, REGION, SESSION, VisitKey
 
 #: Map that registration rests on.
 CURVATURE = "curvature"
@@ -70,12 +70,16 @@ def _no_measure(name: str, records: Sequence[SheetRecord], further: Sequence[str
     return _unknown(name, names, hint)
 
 
-def check_summaries(measures: Measures, sides: Mapping[str, SideMaps]) -> None:
-    """Refuse summary measures that no hemisphere has."""
+def check_summaries(measures: Measures, sides: Mapping[str, SideMaps]) -> Measures:
+    """Refuse summary measures that no hemisphere has, and add means over regions."""
     available = sorted({str(name) for side in sides.values() for name in side.summary.columns})
     for name in measures.summaries or ():
         if name not in available:
             raise _unknown(name, available, "are its tables there?")
+    if measures.summaries is None:
+        return measures
+    regions = [name for name in available if REGION in name]
+    return replace(measures, summaries=tuple(dict.fromkeys((*measures.summaries, *regions))))
 
 
 def _unknown(name: str, available: Sequence[str], hint: str) -> InputError:

@@ -18,9 +18,6 @@ from hipsta_bids.types import parts_of
 if TYPE_CHECKING:
     from hipsta_bids.stats.inference import Discoveries, MapKey
 
-#: Of the estimate, where a test has them.
-LIMITS = ("limit_low", "limit_high")
-
 
 @dataclass(frozen=True, eq=False)
 class Frame:
@@ -82,7 +79,6 @@ def test_columns(test: PointTest) -> dict[str, str | Float]:
         "df": test.df,
         "p": test.p,
         **({"alternative": test.contrast.hypothesis} if test.contrast.side else {}),
-        **({} if test.limits is None else dict(zip(LIMITS, test.limits, strict=True))),
     }
 
 
@@ -95,6 +91,7 @@ def effect_columns(test: PointTest) -> dict[str, str | Float]:
         "effect_size": test.effect,
         "effect_low": limits[0],
         "effect_high": limits[1],
+        **test.further,
     }
 
 
@@ -114,6 +111,7 @@ def point_columns(
         "eta_squared": test.eta_squared,
         "eta_squared_low": test.eta_squared_limits[0],
         "eta_squared_high": test.eta_squared_limits[1],
+        **test.further,
     }
 
 
@@ -143,8 +141,7 @@ def peak_table(
         "p_corrected": discoveries.adjusted.ravel(),
         **effect_columns(test),
     }
-    for name in ("estimate", "se", *LIMITS):
-        values.pop(name, None)
+    del values["estimate"], values["se"]
     clusters = find_clusters(discoveries.rejected.ravel(), test.statistic, frame.subfield, edges)
     return pd.DataFrame(
         [

@@ -80,7 +80,7 @@ def methods_text(
         paragraphs.append(_rims(analysis))
     paragraphs += blocks("methods", analysis.request, analysis, cite)
     paragraphs.append(_models(analysis, settings, cite))
-    paragraphs += [_joint(settings, cite)] if settings.joint.measures else []
+    paragraphs += blocks("methods-model", analysis.request, analysis, cite)
     if analysis.comparison.asymmetry:
         paragraphs.append(_asymmetry(analysis, settings, cite))
     paragraphs += blocks("methods-after", analysis.request, analysis, cite)
@@ -197,6 +197,8 @@ def _models(analysis: Analysis, settings: GroupSettings, cite: Callable[[str], s
     )
     if analysis.model.maps:
         text += f" Maps were covariates, with the value of each point {cite('point-covariates')}."
+    if analysis.model.summaries:
+        text += " Summary measures in it were covariates of the same hemisphere."
     if interactions(analysis.model.formula):
         text += (
             " Levels were compared at equal weights of other factors and at the means of covariates"
@@ -309,32 +311,6 @@ def discovery_text(
     return (
         f"The false discovery rate was controlled at {rules.alpha:g} by {PROCEDURES[rules.method]}"
         f" {cite(rules.method)}, over {_families(rules, maps)}"
-    )
-
-
-def _joint(settings: GroupSettings, cite: Callable[[str], str]) -> str:
-    rules, joint = settings.multiplicity, settings.joint
-    by = (
-        "as minus twice the sum of their logarithms (Fisher)"
-        if joint.combine == "fisher"
-        else "by the smallest (Tippett)"
-    )
-    family = "" if joint.sides else " of each side" if rules.scope == "map" else " of both sides"
-    names = joined([name.replace("_", " ") for name in joint.measures])
-    text = (
-        f"Maps of {names}{', of the left and the right side,' if joint.sides else ''} were also"
-        f" tested together by non-parametric combination {cite('joint')}. At each point, two-sided"
-        f" p-values of the maps were combined {by}, and written as a normal quantile. Residuals of"
-        f" the model without the contrast were permuted {rules.permutations} times (seed"
-        f" {rules.seed}) {cite('freedman')} {cite('permutation')}. All maps were permuted alike,"
-        " which preserved their dependence."
-    )
-    statistic = "combined evidence"
-    if rules.method == "permutation-tfce":
-        statistic = f"threshold-free cluster enhancement {cite('tfce')} of the evidence"
-    return (
-        f"{text} The largest {statistic} controlled the family-wise error rate at {rules.alpha:g}"
-        f" over the points{family}. The null hypothesis at a point is no effect in any of the maps."
     )
 
 

@@ -5,14 +5,17 @@ from dataclasses import replace
 from typing import Any
 
 from hipsta_bids.errors import ModelError
+from hipsta_bids.group.cohort.data import SHEET
 from hipsta_bids.group.output.results import Analysis
 from hipsta_bids.group.request import Request
 from hipsta_bids.joints import Step, find_steps, load
 from hipsta_bids.stats.formula import listed
 from hipsta_bids.stats.inference import PERMUTATIONS
 
+#: Flags of covariates of each hemisphere.
+COVARIATES = ("map() in the formula", "summary measures in the formula")
 #: Flags of the core, and those that they exclude; extensions have their own.
-EXCLUDED: Mapping[str, Sequence[str]] = {"map() in the formula": ("summary measures alone",)}
+EXCLUDED: Mapping[str, Sequence[str]] = {COVARIATES[0]: ("summary measures alone",)}
 
 
 def plan_steps(request: Request) -> Request:
@@ -27,21 +30,14 @@ def plan_steps(request: Request) -> Request:
     return replace(request, plans=plans)
 
 
-def fitted_contrasts(texts: tuple[str, ...]) -> tuple[str, ...]:
-    """Return texts of the contrasts that are fitted, by the texts of the user."""
-    for step in find_steps():
-        texts = load(step.contrasts)(texts) if step.contrasts else texts
-    return texts
-
-
 def _flags(request: Request) -> Iterator[str]:
     """Name what the core is asked beyond the default."""
     settings = request.settings
     is_asked = {
-        "map() in the formula": bool(request.model.maps),
+        COVARIATES[0]: bool(request.model.maps),
+        COVARIATES[1]: bool(request.model.summaries),
         "summary measures alone": not request.measures.maps,
         "--correction by permutation": settings.multiplicity.method in PERMUTATIONS,
-        "--joint": bool(settings.joint.measures),
     }
     yield from (flag for flag, answer in is_asked.items() if answer)
     yield from request.comparison.sessions.excludes()
@@ -57,6 +53,15 @@ def extend(place: str, analysis: Analysis) -> Analysis:
         if place in step.places:
             analysis = load(step.places[place])(analysis, analysis.request.plans[step.name])
     return analysis
+
+
+def extend_surfaces(analyses: Mapping[str, Analysis]) -> Mapping[str, Analysis]:
+    """Pass the analyses of all surfaces, by name, through what extensions do with all of them."""
+    plans = analyses[SHEET].request.plans
+    for step in _active(analyses[SHEET].request):
+        if "surfaces" in step.places:
+            analyses = load(step.places["surfaces"])(analyses, plans[step.name])
+    return analyses
 
 
 def blocks(place: str, request: Request, *values: object) -> Iterator[Any]:

@@ -1,8 +1,7 @@
 """Results as tables."""
 
 import tomllib
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import cache
 from importlib.resources import files
 from typing import Any
@@ -12,7 +11,6 @@ import pandas as pd
 
 from hipsta_bids.group.cohort.data import Cohort, hemispheres, participants_with, summary_values
 from hipsta_bids.group.output import columns, results
-from hipsta_bids.group.output.columns import find_clusters, frame_of
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.reports import cells
 from hipsta_bids.reports.group_tables import opposite_changes
@@ -20,10 +18,9 @@ from hipsta_bids.stats.arrays import Float, describe_known
 from hipsta_bids.stats.classify import ClassifierResult
 from hipsta_bids.stats.clusters import edges_of
 from hipsta_bids.stats.formula import file_label
-from hipsta_bids.stats.glm import FittedMaps, PointTest
-from hipsta_bids.stats.inference import Discoveries, MapKey, PermutationTest, control_fdr
+from hipsta_bids.stats.inference import Discoveries, MapKey, control_fdr
 from hipsta_bids.stats.registration import Registration
-from hipsta_bids.types import JOINT, PARTICIPANT, SESSION, p_text
+from hipsta_bids.types import PARTICIPANT, REGION, SESSION
 
 Named = tuple[str, pd.DataFrame]
 """File name without extension, and table."""
@@ -35,8 +32,6 @@ CurveOf = Callable[[ClassifierResult], Columns]
 _MEANINGS = tomllib.loads((files("hipsta_bids.group.output") / "columns.toml").read_text("utf-8"))
 #: Meaning of every column; the unit is that of the measure unless said.
 COLUMNS: Mapping[str, str] = _MEANINGS["group"]
-#: The same of measures that are tested together.
-JOINT_COLUMNS: Mapping[str, str] = COLUMNS | _MEANINGS["joint"]
 #: The same of participants by group.
 DEMOGRAPHIC_COLUMNS: Mapping[str, str] = COLUMNS | _MEANINGS["demographics"]
 
@@ -225,10 +220,15 @@ def _measures(cohort: Cohort, analysis: results.Analysis) -> Iterator[Columns]:
 
 
 def with_fdr(table: pd.DataFrame, settings: GroupSettings) -> pd.DataFrame:
-    """Correct the tests of one contrast for the number of measures, sides and models."""
+    """Correct the tests of one contrast for the number of measures, sides and models.
+
+    Means of one map over regions are a separate family.
+    """
     rules = settings.multiplicity
     method = "bh" if rules.method == "bh" else "fdr2"
-    for _, rows in table.groupby("contrast", sort=False):
+    parts = table["measure"].str.partition(REGION)
+    maps = parts[0].where(parts[1] == REGION, "")
+    for _, rows in table.groupby(["contrast", maps], sort=False):
         discoveries = control_fdr(rows["p"].to_numpy(dtype=np.float64), rules.alpha, method)
         one_sided = rows["alternative"].notna() if "alternative" in rows else False
         floor = np.where(one_sided, rows["p"], 0.0)  # see Discoveries.at_least
@@ -368,83 +368,3 @@ def _classification(analysis: results.Analysis, settings: GroupSettings) -> pd.D
             for hemi, measure, (control, case), comparison in analysis.pairs
         ]
     )
-
-
-_EFFECTS = {"t": "cohen_d", "F": "partial_eta_squared"}
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class JointMap:
-    """One contrast of one side, or of both, tested in several measures together."""
-
-    key: MapKey
-    parts: Mapping[str, tuple[FittedMaps, str]]
-    """Fit and measure of each map, by its title."""
-    cohort: Cohort
-    """What has the coordinates of the points."""
-    test: PermutationTest
-    found: Discoveries
-
-    @property
-    def fitted(self) -> FittedMaps:
-        """The columns that locate the points."""
-        return next(iter(self.parts.values()))[0]
-
-    @property
-    def tests(self) -> dict[str, PointTest]:
-        """The test of each map by itself, by its title."""
-        return {
-            title: next(
-                test for test in side.fits[measure].tests if test.contrast.name == self.key.contrast
-            )
-            for title, (side, measure) in self.parts.items()
-        }
-
-
-def joint_points(joint_map: JointMap) -> pd.DataFrame:
-    """List all points of a map, with the p-value of each measure by itself."""
-    frame = frame_of(joint_map.cohort, joint_map.fitted)
-    columns = {
-        **frame.columns,
-        "n": np.min([fit.fits[measure].n for fit, measure in joint_map.parts.values()], axis=0),
-        "statistic": joint_map.test.statistic,
-        "p": joint_map.test.p_uncorrected,
-        "p_corrected": joint_map.found.adjusted,
-        "significant": joint_map.found.rejected,
-        **{f"p_{title.replace(' ', '_')}": test.p for title, test in joint_map.tests.items()},
-    }
-    return pd.DataFrame(columns)
-
-
-def joint_peaks(joint: Sequence[JointMap], neighbors: int, averages: Averages) -> pd.DataFrame:
-    """List clusters with their peaks; of a map without findings its strongest point."""
-    rows = []
-    for joint_map in joint:
-        frame, tests, z = (
-            frame_of(joint_map.cohort, joint_map.fitted, averages.get(joint_map.key.hemi)),
-            joint_map.tests,
-            joint_map.test.statistic,
-        )
-        edges = edges_of(joint_map.fitted.maps, neighbors)
-        for at, cluster in find_clusters(joint_map.found.rejected, z, frame.subfield, edges):
-            words = [
-                f"{title} {cells.effect_name(_EFFECTS[test.kind])}"
-                f" {cells.number_text(test.effect[at])},"
-                f" p {p_text(test.p[at])}"
-                for title, test in tests.items()
-            ]
-            rows.append(
-                {
-                    "measure": JOINT,
-                    "contrast": joint_map.key.contrast,
-                    "hemi": joint_map.key.hemi,
-                    **frame.at(at),
-                    "test": "z",
-                    "statistic": z[at],
-                    "p": joint_map.test.p_uncorrected[at],
-                    "p_corrected": joint_map.found.adjusted[at],
-                    **cluster,
-                    "measures": "; ".join(words),
-                }
-            )
-    return pd.DataFrame(rows)

@@ -7,6 +7,7 @@ import os
 import re
 import shutil
 import warnings
+from collections import ChainMap
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from importlib.util import find_spec
@@ -25,9 +26,8 @@ from hipsta_bids.group.output.demographics import demographics_of
 from hipsta_bids.group.output.figures import draw_figures
 from hipsta_bids.group.output.methods import methods_text
 from hipsta_bids.group.output.shapes import AverageShape
-from hipsta_bids.group.output.steps import blocks
+from hipsta_bids.group.output.steps import blocks, plan_blocks
 from hipsta_bids.group.output.style import KINDS, Drawing, encode
-from hipsta_bids.group.output.tables import JointMap, joint_peaks, joint_points
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.io import files, gifti
 from hipsta_bids.progress import tell
@@ -35,7 +35,7 @@ from hipsta_bids.stats.arrays import Float, return_memory
 from hipsta_bids.stats.arrays import blocks as split_rows
 from hipsta_bids.stats.glm import FittedMaps, PointTest
 from hipsta_bids.stats.inference import Discoveries, MapKey
-from hipsta_bids.types import FAMILY, JOINT, PARTICIPANT, SESSION
+from hipsta_bids.types import FAMILY, PARTICIPANT, SESSION
 
 _LOGGER = logging.getLogger(__name__)
 
@@ -82,7 +82,6 @@ def write_results(
     exclusions: Sequence[Exclusion],
     *,
     averages: tables.Averages,
-    joint: Sequence[JointMap] = (),
     region: str = "body",
     ratings: Mapping[str, int] | None = None,
     labels: Mapping[str, list[str]],
@@ -90,12 +89,14 @@ def write_results(
 ) -> None:
     """Write tables, maps and text; cohorts and analyses are by surface."""
     cohort, analysis = cohorts[SHEET], analyses[SHEET]
+    meaning = dict(ChainMap(*plan_blocks("columns", analysis.request), dict(tables.COLUMNS)))
     for surface in cohorts:
         tables_of_surface = tables.result_tables(
             surface, cohorts[surface], analyses[surface], settings, averages
         )
         for name, table in tables_of_surface:
-            write_table(folder, name, tables.with_references(table, analysis))
+            described = tables.with_references(table, analysis)
+            write_table(folder, name, described, meaning=meaning)
         _write_further(folder, surface, cohorts[surface], analyses[surface])
     if analysis.found:
         overview = tables.overview_table(analysis.found)
@@ -120,9 +121,8 @@ def write_results(
         _write_surfaces(folder, cohorts[surface], of_surface)
         tests = stats_of(results.tested_maps(of_surface))
         write_stats(folder, tests, _about_tests(of_surface, settings))
-    for write in blocks("files", analysis.request, cohorts, analyses, labels):
+    for write in blocks("files", analysis.request, cohorts, analyses, labels, averages):
         write(folder)
-    _write_joint(folder, joint, settings, averages)
     text = methods_text(
         cohort,
         analysis,
@@ -260,6 +260,7 @@ def stats_of(tested: Iterable[tuple[MapKey, PointTest, Discoveries]]) -> dict[Ma
             test.kind: test.statistic,
             **({"d": test.cohen_d} if test.kind == "t" else {"eta2": test.eta_squared}),
             "pcorrected": discoveries.adjusted,
+            **{stat: test.further[stat] for stat in _MAP_TYPES if stat in test.further},
         }
         for key, test, discoveries in tested
     }
@@ -272,6 +273,7 @@ _MAP_TYPES = {
     "d": ("Other", "Cohen's d"),
     "eta2": ("Other", "partial eta squared"),
     "pcorrected": ("P", "p-value, corrected for the number of points"),
+    "percent": ("Other", "difference in percent of the mean of the reference group"),
 }
 _About = Mapping[MapKey, Mapping[str, Any]]
 
@@ -279,7 +281,7 @@ _About = Mapping[MapKey, Mapping[str, Any]]
 def _about_tests(analysis: results.Analysis, settings: GroupSettings) -> _About:
     """Describe tests for the sidecars of their maps."""
     rules, about = settings.multiplicity, {}
-    names = [*analysis.design.columns, *(f"map({name})" for name in analysis.model.maps)]
+    names = [*analysis.design.columns, *analysis.model.added_terms]
     for key, test, discoveries in results.tested_maps(analysis):
         fitted = np.isfinite(test.df)
         df, n = test.df[fitted], analysis.fitted[key.hemi].fits[key.measure].n[fitted]
@@ -322,36 +324,6 @@ def write_stats(folder: Path, maps: Mapping[MapKey, _Stats], about: _About | Non
         names = list(next(iter(sides.values())))
         stacked = {hemi: np.stack([v[stat] for stat in names]) for hemi, v in sides.items()}
         files.write_bytes(folder / f"{name}.dscalar.nii", gifti.cifti_bytes(stacked, names))
-
-
-def _write_joint(
-    folder: Path, joint: Sequence[JointMap], settings: GroupSettings, averages: tables.Averages
-) -> None:
-    """Write tests of several measures together."""
-    if not joint:
-        return
-    write_table(
-        folder,
-        f"{JOINT}_peaks",
-        joint_peaks(joint, settings.multiplicity.neighbors, averages),
-        meaning=tables.JOINT_COLUMNS,
-    )
-    for joint_map in joint:
-        name = tables.map_name(joint_map.key.hemi, joint_map.key.measure, joint_map.key.contrast)
-        parts = {
-            f"p_{title.replace(' ', '_')}": f"p-value of {title} alone, not corrected"
-            for title in joint_map.parts
-        }
-        write_table(
-            folder, name, joint_points(joint_map), meaning={**tables.JOINT_COLUMNS, **parts}
-        )
-    write_stats(
-        folder,
-        {
-            joint_map.key: {"z": joint_map.test.statistic, "pcorrected": joint_map.found.adjusted}
-            for joint_map in joint
-        },
-    )
 
 
 def write_surface(folder: Path, cohort: Cohort, fitted: FittedMaps, hemi: str) -> None:

@@ -12,12 +12,16 @@ from hipsta_bids.group.output.steps import extend
 from hipsta_bids.group.questions.aligning import register_side
 from hipsta_bids.group.questions.summaries import classify_groups, fit_summaries
 from hipsta_bids.group.request import Request
+from hipsta_bids.joints import find_permuting
 from hipsta_bids.progress import each, tell
 from hipsta_bids.stats import inference
 from hipsta_bids.stats.design import Design, build_design
 from hipsta_bids.stats.formula import listed
 from hipsta_bids.stats.glm import RowModel, fit_maps, with_mean
 from hipsta_bids.types import PARTICIPANT
+
+#: Measures that are made of a map, besides the ones that begin with its name.
+CONTAINS = {"thickness": ("volume", "surface_volume_ratio")}
 
 
 def analyze_cohort(request: Request) -> Analysis:
@@ -44,7 +48,7 @@ def analyze_points(cohort: data.Cohort, analysis: Analysis) -> Analysis:
         compared=cohort,
         classified=cohort,
     )
-    return replace(extend("score", fit(of_points)), skipped=())
+    return replace(extend("summarize", extend("score", fit(of_points))), skipped=())
 
 
 def design(request: Request) -> Analysis:
@@ -69,9 +73,10 @@ def design(request: Request) -> Analysis:
         settings.multiplicity,
         settings.glm,
         rows.design.contrasts,
-        joint=bool(settings.joint.measures),
+        further=find_permuting(settings),
     )
-    return extend("tests", replace(analysis, design=rows.design, row_model=rows))
+    analysis = replace(analysis, design=rows.design, row_model=rows)
+    return extend("tests", analysis).noted(_parts_of_outcomes(request))
 
 
 def align(analysis: Analysis) -> Analysis:
@@ -100,7 +105,7 @@ def fit(analysis: Analysis) -> Analysis:
     """Fit each hemisphere, and left minus right if asked for, and correct for many points."""
     request, analysis = analysis.request, extend("adjust", analysis)
     maps, comparison, rows = request.measures.maps, request.comparison, analysis.row_model
-    compared = data.compare_sessions(analysis.cohort, comparison.sessions, request.model.maps)
+    compared = data.compare_sessions(analysis.cohort, comparison.sessions, request.model.added)
     fitted = {
         hemi: fit_maps(hemi, side.only(maps), rows)
         for hemi, side in each("models", list(compared.sides.items()) if maps else [])
@@ -166,7 +171,7 @@ def summarize(analysis: Analysis) -> Analysis:
     if maps:
         terms = listed(f"map({name})" for name in maps)
         notes.append(f"summary measures are not tested: {terms} has values at points only")
-    return extend("tests", replace(analysis, measures=measures)).noted(notes)
+    return extend("summarize", replace(analysis, measures=measures).noted(notes))
 
 
 def classify(analysis: Analysis) -> Analysis:
@@ -206,6 +211,17 @@ def _check_covariates(request: Request) -> None:
         raise ModelError(
             f"map({outcomes[0]}) in the formula explains itself; choose other maps by --measures"
         )
+
+
+def _parts_of_outcomes(request: Request) -> list[str]:
+    """Note covariates that contain what the maps measure."""
+    return [
+        f"{name} in the formula contains {measure}: effects are local, at equal {name}; for effects"
+        f" on a hemisphere remove {name}"
+        for name in request.model.summaries
+        for measure in request.measures.maps
+        if name.startswith((f"{measure}_", *CONTAINS.get(measure, ())))
+    ]
 
 
 def _check_margins(matrix: Design, cohort: data.Cohort, measures: data.Measures) -> None:

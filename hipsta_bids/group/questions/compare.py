@@ -9,24 +9,23 @@ import pandas as pd
 
 from hipsta_bids.derivatives import dataset
 from hipsta_bids.derivatives.analyses import GroupResults
+from hipsta_bids.errors import ModelError
 from hipsta_bids.group import model as modeling
 from hipsta_bids.group.cohort import collect
 from hipsta_bids.group.cohort.data import SHEET
 from hipsta_bids.group.cohort.quality import quality_notes, quality_table
 from hipsta_bids.group.output.results import Analysis
 from hipsta_bids.group.output.shapes import average_shapes, write_shapes
-from hipsta_bids.group.output.steps import blocks, fitted_contrasts, plan_blocks, plan_steps
-from hipsta_bids.group.output.tables import JointMap
+from hipsta_bids.group.output.steps import blocks, extend_surfaces, plan_blocks, plan_steps
 from hipsta_bids.group.output.write import draw, write_results, write_table
 from hipsta_bids.group.questions import study as studies
 from hipsta_bids.group.questions.analysis import analyze_cohort, analyze_points
-from hipsta_bids.group.questions.joint import check_joint, combine_maps
 from hipsta_bids.group.questions.mixing import with_mixes
 from hipsta_bids.group.questions.notes import notes_of
 from hipsta_bids.group.request import Request
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.io import files
-from hipsta_bids.joints import Writer, find_steps, load, load_all
+from hipsta_bids.joints import Writer, find_steps, fitted_contrasts, load, load_all
 from hipsta_bids.progress import tell
 from hipsta_bids.protocols.toml import resolve
 from hipsta_bids.stats.formula import folder_name
@@ -60,7 +59,6 @@ def run_group(options: studies.GroupOptions, settings: GroupSettings) -> studies
 def _analyze(options: studies.GroupOptions, settings: GroupSettings) -> studies.GroupResult:
     """Analyze and write all but the page, for which the memory that it takes is free again."""
     study = studies.read_study(options, settings).with_alignment()
-    check_joint(study.maps, options.comparison, study.settings)
     document, request = _request(study)
     study = _with_labels(study, request)
     templates = studies.read_templates(options.template, study.cohort)
@@ -69,11 +67,9 @@ def _analyze(options: studies.GroupOptions, settings: GroupSettings) -> studies.
         surface: analysis if surface == SHEET else analyze_points(cohort, analysis)
         for surface, cohort in study.cohorts.items()
     }
-    joint = combine_maps(list(analyses.values()), study.settings)
     discoveries = {key: test for part in analyses.values() for key, test in part.found.items()}
-    discoveries |= {key: part.found for key, part in joint.items()}
     analyses[SHEET] = replace(analysis, found=discoveries)
-    return _write(study, analyses, joint=tuple(joint.values()), document=document)
+    return _write(study, extend_surfaces(analyses), document=document)
 
 
 def _request(study: studies.Study) -> tuple[Mapping[str, Any], Request]:
@@ -85,13 +81,20 @@ def _request(study: studies.Study) -> tuple[Mapping[str, Any], Request]:
         study.settings,
         comparison=options.comparison,
         visits=study.time,
+        summaries={str(name) for side in cohort.sides.values() for name in side.summary.columns},
     )
+    if model.summaries and len(study.cohorts) > 1:
+        raise ModelError(
+            f"{model.summaries[0]} in the formula: maps of other programs have no summary measures;"
+            " remove one"
+        )
     request = Request(
         cohort=cohort,
         model=model,
         groups=groups,
         settings=study.settings,
         measures=study.measures,
+        surfaces=[name for name in study.cohorts if name != SHEET],
         references=references,
         comparison=options.comparison,
         time=study.time.column if study.time else None,
@@ -114,7 +117,6 @@ def _write(
     study: studies.Study,
     analyses: Mapping[str, Analysis],
     *,
-    joint: Sequence[JointMap],
     document: Mapping[str, Any],
 ) -> studies.GroupResult:
     """Write the results of all surfaces."""
@@ -143,7 +145,6 @@ def _write(
             settings,
             exclusions,
             averages={hemi: shape.middle.points for hemi, shape in shapes.items()},
-            joint=joint,
             region=options.sheets.region,
             ratings=study.collection.ratings,
             labels=study.labels,
@@ -166,7 +167,7 @@ def _write(
 
     measures = modeling.wanted_measures(options.model, options.measures)
     return study.write_folder(
-        folder_name(analysis.model.formula, measures) + options.comparison.sessions.suffix,
+        folder_name(analysis.model.text, measures) + options.comparison.sessions.suffix,
         notes=notes,
         counts=(analysis.n_participants, len(exclusions)),
         fill=fill,

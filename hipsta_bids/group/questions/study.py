@@ -339,7 +339,7 @@ def read_study(
             f"maps {listed(reading.surfaces)} are not on the grid of the sheet, but map() in the"
             " formula is; remove one"
         )
-    read.check_summaries(measures, reading.measured.sides)
+    measures = read.check_summaries(measures, reading.measured.sides)
     notes = [*spelled.notes, *_absence(absent, covariates, options)]
     if spelled:
         file = options.model.file and files.read_json(options.model.file)

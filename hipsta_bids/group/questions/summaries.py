@@ -33,9 +33,12 @@ def fit_summaries(
     icv: str | None,
     rows_of: Callable[[Design], RowModel],
 ) -> tuple[dict[tuple[str, str], tuple[list[str], PointwiseFit, Int]], list[str]]:
-    """Fit the model of the maps to all summary measures; sizes also with intracranial volume."""
+    """Fit the model of the maps to all summary measures; sizes also with intracranial volume.
+
+    Summary measures in the formula are not fitted.
+    """
     fits: dict[tuple[str, str], tuple[list[str], PointwiseFit, Int]] = {}
-    first = data.baselines(cohort)
+    first, covariates = data.baselines(cohort), model.summaries
 
     def fit(formula: str, model: RowModel, is_included: Callable[[str], bool]) -> None:
         rows = model.design.rows
@@ -45,14 +48,15 @@ def fit_summaries(
             values = values[[name for name in varied if is_included(str(name))]]
             if not values.columns.size:
                 continue
-            fit_values = model.fit_measures
+            fit_values, added = model.fit_measures, None
             if first is not None:
                 baseline = data.summary_values(first, hemi, names).iloc[rows][values.columns]
-                values = values.where(baseline.notna())
+                values, added = values.where(baseline.notna()), baseline.to_numpy(np.float64)[None]
+            elif covariates:
+                added = _repeated(cohort, hemi, covariates, rows, values.shape[1])
             present = np.flatnonzero(values.notna().any(axis=1).to_numpy())
-            if first is not None:
-                covariates = baseline.to_numpy(dtype=np.float64)[None, present]
-                fit_values = partial(model.fit, covariates=covariates)
+            if added is not None:
+                fit_values = partial(model.fit, covariates=added[:, present])
             maps: Float = values.to_numpy(dtype=np.float64)[present]
             participants = cohort.table[PARTICIPANT].iloc[rows[present]].to_numpy()
             fits[hemi, formula] = (
@@ -61,23 +65,47 @@ def fit_summaries(
                 data.participants_with(np.isfinite(maps), participants),
             )
 
-    fit(model.formula, rows_of(design), lambda _: True)
+    fit(model.text, rows_of(design), lambda name: name not in covariates)
     if not any(
         data.grows_with_head(str(name)) for columns, *_ in fits.values() for name in columns
     ):
         return fits, []
-    if icv is None:
-        return fits, [f"{data.SIZES} are not adjusted: no intracranial volume is known"]
-    if icv in closed_formula(model.formula).names:
-        return fits, []
     try:
-        adjusted = replace(model, formula=f"{model.formula} + {icv}")
-        larger = build_design(cohort.table, adjusted, settings, references)
-        larger = replace(larger, contrasts=_same_names(larger, design))
+        adjusted, larger = _with_head_size(cohort, model, design, (settings, references), icv)
     except ModelError as error:
-        return fits, [f"{data.SIZES} are not adjusted for {icv}: {error}"]
-    fit(adjusted.formula, rows_of(larger), data.grows_with_head)
+        return fits, [f"{data.SIZES} are not adjusted{error}"]
+    if larger is None:
+        return fits, []
+    fit(adjusted.text, rows_of(larger), lambda n: data.grows_with_head(n) and n not in covariates)
     return fits, [f"{data.SIZES} are also tested with head size ({icv})"]
+
+
+def _with_head_size(
+    cohort: data.Cohort,
+    model: ModelSpec,
+    design: Design,
+    coding: tuple[DesignSettings, Mapping[str, str]],
+    icv: str | None,
+) -> tuple[ModelSpec, Design | None]:
+    """Add intracranial volume to a model; no design if it is there. ModelError says why not."""
+    if icv is None:
+        raise ModelError(": no intracranial volume is known")
+    if icv in closed_formula(model.formula).names:
+        return model, None
+    adjusted = replace(model, formula=f"{model.formula} + {icv}")
+    try:
+        larger = build_design(cohort.table, adjusted, *coding)
+        return adjusted, replace(larger, contrasts=_same_names(larger, design))
+    except ModelError as error:
+        raise ModelError(f" for {icv}: {error}") from error
+
+
+def _repeated(
+    cohort: data.Cohort, hemi: str, names: Sequence[str], rows: Int, n_measures: int
+) -> Float:
+    """Summary measures (names, rows, measures) of a hemisphere, the same for all measures."""
+    values = data.covariate_values(cohort, hemi, names).iloc[rows].to_numpy(dtype=np.float64)
+    return np.broadcast_to(values.T[:, :, None], (len(names), len(rows), n_measures))
 
 
 def _same_names(larger: Design, design: Design) -> tuple[Contrast, ...]:

@@ -375,6 +375,7 @@ def test_maps_of_others_are_scored_against_a_reference_group(written):
     assert rows[~rows.reference].low.mean() > rows[rows.reference].low.mean()
 
 
+@needs("combination")
 def test_cifti_files_give_what_gifti_files_give_and_go_together(study, alone):
     for subject in subjects():
         both = {hemi: thickness(subject, hemi) for hemi in "LR" if (subject, hemi) != MISSING}
@@ -395,6 +396,7 @@ def test_cifti_files_give_what_gifti_files_give_and_go_together(study, alone):
     assert "peak vertex " in group_page(folder)
 
 
+@needs("combination")
 def test_joint_maps_have_to_lie_on_one_surface(study, capsys):
     options = ["--maps", f"hipp={PATTERNS[1]}", "--joint", "thickness", "hipp", "--align", "none"]
     assert run(study, *options, "--measures", "thickness", "hipp", "--name", "no") == 65

@@ -8,6 +8,7 @@ import pytest
 from scipy import stats
 from small_cohorts import PLAN, methods_of, place_of, run_named, table, write_dataset
 
+from hipsta_bids.cli import group
 from hipsta_bids.cli.main import main
 from hipsta_bids.reports.group import group_page
 from hipsta_bids.stats.inference import control_fdr
@@ -192,3 +193,11 @@ def test_a_dataset_without_sessions_has_none_to_compare(dataset, capsys, options
     data, out = dataset
     assert main([str(data), str(out), "group", *options]) == 65
     assert f"{options[0]}: no sessions in this dataset" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("words", "random"), [((), "slope"), (("visits",), "visits")])
+def test_settings_choose_random_effects_unless_the_option_does(tmp_path, words, random):
+    (tmp_path / "own.toml").write_text('[longitudinal]\nrandom = "slope"\n')
+    command = ["x", str(tmp_path), "group", "--settings", str(tmp_path / "own.toml")]
+    options = group.group_parser().parse_args([*command, "--longitudinal", *words])
+    assert group._settings(options).longitudinal.random == random

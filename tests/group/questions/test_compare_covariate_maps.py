@@ -20,7 +20,6 @@ from small_cohorts import (
 
 from hipsta_bids.cli.main import main
 from hipsta_bids.errors import ExitCode
-from hipsta_bids.stats.inference import combine_evidence
 
 FAST = ("--align", "none", "--no-classification", "--no-reports")
 
@@ -70,7 +69,6 @@ def test_permutations_and_asymmetry_have_the_map(study):
     data, out = study
     command = [str(data), str(out), "group", "--formula", "thickness ~ group + map(curvature)"]
     options = ["--correction", "permutation-max", "--permutations", "200", "--asymmetry"]
-    options += ["--joint", "thickness", "--joint-sides"]
     assert main([*command, *options, "--name", "permuted", *FAST]) == ExitCode.OK
     folder = out / "group" / "permuted"
     people = table(data / "participants.tsv")
@@ -93,10 +91,6 @@ def test_permutations_and_asymmetry_have_the_map(study):
     order = left_group["statistic"].abs().argsort()
     assert (np.diff(left_group["p_corrected"].to_numpy()[order]) <= 0).all()
     assert "200 permutations" in (folder / "methods.md").read_text()
-    joint = table(folder / "contrast-MapCurvature_desc-joint_statmap.tsv")
-    sides = [f"hemi-{hemi}_contrast-MapCurvature_desc-thickness_statmap.tsv" for hemi in "LR"]
-    p = np.stack([table(folder / name)["p"] for name in sides])
-    np.testing.assert_allclose(joint["statistic"], combine_evidence(p, "fisher"), rtol=1e-4)
 
 
 @needs("repeated")
@@ -172,3 +166,72 @@ def test_what_maps_cannot_do_is_one_line(study, capsys, options, code, said):
     error = capsys.readouterr().err
     assert said in error, error
     assert error.count("\n") == 1
+
+
+def summaries_of(out, measure, hemi="L"):
+    places = [place_of(out, f"{i + 1:02d}", hemi) for i in range(sum(PLAN.sizes))]
+    return np.array([table(place.path("summary"))[measure].iloc[0] for place in places])
+
+
+def test_summary_measures_are_covariates_of_their_hemisphere(study):
+    data, out = study
+    command = [str(data), str(out), "group", "--formula", "thickness ~ volume + group"]
+    assert main([*command, "--contrast", "volume", *FAST]) == ExitCode.OK
+    folder = out / "group" / "thickness_group-volume"
+    people = table(data / "participants.tsv")
+    for hemi in "LR":
+        thickness, volume = (sheets(out, "thickness", hemi), summaries_of(out, "volume", hemi))
+        result = table(folder / f"hemi-{hemi}_contrast-Volume_desc-thickness_statmap.tsv")
+        for point in (0, 100, 146):
+            rows = people.assign(y=thickness[:, point], v=volume)
+            fit = smf.ols("y ~ C(group) + v", rows).fit()
+            assert result["estimate"][point] == pytest.approx(fit.params["v"], rel=1e-5)
+            assert result["p"][point] == pytest.approx(fit.pvalues["v"], rel=1e-5)
+    record = json.loads((folder / "analysis.json").read_text())
+    assert record["formula"] == "group + volume"
+    notes = "\n".join(record["notes"])
+    assert "volume in the formula contains thickness" in notes
+    assert "covariates of the same hemisphere" in (folder / "methods.md").read_text()
+
+
+def test_summary_measures_explain_the_others(study):
+    """Of each side its own; of both together their mean."""
+    data, out = study
+    command = [str(data), str(out), "group", "--formula", "group + volume", "--name", "sizes"]
+    command += ["--measures", "thickness", "volume", "thickness_mean"]
+    assert main([*command, "--contrast", "CN-AD = group[CN] - group[AD]", *FAST]) == ExitCode.OK
+    result = table(out / "group" / "sizes" / "measures.tsv")
+    assert set(result["measure"]) == {"thickness_mean"}  # a covariate does not explain itself
+    people = table(data / "participants.tsv")
+    sides = {
+        name: {hemi: summaries_of(out, name, hemi) for hemi in "LR"}
+        for name in ("volume", "thickness_mean")
+    }
+    for name, of_sides in sides.items():
+        people[f"{name}_LR"] = sum(of_sides.values()) / 2
+        people = people.assign(**{f"{name}_{hemi}": of_sides[hemi] for hemi in "LR"})
+    for row in result.to_dict("records"):
+        hemi = row["hemi"]
+        fit = smf.ols(f"thickness_mean_{hemi} ~ group + volume_{hemi}", people).fit()
+        assert row["p"] == pytest.approx(fit.pvalues["group[T.CN]"], rel=1e-8), hemi
+        assert row["estimate"] == pytest.approx(fit.params["group[T.CN]"], rel=1e-8), hemi
+    assert set(result["hemi"]) == {"L", "R", "LR"}
+
+
+@pytest.mark.parametrize("formula", ["group * volume", "group + poly(volume, 2)"])
+def test_summary_measures_are_terms_of_their_own(study, capsys, formula):
+    data, out = study
+    assert main([str(data), str(out), "group", "--formula", formula, *FAST]) == ExitCode.BAD_DATA
+    assert "volume is a summary measure; add it to other terms" in capsys.readouterr().err
+
+
+def test_columns_of_the_table_come_before_summary_measures(study, tmp_path):
+    data, out = study
+    people = table(data / "participants.tsv").assign(volume=np.arange(sum(PLAN.sizes)) ** 2.0)
+    people[["participant_id", "volume"]].to_csv(tmp_path / "own.tsv", sep="\t", index=False)
+    command = [str(data), str(out), "group", "--formula", "group + volume", "--name", "own"]
+    command += ["--covariates", str(tmp_path / "own.tsv"), "--measures", "thickness_mean"]
+    assert main([*command, "--contrast", "volume", *FAST]) == ExitCode.OK
+    (row,) = table(out / "group" / "own" / "measures.tsv").query("hemi == 'L'").to_dict("records")
+    fit = smf.ols("y ~ group + volume", people.assign(y=summaries_of(out, "thickness_mean"))).fit()
+    assert row["p"] == pytest.approx(fit.pvalues["volume"], rel=1e-8)

@@ -2,6 +2,7 @@
 
 import json
 
+import nibabel as nib
 import numpy as np
 import pandas as pd
 import pytest
@@ -54,6 +55,23 @@ def test_permutations_are_in_the_tables_of_the_map(dataset, quick):
     pd.testing.assert_frame_equal(
         maximum, table(again / "hemi-L_contrast-CNAD_desc-thickness_statmap.tsv")
     )
+
+
+def test_statistics_of_both_sides_are_one_cifti_file(dataset, quick):
+    folder = run_named(dataset, *quick, *PLAIN, "--measures", "thickness")
+    image = nib.load(folder / "contrast-CNAD_desc-thickness_statmap.dscalar.nii")
+    assert image.nifti_header.get_intent()[0] == "ConnDenseScalar"
+    assert list(image.header.get_axis(0).name) == ["t", "d", "pcorrected"]
+    parts = list(image.header.get_axis(1).iter_structures())
+    names = [name for name, *_ in parts]
+    assert names == [f"CIFTI_STRUCTURE_HIPPOCAMPUS_{side}" for side in ("LEFT", "RIGHT")]
+    for hemi, (_, part, model) in zip("LR", parts, strict=True):
+        surface = nib.load(folder / f"hemi-{hemi}_space-unfold_midthickness.surf.gii")
+        assert list(model.nvertices.values()) == [len(surface.darrays[0].data)]
+        own = nib.load(
+            folder / f"hemi-{hemi}_contrast-CNAD_stat-d_desc-thickness_statmap.shape.gii"
+        )
+        np.testing.assert_array_equal(image.get_fdata()[1, part], own.darrays[0].data)
 
 
 def test_pooled_family_is_no_less_strict(dataset, quick):

@@ -1,16 +1,20 @@
 """Tests of several measures, or of both sides, together."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from itertools import product
 
 import numpy as np
 
 from hipsta_bids.errors import ModelError
+from hipsta_bids.extensions.combination import NAME
+from hipsta_bids.extensions.combination.output import JointMap
+from hipsta_bids.extensions.combination.settings import JointSettings
 from hipsta_bids.group import model as modeling
-from hipsta_bids.group.output import results
-from hipsta_bids.group.output.tables import JointMap
-from hipsta_bids.group.settings import GroupSettings
+from hipsta_bids.group.cohort.data import SHEET
+from hipsta_bids.group.output.results import Analysis
+from hipsta_bids.group.request import Request
 from hipsta_bids.progress import tell
 from hipsta_bids.stats import inference
 from hipsta_bids.stats.clusters import edges_of
@@ -19,15 +23,19 @@ from hipsta_bids.stats.glm import FittedMaps
 from hipsta_bids.types import BOTH_SIDES, JOINT, SIDES
 
 
-def check_joint(
-    available: Sequence[str], comparison: modeling.Comparison, settings: GroupSettings
-) -> None:
+def is_asked(request: Request) -> bool:
+    """Check whether anything is tested together."""
+    joint = request.settings.of(JointSettings)
+    return bool(joint.measures) or joint.sides
+
+
+def plan_joint(request: Request) -> JointSettings:
     """Refuse measures that cannot be tested together, before anything is fitted."""
-    available = [
-        *available,
-        *(modeling.asymmetry_name(name) for name in available if comparison.asymmetry),
-    ]
-    names, sides = settings.joint.measures, settings.joint.sides
+    joint = request.settings.of(JointSettings)
+    names, sides = joint.measures, joint.sides
+    available = [*request.measures.maps, *request.surfaces]
+    if request.comparison.asymmetry:
+        available += map(modeling.asymmetry_name, available.copy())
     problem = None
     if unknown := [name for name in names if name not in available]:
         problem = f"no map is called {unknown[0]!r}; there are {', '.join(available)}"
@@ -35,47 +43,49 @@ def check_joint(
         problem = f"a map is called {JOINT}, as its results would be; give it another name"
     elif len(set(names)) < len(names):
         problem = "a measure is named twice; remove it"
-    elif len(names) < 1 + (not sides) and (names or sides):
+    elif len(names) < 1 + (not sides):
         problem = "name two measures, or one and --joint-sides"
     if problem is not None:
         raise ModelError(f"--joint {' '.join(names)}".strip() + f": {problem}")
+    return joint
 
 
-def combine_maps(
-    analyses: Sequence[results.Analysis], settings: GroupSettings
-) -> dict[inference.MapKey, JointMap]:
-    """Test the measures of the setting ``joint`` together; empty without any.
+def combine_surfaces(
+    analyses: Mapping[str, Analysis], joint: JointSettings
+) -> Mapping[str, Analysis]:
+    """Test measures together, and add the discoveries to the analysis of the sheets.
 
-    The first analysis has the model; further ones may have maps of other programs.
+    This analysis has the model; further ones may have maps of other programs.
     """
-    names, sides = settings.joint.measures, settings.joint.sides
-    if not names:
-        return {}
+    sheets, names = analyses[SHEET], joint.measures
     cohort = next(
         analysis.compared
-        for analysis in analyses
+        for analysis in analyses.values()
         if any(names[0] in maps.fits for maps in analysis.fitted.values())
     )
-    groups, contrasts = _groups(analyses, names, sides=sides)
+    groups, contrasts = _groups(list(analyses.values()), names, sides=joint.sides)
     if not groups:
         raise ModelError(f"--joint {' '.join(names)}: no side has them all; remove one")
-    tests_found = inference.correct_joint(
+    tests = inference.correct_joint(
         groups,
         contrasts,
-        analyses[0].row_model,
-        analyses[0].compared.table,
-        settings.multiplicity,
-        combine=settings.joint.combine,
+        sheets.row_model,
+        sheets.compared.table,
+        sheets.request.settings.multiplicity,
+        combine=joint.combine,
         report=partial(tell, "permutations"),
     )
-    return {
-        key: JointMap(key=key, parts=groups[key], cohort=cohort, test=test, found=discoveries)
-        for key, (test, discoveries) in tests_found.items()
-    }
+    maps = [
+        JointMap(key=key, parts=groups[key], cohort=cohort, test=test, discoveries=discoveries)
+        for key, (test, discoveries) in tests.items()
+    ]
+    discoveries_of = {**sheets.found, **{part.key: part.discoveries for part in maps}}
+    sheets = replace(sheets, found=discoveries_of, parts={**sheets.parts, NAME: maps})
+    return {**analyses, SHEET: sheets}
 
 
 def _groups(
-    analyses: Sequence[results.Analysis], names: Sequence[str], *, sides: bool
+    analyses: Sequence[Analysis], names: Sequence[str], *, sides: bool
 ) -> tuple[dict[inference.MapKey, dict[str, tuple[FittedMaps, str]]], dict[str, Contrast]]:
     """Find the maps that are tested together, by the key of their test; and contrasts by name."""
     fits = {

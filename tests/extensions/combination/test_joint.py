@@ -1,12 +1,17 @@
 """Several measures together, from files to files, and refusals."""
 
-import nibabel as nib
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
+from extension_marks import needs
 from small_cohorts import table, write_dataset
 
 from hipsta_bids.cli.main import main
+from hipsta_bids.errors import ModelError
 from hipsta_bids.group.output import figures, write
+from hipsta_bids.group.output.steps import plan_steps
+from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.reports.group import group_page
 from hipsta_bids.stats.inference import combine_evidence
 
@@ -89,21 +94,13 @@ def test_maps_of_left_minus_right_together(dataset, quick):
     assert list((folder / "figures").glob("joint_maps.*"))
 
 
-def test_statistics_of_both_sides_are_one_cifti_file(dataset, quick):
-    folder = run(dataset, quick, "--measures", "thickness", "--align", "none")
-    image = nib.load(folder / "contrast-CNAD_desc-thickness_statmap.dscalar.nii")
-    assert image.nifti_header.get_intent()[0] == "ConnDenseScalar"
-    assert list(image.header.get_axis(0).name) == ["t", "d", "pcorrected"]
-    parts = list(image.header.get_axis(1).iter_structures())
-    names = [name for name, *_ in parts]
-    assert names == [f"CIFTI_STRUCTURE_HIPPOCAMPUS_{side}" for side in ("LEFT", "RIGHT")]
-    for hemi, (_, part, model) in zip("LR", parts, strict=True):
-        surface = nib.load(folder / f"hemi-{hemi}_space-unfold_midthickness.surf.gii")
-        assert list(model.nvertices.values()) == [len(surface.darrays[0].data)]
-        own = nib.load(
-            folder / f"hemi-{hemi}_contrast-CNAD_stat-d_desc-thickness_statmap.shape.gii"
-        )
-        np.testing.assert_array_equal(image.get_fdata()[1, part], own.darrays[0].data)
+def test_sides_with_a_covariate_at_each_point_together(dataset, quick):
+    how = ["--formula", "thickness ~ group + map(curvature)", "--align", "none"]
+    folder = run(dataset, quick, *how, "--joint", "thickness", "--joint-sides")
+    joint = table(folder / "contrast-MapCurvature_desc-joint_statmap.tsv")
+    sides = [f"hemi-{hemi}_contrast-MapCurvature_desc-thickness_statmap.tsv" for hemi in "LR"]
+    p = np.stack([table(folder / name)["p"] for name in sides])
+    np.testing.assert_allclose(joint["statistic"], combine_evidence(p, "fisher"), rtol=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -113,6 +110,10 @@ def test_statistics_of_both_sides_are_one_cifti_file(dataset, quick):
         (["--joint", "thickness"], "name two measures"),
         (["--joint-sides"], "name two measures"),
         (["--joint", "thickness", "thickness"], "named twice"),
+        (
+            ["--joint", "thickness", "curvature", "--contrast", "group[AD]-group[CN] > 0"],
+            "one-sided tests are not permuted; use --correction fdr2, without --joint",
+        ),
     ],
 )
 def test_refusals(dataset, capsys, options, words):
@@ -124,9 +125,30 @@ def test_refusals(dataset, capsys, options, words):
     assert not (out / "group" / "no").exists()
 
 
+def test_permutations_have_no_effect_without_a_test_that_permutes(dataset, capsys):
+    data, out = dataset
+    assert main([str(data), str(out), "group", "--permutations", "99"]) == 64
+    assert "without permutations, by --correction or --joint; remove" in capsys.readouterr().err
+
+
 def test_refused_where_residuals_cannot_be_permuted(dataset, capsys, tmp_path):
     path = tmp_path / "hc3.toml"
     path.write_text('[glm]\ncovariance = "hc3"\n[joint]\nmeasures = ["thickness", "curvature"]\n')
     data, out = dataset
     assert main([str(data), str(out), "group", "--settings", str(path)]) == 65
     assert "permutations assume equal variances" in capsys.readouterr().err
+
+
+@needs("repeated")
+def test_visits_as_categories_are_not_tested_together():
+    from hipsta_bids.extensions.repeated.sessions import Visits  # noqa: PLC0415  (may be deleted)
+
+    request = SimpleNamespace(
+        settings=GroupSettings().changed(joint={"measures": ("a", "b")}),
+        options={},
+        model=SimpleNamespace(maps=(), summaries=()),
+        measures=SimpleNamespace(maps=("a", "b")),
+        comparison=SimpleNamespace(sessions=Visits()),
+    )
+    with pytest.raises(ModelError, match="--longitudinal visits: not with --joint"):
+        plan_steps(request)
