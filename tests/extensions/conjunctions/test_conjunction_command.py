@@ -79,6 +79,8 @@ def test_equivalence_is_where_none_differs(results):
     assert (same["limit_low"] < same["estimate"]).all()
     assert (same["p_fdr"] > 0.05).all()  # the means differ by 0.1 mm
     assert measures["limit_low"].isna()["group"].all()
+    described = json.loads((results / "measures.json").read_text())
+    assert "equivalence" in described["limit_low"]["Description"]
 
 
 def test_parts_are_no_results(results):
@@ -154,3 +156,11 @@ def test_harmonized_maps_have_conjunctions(cohort):
     options = ("--harmonize", "machine", "--contrast", f"both={BOTH}", "--no-reports")
     folder = run(cohort, *options, name="harmonized")
     assert set(table(folder / "maps.tsv")["contrast"]) == {"both"}
+
+
+@needs("percent")
+def test_percent_is_of_plain_contrasts(cohort):
+    options = ("--percent", "--contrast", "group[CN]-group[AD]", BOTH, "--no-reports")
+    measures = table(run(cohort, *options, name="percent") / "measures.tsv").set_index("contrast")
+    assert set(measures.index) == {"group[CN]-group[AD]", BOTH.replace("&", "and")}
+    assert measures.loc[BOTH.replace("&", "and"), "percent"].isna().all()
