@@ -98,6 +98,8 @@ class Step:
     """Function that adds its options to the parser."""
     excludes: tuple[str, ...] = ()
     """Flags beside which it is refused."""
+    contrasts: str = ""
+    """Function of the texts of contrasts; returns texts of the contrasts that are fitted."""
     settings: str = ""
     """Function of the parsed options and the settings; returns the settings, or refuses both."""
     setting: str = ""
@@ -112,10 +114,10 @@ class Step:
     """Keys of the record of inputs, by the names of options that are paths."""
     places: Mapping[str, str] = field(default_factory=dict)
     """Functions of an analysis and the plan, which return the analysis, by place of the line:
-    ``design`` (after it), ``adjust`` (registered maps, before sessions are compared), ``score``
-    (after the fit), ``summarize`` (after the fit of summary measures), ``classify`` (before it). Of
-    ``surfaces``, the last place, functions take and return the analyses of all surfaces, by
-    name."""
+    ``design`` (after it), ``adjust`` (registered maps, before sessions are compared), ``tests``
+    (after ``design`` and each fit of maps, before its correction), ``score`` (after the fit),
+    ``summarize`` (after the fit of summary measures), ``classify`` (before it). Of ``surfaces``,
+    the last place, functions take and return the analyses of all surfaces, by name."""
     blocks: Mapping[str, str] = field(default_factory=dict)
     """Functions that yield parts of results, by place: ``tables``, ``figures``, ``files``,
     ``methods`` (before the model), ``methods-model`` (after it), ``methods-after`` (at the end),
@@ -379,6 +381,13 @@ def find_questions() -> tuple[Question, ...]:
 def find_steps() -> tuple[Step, ...]:
     """Find what extensions add to the line of an analysis."""
     return _gather("steps")
+
+
+def fitted_contrasts(texts: tuple[str, ...]) -> tuple[str, ...]:
+    """Return texts of the contrasts that are fitted, by the texts of the user."""
+    for step in find_steps():
+        texts = load(step.contrasts)(texts) if step.contrasts else texts
+    return texts
 
 
 def find_permuting(settings: Any) -> dict[str, bool]:  # noqa: ANN401  (of the group level)

@@ -37,6 +37,8 @@ class Request:
     """Column of intracranial volume, for volumes, areas and extents."""
     templates: Mapping[str, Template] | None = None
     """Of registration, by hemisphere; without, they are made from this cohort."""
+    contrasts: tuple[str, ...] = ()
+    """Texts, as the user wrote them."""
     options: Mapping[str, Any] = field(default_factory=dict)
     """Values of the options of extensions, by their names in Python."""
     plans: Mapping[str, Any] = field(default_factory=dict)

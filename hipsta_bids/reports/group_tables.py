@@ -86,6 +86,7 @@ def findings(results: GroupResults) -> Mapping[str, Any] | None:
         "sites": "sites" in results.record,
         "signed": set(results.record["contrasts"]) > set(sided) or not sided,
         "margins": [(str(name), side_words(text)) for name, text in sided.items()],
+        "limits": 1 - 2 * multiplicity["alpha"] if "limit_low" in measures else None,
         "summaries": _summaries(results),
         "visible": _VISIBLE_ROWS,
         "letters": letters_of(measures),
@@ -123,8 +124,9 @@ def _names_and_sides(rows: Sequence[Mapping[str, Any]]) -> Iterator[tuple[str, s
 
 def side_words(hypothesis: str) -> str:
     """Write the alternative of a one-sided test: ``> -0.05`` as *above*, with the margin."""
-    sign, margin = hypothesis.split()
-    return f"{'above' if sign == '>' else 'below'} {margin.replace('-', cells.MINUS)}"
+    for sign, word in ((">", "above"), ("<", "below"), ("-", cells.MINUS)):
+        hypothesis = hypothesis.replace(sign, word)
+    return hypothesis
 
 
 def _side(results: GroupResults, row: Mapping[str, Any]) -> dict[str, Any]:
@@ -137,15 +139,19 @@ def _side(results: GroupResults, row: Mapping[str, Any]) -> dict[str, Any]:
     if not len(candidates):
         return {"title": title, "share": 0.0, "text": "nothing could be tested"}
     sided = (results.record.get("one_sided") or {}).get(row["contrast"])
+    if sided:
+        unit = slope_unit(results, map_unit(results, row["measure"]), row["contrast"])
+        words = side_words(sided)
+        words = cells.with_unit(words, unit) if words[-1].isdigit() else words
     if not n:
-        ending = f"is significantly {side_words(sided)}" if sided else "survives"
+        ending = f"is shown to be {words}" if sided else "survives"
         return {"title": title, "share": 0.0, "text": f"none of {total} points {ending}"}
     points = results.table(str(row["file"]))
     first = records(candidates)[int(np.argmax(candidates["statistic"].abs()))]
     counts = "" if sided else "".join(_directions(results, row, points))
     text = f"{n} of {total} points survive ({_percent(share)}){counts}"
     if sided:
-        text = f"{n} {side_words(sided)}, {total - n} not ({_percent(share)} of {total} points)"
+        text = f"{n} {words}, {total - n} not shown ({_percent(share)} of {total} points)"
     if str(row.get("lenient", "")).lower() == "true":
         text += f", uncorrected p up to {row['p_cutoff']:.2g} since the effect is widespread"
     return {"title": title, "share": share, "text": f"{text}; peak {_peak(results, first, points)}"}
@@ -212,6 +218,7 @@ def _summaries(results: GroupResults) -> list[dict[str, Any]]:
         df = low["df"].where(np.isfinite(low["df"]), np.inf)
         reach = stats.t.isf((1 - model.get("confidence", 0.95)) / 2, df) * low["se"]
         limits = {"low": low["estimate"] - reach, "high": low["estimate"] + reach}
+        limits = {end: low.get(f"limit_{end}", v).fillna(v) for end, v in limits.items()}
         low = low.assign(**{f"estimate_{end}": values for end, values in limits.items()})
     return records(low)
 

@@ -112,7 +112,7 @@ def contrast_json(text: str) -> dict[str, Any]:
     ending = "".join(CONDITION + ", ".join(map(str.strip, c.split(","))) for c in conditions)
     rows = [
         {name + ending: weight for name, weight in parse_expression(row).items()}
-        for row in _COMMA.split(body)
+        for row in _COMMA.split(body if body.strip() else text)
     ]
     combined = list(dict.fromkeys(chain.from_iterable(rows)))
     weights = [[row.get(name, 0.0) for name in combined] for row in rows]

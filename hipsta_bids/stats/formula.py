@@ -142,7 +142,12 @@ def _contrasts(contrasts: object) -> tuple[texts.ContrastSpec, ...]:
     if not isinstance(contrasts, list):
         raise refusal("has Contrasts that are no list")
     specs = tuple(map(texts.parse_contrast, contrasts))
-    names = [spec.name for spec in specs]
+    check_labels([spec.name for spec in specs])
+    return specs
+
+
+def check_labels(names: Sequence[str]) -> None:
+    """Refuse contrasts of one name, or whose files would have one name."""
     if repeated := sorted({name for name in names if names.count(name) > 1}):
         raise refusal(f"has contrasts of the same name: {', '.join(repeated)}")
     labels = list(map(file_label, names))
@@ -151,7 +156,6 @@ def _contrasts(contrasts: object) -> tuple[texts.ContrastSpec, ...]:
             f"has contrasts whose files would have one name: {listed(alike)}; give one"
             " a name, as other=group[A]:age"
         )
-    return specs
 
 
 def split_maps(formula: str) -> tuple[str, tuple[str, ...]]:

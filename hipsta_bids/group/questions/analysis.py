@@ -82,7 +82,7 @@ def design(request: Request) -> Analysis:
         further=find_permuting(settings),
     )
     analysis = replace(analysis, design=rows.design, row_model=rows)
-    return analysis.noted(_parts_of_outcomes(request))
+    return extend("tests", analysis).noted(_parts_of_outcomes(request))
 
 
 def align(analysis: Analysis) -> Analysis:
@@ -122,14 +122,16 @@ def fit(analysis: Analysis) -> Analysis:
         difference = data.asymmetry_maps(compared, maps, relative)
         contrasts = with_mean(rows.design)
         fitted[modeling.BOTH] = fit_maps(modeling.BOTH, difference, rows, contrasts=contrasts)
+    analysis = replace(analysis, compared=compared, classified=compared, fitted=fitted)
+    analysis = extend("tests", analysis)
     found = inference.correct(
-        fitted,
+        analysis.fitted,
         rows,
         compared.table,
         request.settings.multiplicity,
         report=partial(tell, "permutations"),
     )
-    return replace(analysis, compared=compared, classified=compared, fitted=fitted, found=found)
+    return replace(analysis, found=found)
 
 
 def repeat_unregistered(analysis: Analysis) -> Analysis:
@@ -165,7 +167,7 @@ def summarize(analysis: Analysis) -> Analysis:
     measures, notes = fit_summaries(
         analysis.compared,
         request.model,
-        analysis.design,
+        analysis.row_model.design,
         request.settings.design,
         names=() if maps else request.measures.summaries,
         references=request.references,

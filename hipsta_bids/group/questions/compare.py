@@ -25,7 +25,7 @@ from hipsta_bids.group.questions.notes import notes_of
 from hipsta_bids.group.request import Request
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.io import files
-from hipsta_bids.joints import Writer, find_steps, load, load_all
+from hipsta_bids.joints import Writer, find_steps, fitted_contrasts, load, load_all
 from hipsta_bids.progress import tell
 from hipsta_bids.protocols.toml import resolve
 from hipsta_bids.stats.formula import folder_name
@@ -76,7 +76,7 @@ def _request(study: studies.Study) -> tuple[Mapping[str, Any], Request]:
     """Choose the model, as a document and as what the line is asked."""
     options, cohort = study.options, study.cohort
     document, model, groups, references = modeling.choose_model(
-        options.model,
+        replace(options.model, contrasts=fitted_contrasts(options.model.contrasts)),
         cohort.table,
         study.settings,
         comparison=options.comparison,
@@ -99,6 +99,7 @@ def _request(study: studies.Study) -> tuple[Mapping[str, Any], Request]:
         comparison=options.comparison,
         time=study.time.column if study.time else None,
         icv=study.icv,
+        contrasts=options.model.contrasts,
         options=options.further,
     )
     return document, plan_steps(request)
