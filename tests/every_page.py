@@ -43,8 +43,10 @@ COMMANDS = [
     ),
     *[
         (
-            "labels labels/shared participant --longitudinal --participant-label 01"
-            " --settings coarse.toml --n-procs 1",
+            (
+                "labels labels/shared participant --longitudinal --participant-label 01"
+                " --settings coarse.toml --n-procs 1"
+            ),
             0,
             ["labels/shared/report.html", "labels/shared/sub-01_ses-[12].html"],
         )
