@@ -226,6 +226,17 @@ class Grouping:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Engine:
+    """Workers that options of the participant level choose instead of this machine's."""
+
+    options: str
+    """Function that adds its options to a group of the parser."""
+    make: str
+    """Function of the parsed options; returns what runs jobs (``RunJobs`` of
+    `hipsta_bids.participant.pool`), ``None`` if it is not asked."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Extension:
     """What a folder adds to the program."""
 
@@ -249,6 +260,7 @@ class Extension:
     regions: tuple[Region, ...] = ()
     measurements: tuple[Measurement, ...] = ()
     groupings: tuple[Grouping, ...] = ()
+    engines: tuple[Engine, ...] = ()
     sections: str = ""
     """Sections of the page of an analysis, as ``module:tuple``."""
     participant_sections: str = ""
@@ -319,6 +331,11 @@ def find_measurements() -> tuple[Measurement, ...]:
 def find_groupings() -> tuple[Grouping, ...]:
     """Find which hemispheres can be measured together."""
     return _gather("groupings")
+
+
+def find_engines() -> tuple[Engine, ...]:
+    """Find workers elsewhere."""
+    return _gather("engines")
 
 
 def find_grouping(settings: Any) -> Grouping | None:  # noqa: ANN401  (of the participant level)

@@ -25,8 +25,8 @@ from hipsta_bids.cli.parser import (
     subject_label,
 )
 from hipsta_bids.errors import ExitCode, NothingToDoError, OutputError, UsageError, did_you_mean
-from hipsta_bids.participant.cluster import Cluster, Shard, check_cluster, parse_shard
 from hipsta_bids.participant.pool import pin_threads, processors
+from hipsta_bids.participant.shard import Shard, parse_shard
 from hipsta_bids.protocols import EXPERIMENTAL
 
 if TYPE_CHECKING:
@@ -72,10 +72,10 @@ def build_parser(epilog: str | None = None) -> Parser:
     add_segmentations(parser)
     _add_signals(parser)
     _add_processing(parser)
-    add = adder(parser.add_argument_group("many machines"), _HELP)
-    add("--shard", "I/N", type=_shard)
-    add("--dask-scheduler", "ADDRESS")
-    add("--slurm", "OPTIONS")
+    group = parser.add_argument_group("many machines")
+    adder(group, _HELP)("--shard", "I/N", type=_shard)
+    for engine in joints.find_engines():
+        joints.load(engine.options)(group)
     return parser
 
 
@@ -470,16 +470,13 @@ def _run_options(
             f" ({WORKER_GB * 1000:g} MB); for gigabytes write 8G"
         )
     check_scratch(options.work_dir)
-    cluster = None
-    if options.dask_scheduler is not None or options.slurm is not None:
-        cluster = Cluster(scheduler=options.dask_scheduler, slurm=options.slurm)
-        check_cluster(cluster)
+    engines = (joints.load(engine.make)(options) for engine in joints.find_engines())
     return from_namespace(
         RunOptions,
         options,
         mem_gb=options.mem,
         verbosity=options.verbose,
-        cluster=cluster,
+        engine=next(filter(None, engines), None),
         further=_further(options),
         reports=not options.no_reports,
         anatomy=not options.no_anatomy,
