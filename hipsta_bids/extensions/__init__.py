@@ -6,5 +6,5 @@
 #: Folders, in the order of the help.
 NAMES = (
     *("repeated", "sites", "consortia", "trials", "norms", "agreement", "maps"),
-    *("visits", "regions", "uncertainty", "surrogate", "export", "cluster"),
+    *("signals", "visits", "regions", "uncertainty", "surrogate", "export", "cluster"),
 )

@@ -322,7 +322,8 @@ def _find_sources(items: Sequence[HemisphereInput]) -> dict[str, Path]:
     origins = [(item.source, item.source_path) for item in items]
     origins += [(edit.source, edit.source_path) for item in items for edit in item.edits]
     origins += [(soft.source, soft.source_path) for i in items if (soft := i.probabilities)]
-    origins += [("bids", m.source_path) for item in items for m in item.maps if m.source_path]
+    additions = chain.from_iterable(item.further.values() for item in items)
+    origins += chain.from_iterable(addition.origins for addition in additions)
     return dataset.source_names(origins)
 
 

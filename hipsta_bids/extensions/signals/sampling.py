@@ -6,24 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hipsta_bids.extensions.signals.settings import MapSettings
 from hipsta_bids.geometry.digital import to_ras
 from hipsta_bids.geometry.measures import column_area
-from hipsta_bids.settings import MapSettings
-from hipsta_bids.types import Bool, Float, Sheet
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class ScalarVolume:
-    """One or more numbers per voxel, cropped to the part needed."""
-
-    values: Float
-    """(I, J, K, T); not finite where missing."""
-    affine: Float
-    """(4, 4), index into ``values`` to RAS mm."""
-    start: tuple[int, int, int]
-    """Index of the first voxel in the whole image."""
-    shape: tuple[int, int, int]
-    """Shape of the whole image."""
+from hipsta_bids.types import Bool, Float, ScalarVolume, Sheet
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
