@@ -19,8 +19,8 @@ from report import write_report
 
 from hipsta_bids.inputs.scan import InputRequest
 from hipsta_bids.inputs.search import dataset_notes, find_inputs, list_subjects
-from hipsta_bids.participant.cluster import Shard
 from hipsta_bids.participant.job import peak_memory
+from hipsta_bids.participant.shard import Shard
 
 _HIPPUNFOLD = "space-cropT1w_desc-subfields_atlas-multihist7_dseg.nii.gz"
 

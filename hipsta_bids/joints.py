@@ -178,25 +178,36 @@ class Region:
 
 @dataclass(frozen=True, kw_only=True)
 class Measurement:
-    """What an option of the participant level adds to each measured hemisphere."""
+    """What options of the participant level add to each measured hemisphere."""
 
     name: str
-    """Of the option in Python, and of its stage."""
-    options: str
-    """Function that adds the option to a group of the parser."""
+    """Of the option in Python, or of an addition to the inputs; and of its stage."""
     after: str
-    """Function of a job, its labels and its maps; returns the maps, notes, and a function that
-    writes further files."""
+    """Function of a job, its labels, its maps and its quality record, which it may change; returns
+    the maps, and a function that writes further files."""
     is_complete: str
     """Function of a job and its quality record: whether its files exist as the option asks."""
-    cost: str
+    options: str = ""
+    """Function that adds the option to a group of the parser."""
+    cost: str = ""
     """Function of the option's value: how many times as long a hemisphere takes."""
-    tables: tuple[str, ...]
+    tables: tuple[str, ...] = ()
     """Keys of tables with further maps, a row per node."""
-    columns: str
+    columns: str = ""
     """Function of a hemisphere of a page; returns further maps of its sheet, by name."""
-    pictures: str
+    pictures: str = ""
     """Function of measured hemispheres of a page; returns pictures, and lines below them."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Input:
+    """What options of the participant level add to the inputs of each hemisphere."""
+
+    options: str
+    """Function that adds its options to the parser."""
+    make: str
+    """Function of the parsed options; returns a function of inputs, which returns these with
+    additions (``HemisphereInput.further``), notes and warnings."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -234,6 +245,17 @@ class Grouping:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Engine:
+    """Workers that options of the participant level choose instead of this machine's."""
+
+    options: str
+    """Function that adds its options to a group of the parser."""
+    make: str
+    """Function of the parsed options; returns what runs jobs (``RunJobs`` of
+    `hipsta_bids.participant.pool`), ``None`` if it is not asked."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Extension:
     """What a folder adds to the program."""
 
@@ -255,8 +277,10 @@ class Extension:
     functions: tuple[str, ...] = ()
     """Functions of the Python interface, as ``module:name``."""
     regions: tuple[Region, ...] = ()
+    inputs: tuple[Input, ...] = ()
     measurements: tuple[Measurement, ...] = ()
     groupings: tuple[Grouping, ...] = ()
+    engines: tuple[Engine, ...] = ()
     sections: str = ""
     """Sections of the page of an analysis, as ``module:tuple``."""
     participant_sections: str = ""
@@ -327,9 +351,19 @@ def find_measurements() -> tuple[Measurement, ...]:
     return _gather("measurements")
 
 
+def find_inputs() -> tuple[Input, ...]:
+    """Find what options of extensions add to inputs."""
+    return _gather("inputs")
+
+
 def find_groupings() -> tuple[Grouping, ...]:
     """Find which hemispheres can be measured together."""
     return _gather("groupings")
+
+
+def find_engines() -> tuple[Engine, ...]:
+    """Find workers elsewhere."""
+    return _gather("engines")
 
 
 def find_grouping(settings: Any) -> Grouping | None:  # noqa: ANN401  (of the participant level)
@@ -339,7 +373,8 @@ def find_grouping(settings: Any) -> Grouping | None:  # noqa: ANN401  (of the pa
 
 def find_columns() -> list[str]:
     """Find functions of a hemisphere of a page that return further maps of its sheet."""
-    return [part.columns for part in _gather("measurements") + _gather("groupings")]
+    places = (part.columns for part in _gather("measurements") + _gather("groupings"))
+    return [place for place in places if place]
 
 
 def find_parts() -> tuple[Part, ...]:

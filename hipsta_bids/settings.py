@@ -261,15 +261,6 @@ class CheckSettings(tables.SettingsTable):
     map by more (RMS), mm."""
 
 
-class MapSettings(tables.SettingsTable):
-    """Other volumes on the sheet (``--map``)."""
-
-    min_known: tables.Fraction = 0.5
-    """A value is missing if less than this share of its voxels, or of the depth, is known."""
-    flag_outside: NonNegativeFloat = 0.05
-    """Flag if a larger share of the points lies outside the volume's field of view."""
-
-
 #: Settings of ``--method published``: what Diers et al. 2023 describe. Topology is repaired in any
 #: case, where the original stops.
 PUBLISHED: Mapping[str, Mapping[str, str | float]] = MappingProxyType(
@@ -294,7 +285,6 @@ class Settings(tables.ExtendedSettings):
     sheet: SheetSettings = Field(default_factory=SheetSettings)
     measures: MeasureSettings = Field(default_factory=MeasureSettings)
     checks: CheckSettings = Field(default_factory=CheckSettings)
-    maps: MapSettings = Field(default_factory=MapSettings)
 
     def as_published(self) -> list[str]:
         """List the settings of ``--method published`` that hold here, as ``group.name``."""

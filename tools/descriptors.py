@@ -197,9 +197,10 @@ _HEMISPHERE = {
     "records": ("_desc-qc_metrics.json", "status, flags, inputs, quality metrics"),
     "layers": ("_desc-layers_morph.tsv", "points of all layers (write_meshes)"),
     "meshes": ("_desc-tet_mesh.vtu", "tetrahedral meshes (write_meshes)"),
-    "other_maps": ("_desc-*_map.tsv", "other images on the sheet (map)"),
-    "regions": ("_desc-roi_morph.tsv", "maps summed up in regions (roi)"),
 }
+if is_present("signals"):
+    _HEMISPHERE["other_maps"] = ("_desc-*_map.tsv", "other images on the sheet (map)")
+    _HEMISPHERE["regions"] = ("_desc-roi_morph.tsv", "maps summed up in regions (roi)")
 if is_present("uncertainty"):
     text = "SD over perturbed labels (uncertainty)"
     _HEMISPHERE["uncertainties"] = ("_desc-*uncertainty_morph.tsv", text)

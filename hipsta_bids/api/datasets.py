@@ -19,6 +19,7 @@ from hipsta_bids.api.maps import measure
 from hipsta_bids.api.variables import attributes, node_axes
 from hipsta_bids.derivatives.dataset import counts_text
 from hipsta_bids.derivatives.measures import identify, origin
+from hipsta_bids.derivatives.names import NAMED_TABLES
 from hipsta_bids.derivatives.results import NODES, POSITION, STATE, list_results, read_sheet
 from hipsta_bids.errors import MissingFileError, NothingToDoError, in_python
 from hipsta_bids.geometry.catalog import MAPS
@@ -200,7 +201,7 @@ def _further_maps(measured: list[Hemisphere]) -> dict[str, tuple[tuple[str, ...]
     maps = {entry["name"] for h in measured for entry in h.record.get("maps") or ()}
     added = [(key,) for measurement in find_measurements() for key in measurement.tables]
     variables = {}
-    for key in (*added, *(("map_table", name) for name in sorted(maps))):
+    for key in (*added, *((key, name) for key in NAMED_TABLES for name in sorted(maps))):
         for name, about in _read_sidecar(measured, key).items():
             is_map = name not in NODES if key in added else name.partition("_")[0] in maps
             if is_map and isinstance(about, dict):

@@ -25,6 +25,7 @@ _PATHS = ("DIR", "FILE", "FILE.tsv", "FILE.toml", "FILE.json")
 _CHOICE = re.compile(r"invalid choice: '(?P<word>.*)' \(choose from (?P<known>.*)\)")
 #: argparse's message about arguments without dashes that are missing.
 _LACKING = re.compile(r"the following arguments are required: (?P<names>[^-].*)")
+_OPTIONS = "OPTIONS"  # of another program: they may begin with a dash
 _WORDS = 5  # of a call that a message repeats
 
 
@@ -76,14 +77,15 @@ class Parser(argparse.ArgumentParser):
         return content.replace(self.epilog or "", f"{hint}\n\n{self.epilog or ''}")
 
     def parse_known_args(self, args: Sequence[str], namespace: Any = None) -> Any:  # type: ignore[override]  # noqa: ANN401  (as in argparse, but without its overloads)
-        """Parse options in either spelling; the value of ``--slurm`` may begin with a dash.
+        """Parse options in either spelling; options of another program are a value.
 
         Unknown options are reported first: the next argument would be taken for something else.
         """
         spelled: list[str] = []
         for text in args:
             name, equals, value = text.partition("=")
-            if spelled and spelled[-1] == "--slurm":
+            option = self._option_string_actions.get(spelled[-1]) if spelled else None
+            if option is not None and option.metavar == _OPTIONS:
                 spelled[-1] += f"={text}"
             elif text.startswith("--"):
                 spelled.append(name.replace("_", "-") + equals + value)

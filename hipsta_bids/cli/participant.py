@@ -7,7 +7,7 @@ import shlex
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from hipsta_bids import __version__, joints
 from hipsta_bids.cli import console
@@ -19,14 +19,13 @@ from hipsta_bids.cli.parser import (
     from_namespace,
     help_texts,
     named_path,
-    named_pattern,
     positive_float,
     positive_int,
     subject_label,
 )
 from hipsta_bids.errors import ExitCode, NothingToDoError, OutputError, UsageError, did_you_mean
-from hipsta_bids.participant.cluster import Cluster, Shard, check_cluster, parse_shard
 from hipsta_bids.participant.pool import pin_threads, processors
+from hipsta_bids.participant.shard import Shard, parse_shard
 from hipsta_bids.protocols import EXPERIMENTAL
 
 if TYPE_CHECKING:
@@ -70,12 +69,13 @@ def build_parser(epilog: str | None = None) -> Parser:
     accept(parser, help_texts()["without meaning"])
     add_selection(parser)
     add_segmentations(parser)
-    _add_signals(parser)
+    for addition in joints.find_inputs():
+        joints.load(addition.options)(parser)
     _add_processing(parser)
-    add = adder(parser.add_argument_group("many machines"), _HELP)
-    add("--shard", "I/N", type=_shard)
-    add("--dask-scheduler", "ADDRESS")
-    add("--slurm", "OPTIONS")
+    group = parser.add_argument_group("many machines")
+    adder(group, _HELP)("--shard", "I/N", type=_shard)
+    for engine in joints.find_engines():
+        joints.load(engine.options)(group)
     return parser
 
 
@@ -106,17 +106,6 @@ def add_segmentations(parser: Parser) -> None:
     add("--edited-dir", "DIR")
 
 
-def _add_signals(parser: Parser) -> None:
-    add = adder(parser.add_argument_group("what else to bring to the sheet"), _HELP)
-    add("--map", "NAME=PATTERN...", type=named_pattern)
-    places = ("depth", "mid", "interior", "exterior")
-    add("--map-sampling", "[NAME=]" + "|".join(places) + "...", type=_choice(*places))
-    add("--map-interpolation", "[NAME=]linear|nearest...", type=_choice("linear", "nearest"))
-    add("--map-transform", "NAME=PATTERN...", type=named_pattern)
-    add("--map-reference", "NAME=PATTERN...", type=named_pattern)
-    add("--roi", "FILE.tsv")
-
-
 def _add_processing(parser: Parser) -> None:
     group = parser.add_argument_group("how to process")
     add = adder(group, _HELP)
@@ -130,7 +119,8 @@ def _add_processing(parser: Parser) -> None:
         joints.load(grouping.options)(group)
     add("--write-meshes")
     for measurement in joints.find_measurements():
-        joints.load(measurement.options)(group)
+        if measurement.options:
+            joints.load(measurement.options)(group)
     add("--force")
     add_pages = adder(group.add_mutually_exclusive_group(), _HELP)
     add_pages("--no-reports")
@@ -170,20 +160,6 @@ def _hemi(text: str) -> str:
     return hemi
 
 
-def _choice(*values: str) -> Callable[[str], tuple[str | None, str]]:
-    """Return a converter that takes one of some words, for all maps or (NAME=) for one."""
-
-    def convert(text: str) -> tuple[str | None, str]:
-        name, equals, value = text.rpartition("=")
-        if value not in values or (equals and not name):
-            raise argparse.ArgumentTypeError(
-                f"{text!r} is not {', '.join(values[:-1])} or {values[-1]}, alone or after NAME="
-            )
-        return name or None, value
-
-    return convert
-
-
 def _probabilities(text: str) -> str | Path:
     return text if text in {"auto", "never"} else Path(text)
 
@@ -206,18 +182,6 @@ def run_participant_level(options: "Namespace", arguments: Sequence[str] = ()) -
         return _run(options, arguments)
 
 
-def _echo_notes(notes: Iterable[str], items: Sequence["HemisphereInput"]) -> None:
-    """Print notes on inputs, and a warning for each map of which no hemisphere has a file."""
-    for note in notes:
-        console.echo(f"note: {note}")
-    for requests in zip(*(item.maps for item in items), strict=True):
-        if not any(request.path for request in requests):
-            console.warn(
-                f"warning: --map {requests[0].name}: no hemisphere has this map; check the pattern"
-                f" {requests[0].pattern}"
-            )
-
-
 def _run(options: "Namespace", arguments: Sequence[str]) -> ExitCode:
     pin_threads()
     for name, reason in dict(options.ignored).items():
@@ -236,14 +200,10 @@ def _run(options: "Namespace", arguments: Sequence[str]) -> ExitCode:
     from hipsta_bids.derivatives.dataset import upgrade_notes  # noqa: PLC0415  (heavy)
     from hipsta_bids.inputs import account, search  # noqa: PLC0415  (heavy)
     from hipsta_bids.inputs.edits import attach_ends  # noqa: PLC0415  (heavy)
-    from hipsta_bids.inputs.maps import attach, map_requests  # noqa: PLC0415  (heavy)
     from hipsta_bids.io.volumes import limit_memory  # noqa: PLC0415  (heavy)
 
     limit_memory(options.mem)
-    requests = map_requests(
-        *(options.map, options.map_sampling, options.map_interpolation),
-        *(options.map_transform, options.map_reference),
-    )
+    additions = [joints.load(addition.make)(options) for addition in joints.find_inputs()]
     with console.searching(has_bar=not (options.quiet or options.dry_run)):
         part = options.shard and options.shard.take(search.list_subjects(request))
         findings = _find(request, part, say=console.echo if options.dry_run else None)
@@ -251,17 +211,17 @@ def _run(options: "Namespace", arguments: Sequence[str]) -> ExitCode:
         console.echo(f"part {options.shard.name} of the dataset has nothing to process")
         return ExitCode.OK
     items, end_notes = attach_ends(findings.items, options.ends)
-    items, map_notes = attach(items, requests, options.roi, options.bids_dir)
+    items, further_notes, warnings = _attach_all(items, additions)
     notes = (
         *search.dataset_notes(request, items, part),
         *findings.notes,
         *end_notes,
-        *map_notes,
+        *further_notes,
         *upgrade_notes(options.output_dir),
     )
     unused = (*findings.ignored, *findings.other_entries)
     inputs = account.input_table(items, unused, options.bids_dir)
-    _echo_notes(notes, items)
+    _echo_notes(notes, warnings)
     counts = f"inputs: {account.count_inputs(inputs)}"
     if options.dry_run:
         console.echo(counts)
@@ -288,6 +248,26 @@ def _run(options: "Namespace", arguments: Sequence[str]) -> ExitCode:
             result = run_participants(items, out, settings, run_options, progress.report)
     console.echo_result(result, out, has_pages=run_options.reports)
     return result.exit_code
+
+
+def _echo_notes(notes: Iterable[str], warnings: Iterable[str]) -> None:
+    """Print notes and warnings on inputs."""
+    for note in notes:
+        console.echo(f"note: {note}")
+    for warning in warnings:
+        console.warn(f"warning: {warning}")
+
+
+def _attach_all(
+    items: "Sequence[HemisphereInput]", additions: Iterable[Callable[..., Any]]
+) -> tuple[tuple["HemisphereInput", ...], list[str], list[str]]:
+    """Add what extensions bring to inputs; return notes and warnings, too."""
+    notes, warnings = [], []
+    for attach in additions:
+        items, added_notes, added_warnings = attach(items)
+        notes += added_notes
+        warnings += added_warnings
+    return tuple(items), notes, warnings
 
 
 def _list_inputs(
@@ -334,10 +314,8 @@ def _settings(options: "Namespace") -> "Settings":
 
 def _further(options: "Namespace") -> dict[str, object]:
     """Collect the options of extensions that were given, by name."""
-    values = {
-        measurement.name: getattr(options, measurement.name)
-        for measurement in joints.find_measurements()
-    }
+    names = [measurement.name for measurement in joints.find_measurements() if measurement.options]
+    values = {name: getattr(options, name) for name in names}
     return {name: value for name, value in values.items() if value}
 
 
@@ -470,16 +448,13 @@ def _run_options(
             f" ({WORKER_GB * 1000:g} MB); for gigabytes write 8G"
         )
     check_scratch(options.work_dir)
-    cluster = None
-    if options.dask_scheduler is not None or options.slurm is not None:
-        cluster = Cluster(scheduler=options.dask_scheduler, slurm=options.slurm)
-        check_cluster(cluster)
+    engines = (joints.load(engine.make)(options) for engine in joints.find_engines())
     return from_namespace(
         RunOptions,
         options,
         mem_gb=options.mem,
         verbosity=options.verbose,
-        cluster=cluster,
+        engine=next(filter(None, engines), None),
         further=_further(options),
         reports=not options.no_reports,
         anatomy=not options.no_anatomy,

@@ -5,6 +5,7 @@ The quality record is written last and removed first, so that it stands for a co
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -160,6 +161,19 @@ def number_nodes(axes: Iterable[str], shape: tuple[int, ...]) -> dict[str, list[
     """Node numbers of all points of a grid, from 1, last axis fastest."""
     numbers = (index.ravel() + 1 for index in np.indices(shape))
     return {axis: [str(n) for n in v.tolist()] for axis, v in zip(axes, numbers, strict=True)}
+
+
+def write_nodes(path: Path, names: Sequence[str], values: Float, digits: int = 7) -> None:
+    """Write values (Nx, Ny, columns) of a sheet as a table with one row per node."""
+    x, y = np.indices(values.shape[:2]).reshape(2, -1) + 1
+    cells = [format_cells(column, digits) for column in values.reshape(len(x), -1).T]
+    rows = zip(map(str, x.tolist()), map(str, y.tolist()), *cells, strict=True)
+    files.write_tsv(path, ["x", "y", *names], rows)
+
+
+def format_cells(values: Float, digits: int = 7) -> list[str]:
+    """Format numbers of unknown size."""
+    return [f"{v:.{digits}g}" if np.isfinite(v) else files.MISSING for v in values.tolist()]
 
 
 def _positions(points: Float) -> dict[str, list[str]]:

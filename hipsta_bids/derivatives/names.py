@@ -177,17 +177,18 @@ OUTPUTS: tuple[Output, ...] = (
     _output("qc", "metrics", ".json", desc="qc"),
 )
 
-_SAMPLED = {"table": ".tsv", "sidecar": ".json", "shape": ".shape.gii", "series": ".func.gii"}
-
 
 def _of_extensions() -> Iterator[Output]:
-    """Describe files that extensions add: tables, records, and images with their sidecars."""
+    """Describe files that extensions add: tables, records, and images with their sidecars.
+
+    Those with names that the user gives are described alone.
+    """
     images = []
     for key, row in _FURTHER.items():
         fields = {name: value for name, value in row.items() if name != "text"}
         if not fields:
             yield from _table(key, called="that table")
-        elif fields["extension"] == ".json":
+        elif fields["extension"] == ".json" or fields["desc"] == "*":
             yield _output(key, **fields)
         else:
             images.append(_output(key, **fields))
@@ -197,11 +198,10 @@ def _of_extensions() -> Iterator[Output]:
 
 #: Files of one hemisphere that come with an option or another command. A ``*`` stands for the name
 #: that the user gave.
-EXTRA_OUTPUTS: tuple[Output, ...] = (
-    *(_output(f"map_{key}", "map", end, desc="*") for key, end in _SAMPLED.items()),
-    *_table("roi", called="the region table"),
-    *_of_extensions(),
-)
+EXTRA_OUTPUTS: tuple[Output, ...] = tuple(_of_extensions())
+
+#: Tables of maps that the user names, by key.
+NAMED_TABLES = [r.key for r in EXTRA_OUTPUTS if r.desc == "*" and r.extension == ".tsv"]
 
 #: Lists of files in a quality record, each an entry with an address.
 FILE_LISTS = ("inputs", "edited", "probabilities", "visits")

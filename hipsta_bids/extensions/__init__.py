@@ -6,6 +6,6 @@
 #: Folders, in the order of the help.
 NAMES = (
     *("combination", "repeated", "sites", "multilevel", "consortia", "trials", "norms"),
-    *("agreement", "maps", "conjunctions", "percent", "parcels", "visits", "regions"),
-    *("uncertainty", "surrogate", "export"),
+    *("agreement", "maps", "conjunctions", "percent", "parcels", "signals", "visits", "regions"),
+    *("uncertainty", "surrogate", "export", "cluster"),
 )

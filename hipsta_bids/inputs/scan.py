@@ -6,6 +6,7 @@ is not understood, hides nothing but itself, and is named.
 
 import os
 import re
+import typing
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -108,32 +109,15 @@ class Probabilities:
     source_path: Path
 
 
-@dataclass(frozen=True, kw_only=True)
-class MapSource:
-    """Another volume of the same participant, to be sampled on the sheet."""
+class Addition(typing.Protocol):
+    """What an extension adds to the inputs of a hemisphere."""
 
-    name: str
-    """What its outputs are called."""
-    pattern: str = ""
-    """Path with placeholders, absolute or relative to the BIDS dataset; may have wildcards."""
-    sampling: str
-    """As of :func:`~hipsta_bids.geometry.sampling.sample_on_sheet`: surface, or ``depth``."""
-    interpolation: str
-    """``linear`` or ``nearest``."""
-    path: Path | None = None
-    """None where there is no file, or more than one that it could be."""
-    missing: str | None = None
-    """Why there is no path, in one phrase."""
-    source_path: Path | None = None
-    """The dataset that it is in, if it is in the one that was given."""
-    transform_pattern: str | None = None
-    """As ``pattern``, for the registration of the volume to the space of the labels."""
-    transform: Path | None = None
-    """The file of this registration, where there is one."""
-    reference_pattern: str | None = None
-    """As ``pattern``, for the image that FSL registered the volume to."""
-    reference: Path | None = None
-    """The file of this image, where there is one."""
+    @property
+    def origins(self) -> Sequence[tuple[str, Path]]:
+        """Datasets of its files: their names and folders."""
+
+    def describe(self) -> list[object]:
+        """List what decides about its results: contents of files, and how they are read."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -164,12 +148,10 @@ class HemisphereInput(Hemisphere):
     """Corrections by a person that take the place of what the files say."""
     ends: tuple[GivenEnd, ...] = ()
     """Ends of the body that a person has placed."""
-    maps: tuple[MapSource, ...] = ()
-    """Other volumes to be sampled on the sheet."""
     probabilities: Probabilities | None = None
     """Probabilities of the labels, if they are used."""
-    regions: Path | None = None
-    """Table of regions drawn on the sheet."""
+    further: Mapping[str, Addition] = field(default_factory=dict, hash=False)
+    """What extensions add to the inputs, by name."""
 
     def edit(self, kind: str) -> Edit | None:
         """Return the edit of one kind, if there is one."""

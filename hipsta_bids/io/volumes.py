@@ -22,9 +22,8 @@ from scipy.spatial.transform import Rotation
 
 from hipsta_bids.errors import InputError, MissingFileError
 from hipsta_bids.geometry.digital import Box, box, to_ras
-from hipsta_bids.geometry.sampling import ScalarVolume
 from hipsta_bids.opening import open_regular
-from hipsta_bids.types import BodyMask, Float
+from hipsta_bids.types import BodyMask, Float, ScalarVolume
 
 #: Voxel edges [mm] of segmentations outside of this range are taken for a wrong header ...
 VOXEL_SIZES = (0.05, 5.0)

@@ -10,6 +10,7 @@ import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -22,17 +23,9 @@ from hipsta_bids.derivatives.dataset import source_address
 from hipsta_bids.derivatives.names import ADDED_MAPS
 from hipsta_bids.derivatives.results import ResultPlace, read_record
 from hipsta_bids.errors import GeometryError, HipstaError, InputError, OutputError, ProtocolError
-from hipsta_bids.geometry.sampling import Regions
 from hipsta_bids.inputs.scan import HemisphereInput
 from hipsta_bids.io import files
 from hipsta_bids.joints import find_groupings, find_measurements, load
-from hipsta_bids.participant.maps import (
-    Mapped,
-    add_signals,
-    is_complete,
-    signal_hash,
-    write_signals,
-)
 from hipsta_bids.protocols.load import for_region
 from hipsta_bids.settings import Settings
 from hipsta_bids.types import BodyMask, Decision, HemisphereMaps, LabelVolume
@@ -114,7 +107,6 @@ def recorded(job: Job) -> Outcome | None:
     )
     whole = decision == Decision.FAILED or (
         all(path.exists() for path in job.result.paths(optional=job.write_meshes))
-        and is_complete(job.result, record)
         and all(load(measurement.is_complete)(job, record) for measurement in find_measurements())
         and (not job.visits or all(load(g.is_complete)(job) for g in find_groupings()))
     )
@@ -228,7 +220,7 @@ def _describe_reading(
         [item.protocol.unlisted, item.bilateral, item.code_offset, item.hemi],
         sorted([entry["what"], entry["sha256"]] for entry in edited),
         *([[asdict(end) for end in item.ends]] if item.ends else []),
-        *signal_hash(item),
+        *chain.from_iterable(addition.describe() for addition in item.further.values()),
     ]
 
 
@@ -420,21 +412,11 @@ def _measure(
     record["notes"] = [*record["notes"], *noted]
     with naming_causes(volume):
         maps = measure(volume, job.item.hemi, job.settings, clock)
-    mapped: list[Mapped] = []
-    regions = None
-    if job.item.maps or job.item.regions:
-        with clock("maps"):
-            maps, mapped, regions, entries = add_signals(
-                job.item, maps, job.settings.maps, dict(job.sources)
-            )
-            record |= entries
-    writers: list[Callable[[], None]]
-    writers = [partial(_write_maps, job.result, maps, mapped, regions)]
+    writers: list[Callable[[], None]] = [partial(_write_maps, job.result, maps)]
     for measurement in find_measurements():
-        if measurement.name in job.further:
+        if measurement.name in {*job.further, *job.item.further}:
             with clock(measurement.name):
-                maps, notes, write = load(measurement.after)(job, volume, maps)
-            record["notes"] = [*record["notes"], *notes]
+                maps, write = load(measurement.after)(job, volume, maps, record)
             writers.append(write)
     return maps, writers
 
@@ -444,11 +426,8 @@ def _call_all(writers: Sequence[Callable[[], None]]) -> None:
         write()
 
 
-def _write_maps(
-    result: ResultPlace, maps: HemisphereMaps, mapped: Sequence[Mapped], regions: Regions | None
-) -> None:
-    """Write maps of other volumes, and those of a region."""
-    write_signals(result, maps, mapped, regions)
+def _write_maps(result: ResultPlace, maps: HemisphereMaps) -> None:
+    """Write the maps of a region."""
     for name in maps.maps.keys() & ADDED_MAPS.keys():
         from hipsta_bids.io import gifti  # noqa: PLC0415  (workers only)
 

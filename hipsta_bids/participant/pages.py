@@ -15,8 +15,7 @@ from hipsta_bids.derivatives.names import DATASET_FILES, participant_report
 from hipsta_bids.derivatives.results import list_results
 from hipsta_bids.errors import HipstaError, OutputError
 from hipsta_bids.io import files
-from hipsta_bids.participant.cluster import Cluster, run_on_cluster
-from hipsta_bids.participant.pool import WorkerLost, WorkerPlan, run_jobs
+from hipsta_bids.participant.pool import RunJobs, WorkerLost, WorkerPlan, run_jobs
 from hipsta_bids.progress import tell
 from hipsta_bids.reports.cohort import Cohort, read_cohort
 from hipsta_bids.types import VisitKey
@@ -62,7 +61,7 @@ class PagePlan:
     """Whether anatomical images are shown behind labels."""
     cohort: bool = True
     """Whether the page of the cohort is made, too."""
-    cluster: Cluster | None = None
+    engine: RunJobs | None = None
     """Workers elsewhere; ``None`` is this machine."""
 
 
@@ -87,10 +86,7 @@ def write_reports(plan: PagePlan, visits: Iterable[VisitKey]) -> Iterator[Hipsta
         log=plan.log,
         warm_up=warm_up,
     )
-    if plan.cluster is None or not jobs:
-        answers = run_jobs(workers, jobs)
-    else:
-        answers = run_on_cluster(plan.cluster, workers, jobs)
+    answers = (plan.engine if plan.engine and jobs else run_jobs)(workers, jobs)
     tell("pages", 0, len(jobs))
     with contextlib.closing(answers) as pages:
         for count, (job, answer) in enumerate(pages, start=1):

@@ -45,7 +45,8 @@ _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 _OOM_SCORE = "500"  # of -1000 to 1000: if memory runs out, a worker is lost and not the run
 _GRACE = 5.0  # s that an idle worker gets to end by itself
 _START_TIME = 300.0  # s that a worker gets to load its libraries, on a slow network disk
-_STARTS = 3  # a worker that never gets ready is a broken installation, not bad luck
+STARTS = 3
+"""Attempts: a worker that never gets ready is a broken installation, not bad luck."""
 
 
 def pin_threads() -> None:
@@ -109,7 +110,7 @@ class WorkerLost:
 
 
 @dataclass(eq=False)
-class _Slot:
+class Slot:
     """A worker process, as its parent knows it."""
 
     process: BaseProcess
@@ -157,11 +158,15 @@ class _Slot:
         self.connection.close()
 
 
+#: Works off jobs as :func:`run_jobs` does; yields each job with its answer.
+RunJobs = Callable[[WorkerPlan, Iterable[Any]], Generator[tuple[Any, Any]]]
+
+
 def run_jobs(plan: WorkerPlan, jobs: Iterable[Any]) -> Generator[tuple[Any, Any]]:
     """Work off jobs in parallel; closing the generator stops all workers."""
     queue: Iterator[Any] = iter(jobs)
     waiting = next(queue, None)
-    slots: list[_Slot] = []
+    slots: list[Slot] = []
     failed_starts = 0
     try:
         while waiting is not None or any(slot.job is not None for slot in slots):
@@ -171,13 +176,13 @@ def run_jobs(plan: WorkerPlan, jobs: Iterable[Any]) -> Generator[tuple[Any, Any]
                     waiting = next(queue, None)
                     plan.begun([slot.job for slot in slots if slot.job is not None])
             if waiting is not None and len(slots) < plan.n_workers:
-                slots.append(_start(plan))
+                slots.append(start(plan))
                 continue
-            for slot, message in _poll(slots, plan.timeout):
+            for slot, message in poll(slots, plan.timeout):
                 if isinstance(message, WorkerLost):
                     slots.remove(slot)
                     failed_starts += not slot.ready
-                    if failed_starts >= _STARTS:
+                    if failed_starts >= STARTS:
                         raise RuntimeError(f"worker processes do not start; see {plan.log}")
                 elif not slot.ready:
                     slot.ready, failed_starts = True, 0
@@ -189,56 +194,12 @@ def run_jobs(plan: WorkerPlan, jobs: Iterable[Any]) -> Generator[tuple[Any, Any]
         _stop(slots)
 
 
-class Worker:
-    """One worker process, for callers that hand out jobs themselves; replaced when it dies."""
-
-    def __init__(self, plan: WorkerPlan) -> None:
-        self.plan = plan
-        self._slot: _Slot | None = None
-
-    def __call__(self, job: Any) -> Any:  # noqa: ANN401  (jobs are the caller's)
-        """Do one job."""
-        slot = self._ready()
-        slot.give(job)
-        answer = self._listen(slot)
-        slot.job = None
-        return answer
-
-    def kill(self) -> None:
-        """End the process, whatever it is doing; may be called by another thread."""
-        slot = self._slot
-        if slot is not None and slot.job is None:
-            slot.kill()
-        elif slot is not None:
-            slot.kill_group()  # the thread that waits for the answer does the rest
-
-    def _ready(self) -> _Slot:
-        for _ in range(_STARTS):
-            if self._slot is not None and not self._slot.process.is_alive():
-                self._slot.kill()
-                self._slot = None
-            slot = self._slot = self._slot or _start(self.plan)
-            if slot.ready or not isinstance(self._listen(slot), WorkerLost):
-                slot.ready = True
-                return slot
-        raise RuntimeError(f"worker processes do not start; see {self.plan.log}")
-
-    def _listen(self, slot: _Slot) -> Any:  # noqa: ANN401  (jobs are the caller's)
-        events: list[tuple[_Slot, Any]] = []
-        while not events:
-            events = _poll([slot], self.plan.timeout)
-        ((_, message),) = events
-        if isinstance(message, WorkerLost):
-            self._slot = None
-        return message
-
-
-def _poll(slots: list[_Slot], timeout: float) -> list[tuple[_Slot, Any]]:
+def poll(slots: list[Slot], timeout: float) -> list[tuple[Slot, Any]]:
     """Wait for messages, deaths, or the next deadline."""
     nearest = min(slot.deadline(timeout) for slot in slots)
     patience = None if math.isinf(nearest) else max(0.0, nearest - time.monotonic())
     heard = set(wait([slot.connection for slot in slots], patience))
-    events: list[tuple[_Slot, Any]] = []
+    events: list[tuple[Slot, Any]] = []
     for slot in slots:
         if slot.connection in heard:
             try:
@@ -250,7 +211,8 @@ def _poll(slots: list[_Slot], timeout: float) -> list[tuple[_Slot, Any]]:
     return events
 
 
-def _start(plan: WorkerPlan) -> _Slot:
+def start(plan: WorkerPlan) -> Slot:
+    """Start a worker process."""
     context = _context()
     if plan.warm_up is not None and context.get_start_method() == "fork":
         # Once for all workers. An error shows again in them, and in the log.
@@ -268,7 +230,7 @@ def _start(plan: WorkerPlan) -> _Slot:
         raise
     finally:
         child_end.close()
-    return _Slot(process=process, connection=parent_end)
+    return Slot(process=process, connection=parent_end)
 
 
 def _context() -> Any:  # noqa: ANN401  (the contexts have no common type that can start processes)
@@ -309,7 +271,7 @@ def _inherited(plan: WorkerPlan) -> Iterator[None]:
             handler(*caught[0])
 
 
-def _stop(slots: list[_Slot]) -> None:
+def _stop(slots: list[Slot]) -> None:
     """Let idle workers end by themselves, so that they tidy up; then kill the others."""
     idle = [slot for slot in slots if slot.ready and slot.job is None]
     for slot in idle:

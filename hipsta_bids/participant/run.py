@@ -21,7 +21,6 @@ from hipsta_bids.errors import ExitCode, HipstaError, InputError, OutputError, P
 from hipsta_bids.inputs.scan import HemisphereInput
 from hipsta_bids.io import files
 from hipsta_bids.joints import find_grouping, find_measurements, load
-from hipsta_bids.participant.cluster import Cluster, Shard, run_on_cluster
 from hipsta_bids.participant.job import (
     INTERNAL,
     Job,
@@ -34,7 +33,8 @@ from hipsta_bids.participant.job import (
 )
 from hipsta_bids.participant.log import log_file, log_outcome
 from hipsta_bids.participant.pages import PagePlan, reports_after
-from hipsta_bids.participant.pool import WorkerLost, WorkerPlan, run_jobs
+from hipsta_bids.participant.pool import RunJobs, WorkerLost, WorkerPlan, run_jobs
+from hipsta_bids.participant.shard import Shard
 from hipsta_bids.participant.status import StatusTable, not_finished
 from hipsta_bids.progress import tell
 from hipsta_bids.settings import Settings
@@ -73,7 +73,7 @@ class RunOptions:
     """Seconds per hemisphere."""
     shard: Shard | None = None
     """Which part of the dataset this is, if other runs do the others."""
-    cluster: Cluster | None = None
+    engine: RunJobs | None = None
     """Workers elsewhere; ``None`` is this machine."""
     reports: bool = False
     """Make pages to look at afterwards."""
@@ -210,7 +210,7 @@ def _run(
             bids_dir=options.bids_dir,
             anatomy=options.anatomy,
             cohort=options.shard is None,
-            cluster=options.cluster,
+            engine=options.engine,
         )
         # Closed at once, whatever ends the loop, so that no worker outlives it.
         with (
@@ -322,7 +322,8 @@ def _find_sources(items: Sequence[HemisphereInput]) -> dict[str, Path]:
     origins = [(item.source, item.source_path) for item in items]
     origins += [(edit.source, edit.source_path) for item in items for edit in item.edits]
     origins += [(soft.source, soft.source_path) for i in items if (soft := i.probabilities)]
-    origins += [("bids", m.source_path) for item in items for m in item.maps if m.source_path]
+    additions = chain.from_iterable(item.further.values() for item in items)
+    origins += chain.from_iterable(addition.origins for addition in additions)
     return dataset.source_names(origins)
 
 
@@ -404,11 +405,11 @@ def _pooled(
         environment=() if options.work_dir is None else (("TMPDIR", str(options.work_dir)),),
         begun=_tell_titles,
     )
-    if options.cluster is None or not groups:
+    if options.engine is None or not groups:
         tell(STAGE, None, current=f"about {_expected(table, plan, jobs)}")
         pool = run_jobs(plan, groups)
     else:
-        pool = run_on_cluster(options.cluster, plan, groups)
+        pool = options.engine(plan, groups)
     try:
         for group, answer in pool:
             if isinstance(answer, WorkerLost):

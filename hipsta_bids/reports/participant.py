@@ -383,7 +383,8 @@ def _sheets(series: Series) -> Mapping[str, Any] | None:
     if not measured:
         return None
     pictures = [draw_map(kind, measured) for kind in MAP_KINDS if kind != THICKNESS]
-    added = [load(measurement.pictures)(measured) for measurement in find_measurements()]
+    places = (measurement.pictures for measurement in find_measurements())
+    added = [load(place)(measured) for place in places if place]
     return {
         "pictures": [*pictures, *chain.from_iterable(further for further, _ in added)],
         "lines": list(chain.from_iterable(lines for _, lines in added)),

@@ -22,7 +22,6 @@ from hipsta_bids.derivatives.results import (
     read_summary,
 )
 from hipsta_bids.errors import HipstaError, InputError
-from hipsta_bids.geometry.sampling import ScalarVolume
 from hipsta_bids.inputs.search import Candidate, find_anatomy
 from hipsta_bids.io import files, gifti, volumes
 from hipsta_bids.io.volumes import LabelImage, read_grid, read_labels, read_scalars
@@ -32,7 +31,7 @@ from hipsta_bids.protocols.load import load_protocol, protocol_names
 from hipsta_bids.protocols.protocol import Protocol
 from hipsta_bids.reports.display import palette
 from hipsta_bids.reports.page import number
-from hipsta_bids.types import Bool, Decision, Float
+from hipsta_bids.types import Bool, Decision, Float, ScalarVolume
 
 SURFACES = ("interior", "midthickness", "exterior")
 SIDES = {"L": "left", "R": "right"}

@@ -13,8 +13,13 @@ from hipsta_bids.reports.page import number, read_table
 from hipsta_bids.reports.results import Finding, Hemisphere
 from hipsta_bids.types import Decision
 
-#: Flags about volumes that were sampled besides.
-_BESIDES = ("map-outside", "map-unusable", "roi-unusable")
+#: Flags about what was measured besides.
+_BESIDES = {
+    name
+    for section in read_table("reasons.toml")["section"]
+    for name, row in section["reasons"].items()
+    if row.get("is_besides")
+}
 
 #: Repairs by their kinds (:class:`Repair`).
 _REPAIRS = {

@@ -107,8 +107,11 @@ def contrast_json(text: str) -> dict[str, Any]:
             f"contrast {text!r}: write one-sided tests with one > or < and a number, as"
             " arm[B]-arm[A] > -0.05"
         )
-    margin = 0.0 if sided is None else float(sided["margin"])
-    ending_side = f" {sided['sign']} {margin:g}" if sided else ""
+    side: dict[str, Any] = {}
+    ending_side = ""
+    if sided:
+        side = {"Alternative": _SIDES[sided["sign"]], "Margin": float(sided["margin"])}
+        ending_side = f" {sided['sign']} {side['Margin']:g}"
     ending = "".join(CONDITION + ", ".join(map(str.strip, c.split(","))) for c in conditions)
     rows = [
         {name + ending: weight for name, weight in parse_expression(row).items()}
@@ -122,7 +125,7 @@ def contrast_json(text: str) -> dict[str, Any]:
         "ConditionList": combined,
         "Weights": listed,
         "Test": test,
-        **({"Alternative": _SIDES[sided["sign"]], "Margin": margin} if sided else {}),
+        **side,
     }
 
 

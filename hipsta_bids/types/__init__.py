@@ -416,3 +416,17 @@ class Mesh:
         """Whether it lies in the plane of the first two axes, as unfolded surfaces do."""
         reach = np.ptp(self.points, axis=0)
         return bool(reach[2] <= _FLAT * reach.max())
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ScalarVolume:
+    """One or more numbers per voxel, cropped to the part needed."""
+
+    values: Float
+    """(I, J, K, T); not finite where missing."""
+    affine: Float
+    """(4, 4), index into ``values`` to RAS mm."""
+    start: tuple[int, int, int]
+    """Index of the first voxel in the whole image."""
+    shape: tuple[int, int, int]
+    """Shape of the whole image."""

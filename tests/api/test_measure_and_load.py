@@ -24,10 +24,7 @@ from hipsta_bids.errors import (
     NothingToDoError,
     ProtocolError,
 )
-from hipsta_bids.geometry.sampling import SampledMap
-from hipsta_bids.inputs.scan import MapSource
 from hipsta_bids.io import files
-from hipsta_bids.participant.maps import write_map
 from hipsta_bids.phantom import encode
 from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.settings import Settings
@@ -188,8 +185,12 @@ class TestLoad:
         assert maps.x.to_numpy()[-1] == 0.9
 
     @needs("uncertainty")
+    @needs("signals")
     def test_uncertainty_and_sampled_maps_are_beside_them(self, tmp_path):
-        from hipsta_bids.extensions.uncertainty.files import write_spread  # noqa: PLC0415  (may be absent)
+        from hipsta_bids.extensions.signals.files import write_map  # noqa: PLC0415  (may be absent)
+        from hipsta_bids.extensions.signals.inputs import MapSource  # noqa: PLC0415
+        from hipsta_bids.extensions.signals.sampling import SampledMap  # noqa: PLC0415
+        from hipsta_bids.extensions.uncertainty.files import write_spread  # noqa: PLC0415
 
         dataset.settle_settings(tmp_path, Settings())
         write(tmp_path, "01", "L")

@@ -54,8 +54,14 @@ def lose(monkeypatch):
 @pytest.mark.parametrize(
     "case",
     [
-        ("labels labels/shared", "participant.html", "labels/shared/measures.tsv"),
-        ("labels labels/shared", "cohort.html", "labels/shared/measures.tsv"),
+        pytest.param(
+            ("labels labels/shared", "participant.html", "labels/shared/measures.tsv"),
+            marks=needs("visits"),
+        ),
+        pytest.param(
+            ("labels labels/shared", "cohort.html", "labels/shared/measures.tsv"),
+            marks=needs("visits"),
+        ),
         (f"{GROUP} --name a", "group/model.html", "cohort/out/group/a/peaks.tsv"),
         pytest.param(("meta ", "meta/sites.html", "meta/meta/sites.tsv"), marks=needs("consortia")),
         pytest.param(

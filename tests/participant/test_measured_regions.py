@@ -6,6 +6,7 @@ import nibabel as nib
 import numpy as np
 import pandas as pd
 import pytest
+from extension_marks import needs
 from measured_phantoms import Results, measure
 
 from hipsta_bids.cli import main
@@ -115,6 +116,7 @@ def test_regions_share_a_folder(bids, out, capsys):
     }
 
 
+@needs("signals")
 def test_maps_and_drawn_regions_on_other_regions(bids, tmp_path):
     labels = nib.load(next(bids.rglob("sub-01_left_*.nii.gz")))
     index = np.moveaxis(np.indices(labels.shape), 0, -1)

@@ -14,7 +14,7 @@ from hipsta_bids.inputs import search
 from hipsta_bids.inputs.scan import InputRequest
 from hipsta_bids.inputs.search import Findings, list_subjects
 from hipsta_bids.participant import run
-from hipsta_bids.participant.cluster import Shard, parse_shard
+from hipsta_bids.participant.shard import Shard, parse_shard
 
 SUBJECTS = [f"{k:03d}" for k in range(23)]
 

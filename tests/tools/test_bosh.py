@@ -214,9 +214,11 @@ def test_participant_level_leaves_all_outputs(dataset):
         bids_dir="bids",
         output_dir="out put",
         freesurfer_dir="subjects dir",
-        map=[f"codes={labels}"],
-        map_interpolation=["codes=nearest"],
-        roi="roi.tsv",
+        **(
+            {"map": [f"codes={labels}"], "map_interpolation": ["codes=nearest"], "roi": "roi.tsv"}
+            if "signals" in PRESENT
+            else {}
+        ),
         write_meshes=True,
         **({"uncertainty": 2} if "uncertainty" in PRESENT else {}),
         n_procs=1,

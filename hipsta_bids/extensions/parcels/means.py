@@ -20,7 +20,7 @@ from hipsta_bids.group.output.results import Analysis
 from hipsta_bids.group.output.tables import read_columns
 from hipsta_bids.group.output.write import write_table
 from hipsta_bids.group.questions.study import Study
-from hipsta_bids.inputs.maps import read_regions
+from hipsta_bids.inputs.regions import read_regions
 from hipsta_bids.joints import Writer
 from hipsta_bids.stats.arrays import Bool, SideMaps
 from hipsta_bids.stats.formula import left_side

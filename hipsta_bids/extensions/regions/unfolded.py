@@ -12,13 +12,13 @@ import numpy as np
 from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 from scipy.spatial import cKDTree
 
+from hipsta_bids.derivatives.hemisphere import write_nodes
 from hipsta_bids.errors import InputError, UsageError
 from hipsta_bids.geometry.catalog import MAPS
 from hipsta_bids.geometry.sheet import sheet_levels
 from hipsta_bids.io import files, gifti
 from hipsta_bids.io.gifti import DENSE_SCALARS, PointMap
 from hipsta_bids.io.hippunfold import SHEET_SIZE, unfolded_shares
-from hipsta_bids.participant.maps import write_nodes
 from hipsta_bids.settings import SheetSettings
 from hipsta_bids.types import Float
 

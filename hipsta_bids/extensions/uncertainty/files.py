@@ -1,6 +1,6 @@
 """SDs over perturbed copies: when they are measured, and their files."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -17,9 +17,9 @@ _NAME = "uncertainty"
 
 
 def estimate(
-    job: Job, volume: LabelVolume, maps: HemisphereMaps
-) -> tuple[HemisphereMaps, Sequence[str], Callable[[], None]]:
-    """Measure the copies; return the maps with their numbers, notes, and what writes the SDs."""
+    job: Job, volume: LabelVolume, maps: HemisphereMaps, record: dict[str, Any]
+) -> tuple[HemisphereMaps, Callable[[], None]]:
+    """Measure the copies; return the maps with their numbers, and what writes the SDs."""
     from hipsta_bids.extensions.uncertainty import copies  # noqa: PLC0415  (heavy)
 
     spread = copies.estimate_uncertainty(volume, job.item.hemi, job.settings, job.further[_NAME])
@@ -32,7 +32,8 @@ def estimate(
             sd = {name: np.where(finite[name], sds, np.nan) for name, sds in spread.maps.items()}
             write_spread(job.result, sd, spread.summary, measured)
 
-    return maps, spread.notes, write
+    record["notes"] = [*record["notes"], *spread.notes]
+    return maps, write
 
 
 def has_spread(job: Job, record: Mapping[str, Any]) -> bool:

@@ -25,7 +25,7 @@ def apply(options: "Namespace", settings: "Settings") -> "Settings":
     """Set whose sheet it is; UsageError with options that measure something else."""
     if options.longitudinal:
         settings = settings.changed(sheet={"frame": FRAMES[options.longitudinal]})
-    names = [measurement.name for measurement in find_measurements()]
+    names = [measurement.name for measurement in find_measurements() if measurement.options]
     is_more = settings.body.region != "body" or any(getattr(options, name) for name in names)
     if settings.of(FrameSettings).frame != "visit" and is_more:
         flags = " and ".join(f"--{name}" for name in ("region", *names))

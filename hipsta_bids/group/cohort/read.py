@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from hipsta_bids.derivatives.names import NAMED_TABLES
 from hipsta_bids.derivatives.results import read_sheet, read_summary, read_units
 from hipsta_bids.errors import InputError, did_you_mean
 from hipsta_bids.geometry.catalog import MAPS, why_impossible
@@ -50,7 +51,7 @@ def choose_measures(
         if (
             name in further
             or (records and name in SHEET_MAPS)
-            or any(_sampled_table(record, name).is_file() for record in records)
+            or any(_sampled_table(record, name) for record in records)
         ):
             maps.append(name)
         elif name in summaries or name.startswith(VOLUME):
@@ -91,10 +92,13 @@ def _sampled(records: Sequence[SheetRecord]) -> list[str]:
     """Names of the sampled maps of the first hemisphere."""
     if not records:
         return []
-    pattern = records[0].result.path("map_table", "*")
-    start, _, end = pattern.name.partition("*")
-    paths = pattern.parent.glob(pattern.name)
-    return sorted(path.name.removeprefix(start).removesuffix(end) for path in paths)
+    names = set()
+    for key in NAMED_TABLES:
+        pattern = records[0].result.path(key, "*")
+        start, _, end = pattern.name.partition("*")
+        paths = pattern.parent.glob(pattern.name)
+        names |= {path.name.removeprefix(start).removesuffix(end) for path in paths}
+    return sorted(names)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -236,8 +240,7 @@ def _read_side(
     for i, record in enumerate(records):
         columns = read_sheet(record.result.path("sheet"), measured, ["subfield"], shape)
         for name in sampled:
-            path = _sampled_table(record, name)
-            if path.is_file():
+            if path := _sampled_table(record, name):
                 columns |= read_sheet(path, [name], shape=shape)
         for name in maps.keys() & columns.keys():
             maps[name][i] = columns[name]
@@ -255,9 +258,10 @@ def _read_side(
     return SideMaps(rows=rows, maps=maps, subfield=subfield, names=tuple(codes), summary=summary)
 
 
-def _sampled_table(record: SheetRecord, name: str) -> Path:
-    """Table of the sampled map of a column: ``bold_3`` is the third of ``bold``."""
-    return record.result.path("map_table", name.partition("_")[0])
+def _sampled_table(record: SheetRecord, name: str) -> Path | None:
+    """Find the table of the sampled map of a column: ``bold_3`` is the third of ``bold``."""
+    paths = (record.result.path(key, name.partition("_")[0]) for key in NAMED_TABLES)
+    return next((path for path in paths if path.is_file()), None)
 
 
 def _encode(words: np.ndarray[Any, Any], codes: dict[str, int]) -> np.ndarray[Any, Any]:

@@ -13,7 +13,6 @@ from hipsta_bids.group.cohort.covariates import read_covariates, spelled_note
 from hipsta_bids.group.cohort.exclusions import Choices
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.inputs.edits import read_ends
-from hipsta_bids.inputs.maps import read_regions
 from hipsta_bids.io import files, gifti
 from hipsta_bids.stats.formula import check_numbers, typed, with_factors
 
@@ -236,8 +235,6 @@ def test_all_tables_of_users_share_the_list(tmp_path, word):
     assert Choices(path, path, visits).reason_to_leave_out(name, "0" * 64)[0] == "listed"
     path.write_text(f"participant_id\trating\tnote\nsub-1\t{word}\tx\n")
     assert Choices(None, path, visits).counts([(name, None)])["unrated"] == 1
-    path.write_text(f"x\ty\tregion\n1\t1\t{word}\n1\t2\tCA1\n")
-    assert read_regions(path, (2, 2)).member.sum() == 1
     path.write_text(
         "participant_id\tsession\themi\tend\tr\ta\ts\tnr\tna\tns\n"
         f"sub-1\t{word}\tL\tanterior\t1\t2\t3\t{word}\t{word}\t{word}\n"

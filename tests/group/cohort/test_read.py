@@ -4,18 +4,16 @@ import json
 
 import numpy as np
 import pytest
+from extension_marks import PRESENT, needs
 from pyarrow import parquet
 from small_cohorts import NODES, PLAN, place_of, table, write_dataset
 
 from hipsta_bids.cli.main import main
 from hipsta_bids.errors import InputError
-from hipsta_bids.geometry.sampling import SampledMap
 from hipsta_bids.group.cohort.read import SHEET_MAPS, choose_measures
 from hipsta_bids.group.output import write
 from hipsta_bids.group.output.tables import COLUMNS
-from hipsta_bids.inputs.scan import MapSource
 from hipsta_bids.io import files
-from hipsta_bids.participant.maps import write_map
 from hipsta_bids.stats.formula import left_side
 
 MISSING = ("03", "R")
@@ -32,7 +30,7 @@ def dataset(tmp_path_factory):
             add_column(place.path("sheet"), "extent_x", random.normal(20, 1, NODES))
             units = json.loads(place.path("sheet_sidecar").read_text())
             files.write_json(place.path("sheet_sidecar"), units | {"extent_x": {"Units": "mm"}})
-            if (f"{i + 1:02d}", hemi) != MISSING:
+            if "signals" in PRESENT and (f"{i + 1:02d}", hemi) != MISSING:
                 sample(place, "T2", random.normal(100, 5, NODES) + 20 * (i >= PLAN.sizes[0]))
     return data, out
 
@@ -44,6 +42,10 @@ def add_column(path, name, values):
 
 
 def sample(place, name, values):
+    from hipsta_bids.extensions.signals.files import write_map  # noqa: PLC0415  (may be absent)
+    from hipsta_bids.extensions.signals.inputs import MapSource  # noqa: PLC0415
+    from hipsta_bids.extensions.signals.sampling import SampledMap  # noqa: PLC0415
+
     source = MapSource(name=name, sampling="depth", interpolation="linear", path=place.root)
     write_map(place, source, SampledMap(values=values[:, :, None], outside=0.0, unknown=0.0), {})
 
@@ -64,6 +66,7 @@ def run(dataset, quick, *options):
     return main([str(data), str(out), "group", *quick, *options]), out / "group"
 
 
+@needs("signals")
 def test_other_maps_are_fitted_and_handed_over(dataset, quick):
     code, group = run(dataset, quick, "--measures", "T2", "extent_x", "--name", "others")
     assert code == 0
@@ -110,6 +113,7 @@ def test_model_of_a_summary_measure_has_no_maps(dataset, quick):
     assert "volume" in json.loads((folder / "analysis.json").read_text())["measures"]["summaries"]
 
 
+@needs("signals")
 def test_unknown_measures_list_each_known_one_once(dataset, capsys, monkeypatch):
     summary = {"extent_x": 20.0, "extent_y": 9.0, "volume": 500.0, "area_mid": 100.0}
     monkeypatch.setattr("hipsta_bids.group.cohort.read.read_summary", lambda _: summary)
@@ -127,7 +131,8 @@ def test_unknown_measures_are_told_where_many_are_listed(dataset, capsys, monkey
     assert "no measure is called 'xyz'" in first
     table = place_of(dataset[1], "01", "L").path("summary")
     assert place == f"{table} has all summary measures"
-    assert more.endswith(f" and {len(SHEET_MAPS) + 1 + len(summary) - 12} more")
+    count = len(SHEET_MAPS) + len(summary) + ("signals" in PRESENT)  # a sampled map
+    assert more.endswith(f" and {count - 12} more")
     assert run(dataset, [], "--measures", "area_C19")[0] == 65
     assert capsys.readouterr().err.endswith("'area_C19'; did you mean area_CA19?\n")
 
@@ -164,6 +169,7 @@ def test_left_side_of_formulas():
 
 
 @pytest.mark.usefixtures("with_figures")
+@needs("signals")
 def test_figures_are_those_of_the_measures(dataset, quick):
     code, group = run(dataset, quick, "--measures", "T2", "--name", "drawn")
     assert code == 0
@@ -173,6 +179,7 @@ def test_figures_are_those_of_the_measures(dataset, quick):
     assert ">T2 [arbitrary]<" in drawing
 
 
+@needs("signals")
 def test_columns_are_explained(dataset, quick):
     folder = run(dataset, quick, "--measures", "T2", "--name", "explained")[1] / "explained"
     assert set(table(folder / "peaks.tsv").columns) <= set(COLUMNS)

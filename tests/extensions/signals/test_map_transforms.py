@@ -10,10 +10,10 @@ from nibabel.affines import apply_affine
 from hipsta_bids.cli.main import main
 from hipsta_bids.derivatives.results import list_results
 from hipsta_bids.errors import InputError
-from hipsta_bids.inputs.maps import attach, map_requests
+from hipsta_bids.extensions.signals.inputs import attach, map_requests, signals_of
+from hipsta_bids.extensions.signals.transforms import read_transform
 from hipsta_bids.inputs.scan import InputRequest
 from hipsta_bids.inputs.search import find_inputs
-from hipsta_bids.io.transforms import read_transform
 from hipsta_bids.phantom import Hemisphere, PhantomSpec, write_dataset
 
 SPEC = PhantomSpec(kind="arc", thickness=2.0, length=8.0)
@@ -162,8 +162,9 @@ def test_a_pattern_of_a_transform_becomes_a_path_or_a_reason(study):
     requests = map_requests(patterns, (), (), transforms, [("found", f"{root}/ref*.nii.gz")])
     assert [source.transform_pattern for source in requests] == [*dict(transforms).values(), None]
     assert not any(source.transform or source.reference for source in requests)
-    ((item,), notes) = attach(items, requests, None, bids)
-    found, lacks, plain = item.maps
+    (item,), notes, warnings = attach(items, requests, None, bids)
+    found, lacks, plain = signals_of(item).maps
+    assert len(warnings) == 1
     assert (found.transform, found.reference) == (root / "itk.txt", root / "reference.nii.gz")
     assert (found.path, found.missing) == (root / "there.nii.gz", None)
     assert (lacks.path, lacks.transform) == (None, None)

@@ -11,9 +11,10 @@ from pool_jobs import work
 
 from hipsta_bids.cli.participant import build_parser
 from hipsta_bids.errors import UsageError
-from hipsta_bids.participant import cluster
-from hipsta_bids.participant.cluster import Cluster, check_cluster, run_on_cluster
-from hipsta_bids.participant.pool import Worker, WorkerLost, WorkerPlan
+from hipsta_bids.extensions.cluster import engine
+from hipsta_bids.extensions.cluster.engine import Cluster, check_cluster, run_on_cluster
+from hipsta_bids.extensions.cluster.worker import Worker
+from hipsta_bids.participant.pool import WorkerLost, WorkerPlan
 
 JOBS = ["square 3", "exit 5", "kill 9", "raise", "sleep 60", "square 4"]
 
@@ -24,8 +25,8 @@ from dataclasses import replace
 from pathlib import Path
 from distributed import LocalCluster
 from pool_jobs import work
-from hipsta_bids.participant import cluster
-from hipsta_bids.participant.cluster import Cluster, run_on_cluster
+from hipsta_bids.extensions.cluster import engine
+from hipsta_bids.extensions.cluster.engine import Cluster, run_on_cluster
 from hipsta_bids.errors import UsageError
 from hipsta_bids.participant.pool import WorkerPlan
 
@@ -45,7 +46,7 @@ if __name__ == "__main__":
             assert time.monotonic() < deadline
             time.sleep(0.05)
         print("ended")
-        cluster.__version__ = "0.0.0"
+        engine.__version__ = "0.0.0"
         try:
             list(run_on_cluster(there, plan, ["square 2"]))
         except UsageError as error:
@@ -58,7 +59,7 @@ if __name__ == "__main__":
 def test_jobs_on_dask_end_as_in_the_pool(tmp_path):
     script = tmp_path / "script.py"
     script.write_text(SCRIPT.format(jobs=JOBS))
-    paths = os.pathsep.join([str(Path(__file__).parents[1]), *filter(None, sys.path)])
+    paths = os.pathsep.join([str(Path(__file__).parents[2]), *filter(None, sys.path)])
     done = subprocess.run(
         [sys.executable, script, tmp_path],
         env=os.environ | {"PYTHONPATH": paths},
@@ -103,7 +104,7 @@ def test_what_is_not_installed_is_named(monkeypatch):
 
 
 def test_a_scheduler_that_does_not_answer_is_named(tmp_path, monkeypatch):
-    monkeypatch.setattr(cluster, "_ANSWER_TIME", 0.2)
+    monkeypatch.setattr(engine, "_ANSWER_TIME", 0.2)
     plan = WorkerPlan(work=work, n_workers=1, timeout=1.0, log=tmp_path / "log")
     with pytest.raises(UsageError, match=r"--dask-scheduler tcp://127\.0\.0\.1:9: no answer"):
         list(run_on_cluster(Cluster(scheduler="tcp://127.0.0.1:9"), plan, ["square 1"]))
@@ -128,12 +129,12 @@ def test_the_file_of_a_scheduler_is_waited_for(tmp_path, monkeypatch):
 def test_what_slurm_refuses_is_told(tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(UsageError, match="there is no sbatch here"):
-        cluster._check_script("#!/bin/sh\n")
+        engine._check_script("#!/bin/sh\n")
     sbatch = tmp_path / "sbatch"
     sbatch.write_text("#!/bin/sh\necho 'sbatch: error: no such\npartition' >&2\nexit 1\n")
     sbatch.chmod(0o755)
     with pytest.raises(UsageError, match=r"sbatch refuses \(sbatch: error: no such partition\)"):
-        cluster._check_script("#!/bin/sh\n")
+        engine._check_script("#!/bin/sh\n")
 
 
 @pytest.mark.parametrize("options", ["-p short", "--time=1:00", "-p short --mem=2G", "-pshort"])

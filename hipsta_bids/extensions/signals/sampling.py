@@ -6,24 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hipsta_bids.extensions.signals.settings import MapSettings
 from hipsta_bids.geometry.digital import to_ras
 from hipsta_bids.geometry.measures import column_area
-from hipsta_bids.settings import MapSettings
-from hipsta_bids.types import Bool, Float, Sheet
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class ScalarVolume:
-    """One or more numbers per voxel, cropped to the part needed."""
-
-    values: Float
-    """(I, J, K, T); not finite where missing."""
-    affine: Float
-    """(4, 4), index into ``values`` to RAS mm."""
-    start: tuple[int, int, int]
-    """Index of the first voxel in the whole image."""
-    shape: tuple[int, int, int]
-    """Shape of the whole image."""
+from hipsta_bids.inputs.regions import Regions
+from hipsta_bids.types import Bool, Float, ScalarVolume, Sheet
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -138,16 +125,6 @@ def _quotient(total: Float, weight: Float, least: float) -> Float:
     """Divide where the weight suffices; NaN elsewhere."""
     sufficient = (weight >= least) & (weight > 0)
     return np.where(sufficient, total / np.where(sufficient, weight, 1.0), np.nan)
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Regions:
-    """Sets of sheet points, which may overlap."""
-
-    names: tuple[str, ...]
-    """Name of each region."""
-    member: Bool
-    """(R, Nx, Ny) whether a point belongs to a region."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -4,9 +4,13 @@ import numpy as np
 import pytest
 from measured_phantoms import measured, spiral
 
-from hipsta_bids.geometry.sampling import Regions, ScalarVolume, sample_on_sheet, summarize_regions
-from hipsta_bids.settings import MapSettings
-from hipsta_bids.types import Sheet
+from hipsta_bids.extensions.signals.sampling import (
+    Regions,
+    sample_on_sheet,
+    summarize_regions,
+)
+from hipsta_bids.extensions.signals.settings import MapSettings
+from hipsta_bids.types import ScalarVolume, Sheet
 
 #: 0.5 x 0.6 x 0.8 mm voxels, turned and shifted, so that mistakes in affines show.
 ANGLE = np.deg2rad(30)

@@ -15,7 +15,7 @@ from hipsta_bids.cli import main
 from hipsta_bids.derivatives.dataset import read_status
 from hipsta_bids.derivatives.names import EXTRA_OUTPUTS, HemisphereName, output_name, output_path
 from hipsta_bids.errors import ExitCode, InputError
-from hipsta_bids.inputs.maps import read_regions
+from hipsta_bids.inputs.regions import read_regions
 from hipsta_bids.phantom import Hemisphere, PhantomSpec, write_dataset
 
 SPEC = PhantomSpec(kind="arc", thickness=2.0, length=8.0)
@@ -379,7 +379,7 @@ def test_sessions_are_filled_in(bids_dir, tmp_path, capsys):
 
 def test_the_page_lists_the_extra_outputs():
     name = HemisphereName(subject="X", session=None, hemi="L", seg="P")
-    docs = Path(__file__).parents[2] / "docs"
+    docs = Path(__file__).parents[3] / "docs"
     page = (docs / "maps.md").read_text(encoding="utf-8")
     visits = (docs / "longitudinal-maps.md").read_text(encoding="utf-8")
     patterns = re.findall(r"`[^`]*/(\*_desc-[^`.]*)\.", visits)  # sidecars have the same stem
@@ -389,3 +389,10 @@ def test_the_page_lists_the_extra_outputs():
         stem = spelled.partition(".")[0]
         listed = f"`{spelled.removeprefix(name.stem)}`" in page
         assert listed or any(fnmatch(stem, pattern) for pattern in patterns), spelled
+
+
+@pytest.mark.parametrize("word", ["NA", "unknown", "-", "", "n/a"])
+def test_points_without_a_region_are_in_none(tmp_path, word):
+    path = tmp_path / "t.tsv"
+    path.write_text(f"x\ty\tregion\n1\t1\t{word}\n1\t2\tCA1\n")
+    assert read_regions(path, (2, 2)).member.sum() == 1

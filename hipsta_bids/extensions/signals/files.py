@@ -3,24 +3,26 @@
 Nothing here can fail a hemisphere: what cannot be used is a flag, and its shape is unharmed.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from hipsta_bids.derivatives import hemisphere
 from hipsta_bids.derivatives.dataset import TABLES, describe_columns, source_address
-from hipsta_bids.derivatives.hemisphere import format_column
 from hipsta_bids.derivatives.results import NODES, ResultPlace
 from hipsta_bids.errors import InputError
-from hipsta_bids.geometry import sampling
+from hipsta_bids.extensions.signals import sampling
+from hipsta_bids.extensions.signals.inputs import MapSource, signals_of
+from hipsta_bids.extensions.signals.settings import MapSettings
 from hipsta_bids.geometry.catalog import MAPS
-from hipsta_bids.inputs.maps import read_regions
-from hipsta_bids.inputs.scan import HemisphereInput, MapSource
+from hipsta_bids.inputs.regions import read_regions
 from hipsta_bids.io import files, gifti
-from hipsta_bids.settings import MapSettings
-from hipsta_bids.types import Flag, Float, HemisphereMaps
+from hipsta_bids.participant.job import Job
+from hipsta_bids.types import Flag, Float, HemisphereMaps, LabelVolume
 
 _REGION_DIGITS = 6
 
@@ -45,7 +47,7 @@ def write_map(
     digits = 7 if source.interpolation == "linear" else 15
     columns = _with_mean(source, sampled.values)
     values = np.stack(list(columns.values()), axis=-1)
-    write_nodes(result.path("map_table", source.name), list(columns), values, digits)
+    hemisphere.write_nodes(result.path("map_table", source.name), list(columns), values, digits)
     definitions = describe_columns(NODES)
     if source.name in columns:
         definitions[source.name] = {"Description": "mean of the volumes, in their unit"}
@@ -69,19 +71,6 @@ def _with_mean(source: MapSource, values: Float) -> dict[str, Float]:
     return columns
 
 
-def write_nodes(path: Path, names: Sequence[str], values: Float, digits: int = 7) -> None:
-    """Write values (Nx, Ny, columns) of a sheet as a table with one row per node."""
-    x, y = np.indices(values.shape[:2]).reshape(2, -1) + 1
-    cells = [_cells(column, digits) for column in values.reshape(len(x), -1).T]
-    rows = zip(map(str, x.tolist()), map(str, y.tolist()), *cells, strict=True)
-    files.write_tsv(path, ["x", "y", *names], rows)
-
-
-def _cells(values: Float, digits: int = 7) -> list[str]:
-    """Format numbers of unknown size."""
-    return [f"{v:.{digits}g}" if np.isfinite(v) else files.MISSING for v in values.tolist()]
-
-
 def _write_regions(
     result: ResultPlace, regions: sampling.Regions, statistics: sampling.RegionStatistics
 ) -> None:
@@ -89,9 +78,9 @@ def _write_regions(
     definitions = describe_columns(TABLES["roi"])
     columns: dict[str, list[str]] = {
         "region": list(regions.names),
-        "n_points": _cells(statistics.n_points),
-        "n_valid": _cells(statistics.n_valid),
-        "area": format_column(statistics.area, _REGION_DIGITS),
+        "n_points": hemisphere.format_cells(statistics.n_points),
+        "n_valid": hemisphere.format_cells(statistics.n_valid),
+        "area": hemisphere.format_column(statistics.area, _REGION_DIGITS),
     }
     parts = (
         ("mean", "mean of {} over valid points", statistics.mean),
@@ -104,9 +93,9 @@ def _write_regions(
             definitions[key] = {"Description": text.format(name)}
             if name in _SHAPE_UNITS:
                 definitions[key]["Units"] = _SHAPE_UNITS[name]
-                columns[key] = format_column(column, _REGION_DIGITS)
+                columns[key] = hemisphere.format_column(column, _REGION_DIGITS)
             else:
-                columns[key] = _cells(column)
+                columns[key] = hemisphere.format_cells(column)
     files.write_tsv(result.path("roi"), list(columns), zip(*columns.values(), strict=True))
     files.write_json(result.path("roi_sidecar"), definitions)
 
@@ -115,36 +104,22 @@ def _write_regions(
 Mapped = tuple[MapSource, dict[str, Any], sampling.SampledMap]
 
 
-def signal_hash(item: HemisphereInput) -> list[object]:
-    """List what decides about maps and regions: their files' contents and how they are read."""
-    maps = [
-        [
-            *(source.name, source.sampling, source.interpolation, _content(source.path)),
-            *(_content(path) for path in (source.transform, source.reference) if path),
-        ]
-        for source in item.maps
-    ]
-    return [maps, _content(item.regions)] if maps or item.regions else []
-
-
-def _content(path: Path | None) -> str | None:
-    try:
-        return None if path is None else files.sha256_of(path)
-    except InputError:  # reading it will be tried again, and flagged
-        return None
-
-
 def add_signals(
-    item: HemisphereInput, maps: HemisphereMaps, settings: MapSettings, sources: Mapping[str, Path]
-) -> tuple[HemisphereMaps, list[Mapped], sampling.Regions | None, dict[str, Any]]:
-    """Sample a hemisphere's volumes on its sheet, and read the regions.
+    job: Job, _: LabelVolume, maps: HemisphereMaps, record: dict[str, Any]
+) -> tuple[HemisphereMaps, Callable[[], None]]:
+    """Sample the volumes of a hemisphere on its sheet, and read the regions.
 
-    Returns maps with flags, the samples, the regions, and entries of the quality record.
+    Returns maps with flags, and what writes the samples; the quality record gets their entries.
     """
-    mapped = []
+    signals, settings, sources = (
+        signals_of(job.item),
+        job.settings.of(MapSettings),
+        dict(job.sources),
+    )
+    mapped: list[Mapped] = []
     flags = []
     entries: list[dict[str, Any]] = []
-    for source in item.maps:
+    for source in signals.maps:
         entry: dict[str, Any] = {
             "name": source.name,
             "source": None if source.path is None else source_address(source.path, sources),
@@ -177,20 +152,21 @@ def add_signals(
             )
             flags.append(Flag(reason="map-outside", message=message))
     regions = None
-    if item.regions is not None:
+    if signals.regions is not None:
         nx, ny = maps.thickness.shape
         try:
-            regions = read_regions(item.regions, (nx, ny))
+            regions = read_regions(signals.regions, (nx, ny))
         except InputError as error:
             flags.append(Flag(reason="roi-unusable", message=f"regions: {error}"))
-    record = {"maps": entries, "regions": str(item.regions) if item.regions else None}
-    return replace(maps, flags=(*maps.flags, *flags)), mapped, regions, record
+    record |= {"maps": entries, "regions": str(signals.regions) if signals.regions else None}
+    maps = replace(maps, flags=(*maps.flags, *flags))
+    return maps, partial(write_signals, job.result, maps, mapped, regions)
 
 
 def _sample(
     source: MapSource, path: Path, maps: HemisphereMaps, settings: MapSettings
 ) -> sampling.SampledMap:
-    from hipsta_bids.io.transforms import read_transform  # noqa: PLC0415  (in workers only)
+    from hipsta_bids.extensions.signals.transforms import read_transform  # noqa: PLC0415  (in workers only)
     from hipsta_bids.io.volumes import read_scalars  # noqa: PLC0415  (nibabel, in workers only)
 
     sheet = maps.layers if source.sampling == "depth" else maps.sheet
@@ -229,11 +205,11 @@ def write_signals(
         _write_regions(result, regions, statistics)
 
 
-def is_complete(result: ResultPlace, record: Mapping[str, Any]) -> bool:
+def is_complete(job: Job, record: Mapping[str, Any]) -> bool:
     """Return whether the files of maps and regions that a record names exist."""
     maps = [entry for entry in record.get("maps") or () if "outside" in entry]
-    paths = [result.path("map_table", entry["name"]) for entry in maps]
+    paths = [job.result.path("map_table", entry["name"]) for entry in maps]
     usable = not any(f.get("reason") == "roi-unusable" for f in record.get("flags") or ())
     if record.get("regions") and usable:
-        paths.append(result.path("roi"))
+        paths.append(job.result.path("roi"))
     return all(path.exists() for path in paths)
