@@ -46,7 +46,7 @@ def read_rows():
     for line in PAGE.read_text(encoding="utf-8").splitlines():
         cells = [cell.replace(r"\|", "|") for cell in re.split(r"(?<!\\)\|", line)[1:-1]]
         if len(cells) > 1 and "hipsta-bids " in cells[1]:
-            commands, _, numbers = (re.findall("`([^`]+)`", cell) for cell in cells[1:])
+            commands, numbers = (re.findall("`([^`]+)`", cell) for cell in cells[1:])
             yield cells[0].split("*")[0].strip(), "\n".join(commands), numbers
 
 
