@@ -3,7 +3,7 @@
 #   make quick   tests of geometry, statistics, formats, protocols and designs
 #   make test    lint, types, layer contracts and tests, exactly as in CI
 #   make separable    tests and demonstration without each extension
-#   make release    what takes long: validation, tutorials, faults, containers, clusters, browser
+#   make release    what takes long: validation, tutorials, questions, faults, containers, clusters, browser
 #   make validation    measure accuracy: all suites, and their tables in docs/validation
 #   make docs    the documentation as a site in build/site, without network
 
@@ -87,7 +87,7 @@ separable: $(STAMP)
 
 release: $(STAMP) validation separable
 	$(PYTEST) tests/validation
-	set -e; for script in tutorials faults fuzz container cluster reports long install; do \
+	set -e; for script in tutorials questions faults fuzz container cluster reports long install; do \
 		PYTHON="$(BIN)/python" "tools/test-$$script"; done
 
 # All suites, on the real labels too where they are: LABELS=BIDS_DIR.

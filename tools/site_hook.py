@@ -36,6 +36,9 @@ LISTS = {
 }
 
 _LINK = re.compile(r"(?<=\]\()(?![a-z]+:|#)(?P<path>[^)#\s]+)")
+#: Code in a table with a bar, which GitHub wants escaped, and MkDocs plain.
+_BAR = re.compile(r"^\|.*\\\|.*$", re.MULTILINE)
+_CODE = re.compile(r"`[^`\n]+`")
 
 
 def on_config(config: MkDocsConfig) -> None:
@@ -66,6 +69,7 @@ def on_files(files: Files, *, config: MkDocsConfig) -> None:
 def on_page_markdown(markdown: str, *, page: Page, config: MkDocsConfig, files: Files) -> str:
     """Turn links between the files of the repository into links between pages, and weigh pages."""
     del config, files
+    markdown = _BAR.sub(lambda row: _CODE.sub(_without_escapes, row[0]), markdown)
     *_, section = ["", *(str(item.title) for item in page.ancestors)]
     place = page.file.src_uri.partition("/")[0]
     weight = LISTS.get(place, WEIGHTS.get(section, 1.0))
@@ -77,6 +81,10 @@ def on_page_markdown(markdown: str, *, page: Page, config: MkDocsConfig, files: 
     if page.file.src_uri.count("/"):  # a page from a folder beside docs/: its links stay there
         return _LINK.sub(r"#", markdown)
     return _LINK.sub(lambda found: _inside(found["path"]), markdown)
+
+
+def _without_escapes(code: re.Match[str]) -> str:
+    return code[0].replace(r"\|", "|")
 
 
 def _beyond(text: str) -> Iterator[str]:

@@ -65,6 +65,13 @@ def test_every_page_is_built(site):
     }
 
 
+def test_bars_in_code_of_tables_are_not_escaped(site):
+    assert "<code>group | sex=M" in (site / "statistics.html").read_text()
+    questions = (site / "questions.html").read_text()
+    assert "(1|site)" in questions
+    assert questions.count("<tr>") == 26
+
+
 def test_nothing_is_loaded_from_elsewhere(site):
     loaded = re.compile(
         r"<(?:script|img|iframe|link|source)\b[^>]*?(?:src|href)=\"?((?:https?:)?//[^\" >]+)"
