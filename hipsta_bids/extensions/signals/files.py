@@ -19,7 +19,7 @@ from hipsta_bids.extensions.signals import sampling
 from hipsta_bids.extensions.signals.inputs import MapSource, signals_of
 from hipsta_bids.extensions.signals.settings import MapSettings
 from hipsta_bids.geometry.catalog import MAPS
-from hipsta_bids.inputs.regions import read_regions
+from hipsta_bids.inputs.regions import Regions, read_regions
 from hipsta_bids.io import files, gifti
 from hipsta_bids.participant.job import Job
 from hipsta_bids.types import Flag, Float, HemisphereMaps, LabelVolume
@@ -72,7 +72,7 @@ def _with_mean(source: MapSource, values: Float) -> dict[str, Float]:
 
 
 def _write_regions(
-    result: ResultPlace, regions: sampling.Regions, statistics: sampling.RegionStatistics
+    result: ResultPlace, regions: Regions, statistics: sampling.RegionStatistics
 ) -> None:
     """Write one row per region, and the sidecar."""
     definitions = describe_columns(TABLES["roi"])
@@ -190,7 +190,7 @@ def write_signals(
     result: ResultPlace,
     maps: HemisphereMaps,
     mapped: Sequence[Mapped],
-    regions: sampling.Regions | None,
+    regions: Regions | None,
 ) -> None:
     """Write the tables and GIFTI files of the samples."""
     numbers: dict[str, Float] = {name: maps.maps[name] for name in _SHAPE_UNITS}
