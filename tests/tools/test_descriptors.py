@@ -93,7 +93,7 @@ def test_kinds_of_values():
     for key in ("output_dir", "work_dir", "bids_database_dir"):  # need not exist
         assert inputs[key]["type"] == "String"
     lists = {key for key, entry in inputs.items() if entry.get("list")}
-    assert lists >= {"participant_label", "session_label", "hemi", "derivatives", "map"}
+    assert lists >= {"participant_label", "session_label", "hemi", "derivatives"}
     group = {entry["id"]: entry for entry in describe("group")["inputs"]}
     assert group["model"]["disables-inputs"] == ["formula", "contrast"]
     for key in ("derivatives", "covariates"):
