@@ -52,11 +52,15 @@ class Groups:
 
 
 def find_groups(
-    table: pd.DataFrame, settings: GroupSettings, reference: str | None = None
+    table: pd.DataFrame,
+    settings: GroupSettings,
+    reference: str | None = None,
+    *,
+    preferred: Sequence[str] = (),
 ) -> Groups | None:
-    """Find the column of groups and their reference level."""
+    """Find the column of groups and their reference level; ``preferred`` names are first."""
     by_name = {str(column).casefold(): str(column) for column in table.columns}
-    for name in settings.model.group_columns:
+    for name in sorted(settings.model.group_columns, key=lambda name: name not in preferred):
         column = by_name.get(name.casefold())
         values = formulas.typed(table[column]).dropna() if column else None
         if column is None or values is None or values.nunique() < 2:  # noqa: PLR2004 -- two groups
@@ -127,6 +131,8 @@ class Sessions:
     """Whether the default model tests changes, also without groups."""
     is_classified: ClassVar[bool] = True
     """Whether groups are classified, by the first rows of participants."""
+    group_columns: ClassVar[tuple[str, ...]] = ()
+    """Columns of groups that come before the others of the settings."""
     reason: ClassVar[str] = "later-session"
     """Of sessions that are not compared."""
     sd: ClassVar[str] = "the residual standard deviation"
@@ -283,9 +289,10 @@ def choose_model(
     ``find_groups``.
     """
     references = _requested_references(request)
-    groups = find_groups(table, settings)
+    preferred = (comparison or Comparison()).sessions.group_columns
+    groups = find_groups(table, settings, preferred=preferred)
     if groups is not None and groups.column in references:
-        groups = find_groups(table, settings, references[groups.column])
+        groups = find_groups(table, settings, references[groups.column], preferred=preferred)
     document = model_document(
         request, table, groups, settings, comparison=comparison, visits=visits
     )

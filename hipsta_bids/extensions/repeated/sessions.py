@@ -237,6 +237,7 @@ class Trial(Visits):
 
     has_changes = False
     is_classified = False
+    group_columns = ("arm", "treatment")
     reason = "other-session"
 
     def __post_init__(self) -> None:

@@ -4,12 +4,16 @@ import json
 import re
 
 import numpy as np
+import pandas as pd
 import pytest
 from scipy import stats
 from small_cohorts import PLAN, methods_of, place_of, run_named, table, write_dataset
 
 from hipsta_bids.cli import group
 from hipsta_bids.cli.main import main
+from hipsta_bids.extensions.repeated.sessions import Trial
+from hipsta_bids.group.model import Comparison, ModelRequest, choose_model
+from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.reports.group import group_page
 from hipsta_bids.stats.inference import control_fdr
 
@@ -201,3 +205,19 @@ def test_settings_choose_random_effects_unless_the_option_does(tmp_path, words, 
     command = ["x", str(tmp_path), "group", "--settings", str(tmp_path / "own.toml")]
     options = group.group_parser().parse_args([*command, "--longitudinal", *words])
     assert group._settings(options).longitudinal.random == random
+
+
+def test_trials_compare_arms_before_diagnoses():
+    people = pd.DataFrame(
+        {
+            "participant_id": [f"{n:02d}" for n in range(8)],
+            "group": ["CN", "AD"] * 4,
+            "Arm": ["active"] * 4 + ["placebo"] * 4,
+        }
+    )
+    request, trial = ModelRequest(formula="1"), Trial(("ancova", "ses-1", "ses-2"))
+    columns = [
+        choose_model(request, people, GroupSettings(), comparison=comparison)[2].column
+        for comparison in (Comparison(sessions=trial), Comparison())
+    ]
+    assert columns == ["Arm", "group"]
