@@ -111,11 +111,14 @@ def test_models_that_cannot_be_estimated_are_noted_and_not_counted(tmp_path, end
 def test_a_margin_is_named_and_its_points_are_counted(tmp_path):
     record = {"one_sided": {"A-B": "> -0.05"}}
     page = page_of(results_of(tmp_path, record=record, **map_tables(860, 861)))
-    assert f"<i>A-B</i> is significant where the difference is above {MINUS}0.05." in page
-    assert f"860 above {MINUS}0.05, 1 not (100% of 861 points); peak CA1, " in page
+    assert f"Significant points of <i>A-B</i> are above {MINUS}0.05." in page
+    assert f"860 above {MINUS}0.05, 1 not shown (100% of 861 points); peak CA1, " in page
     assert "is positive where A has more" not in page
     page = page_of(results_of(tmp_path, record=record, **map_tables(0, 861)))
-    assert f"none of 861 points is significantly above {MINUS}0.05" in page
+    assert f"none of 861 points is shown to be above {MINUS}0.05" in page
+    record = {"one_sided": {"A-B": "equivalent within 0.1"}}
+    page = page_of(results_of(tmp_path, record=record, **map_tables(0, 861)))
+    assert "none of 861 points is shown to be equivalent within 0.1" in page
     two_sided = page_of(results_of(tmp_path, record={}, **map_tables(860, 861)))
     assert "is positive where A has more" in two_sided
     assert "860 of 861 points survive" in two_sided
