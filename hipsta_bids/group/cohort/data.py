@@ -69,7 +69,8 @@ def summary_values(cohort: Cohort, hemi: str, names: Sequence[str] | None = None
         left, right = (_side_values(cohort, side, names) for side in BOTH)
         return (left + right) / 2
     values = _side_values(cohort, hemi, names)
-    return values.loc[:, ~values.columns.str.contains(asymmetry_name("") + REGION)]
+    ending = asymmetry_name("") + REGION
+    return values[[name for name in values.columns if ending not in str(name)]]
 
 
 def _side_values(cohort: Cohort, hemi: str, names: Sequence[str] | None) -> pd.DataFrame:

@@ -227,8 +227,8 @@ def with_fdr(table: pd.DataFrame, settings: GroupSettings) -> pd.DataFrame:
     """
     rules = settings.multiplicity
     method = "bh" if rules.method == "bh" else "fdr2"
-    parts = table["measure"].str.partition(REGION)
-    maps = parts[0].where(parts[1] == REGION, "")
+    parts = [str(name).partition(REGION) for name in table["measure"]]
+    maps = np.array([name if of_region else "" for name, of_region, _ in parts], dtype=object)
     for _, rows in table.groupby(["contrast", maps], sort=False):
         discoveries = control_fdr(rows["p"].to_numpy(dtype=np.float64), rules.alpha, method)
         one_sided = rows["alternative"].notna() if "alternative" in rows else False

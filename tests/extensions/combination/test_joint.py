@@ -146,6 +146,7 @@ def test_visits_as_categories_are_not_tested_together():
     request = SimpleNamespace(
         settings=GroupSettings().changed(joint={"measures": ("a", "b")}),
         options={},
+        contrasts=(),
         model=SimpleNamespace(maps=(), summaries=(), random=""),
         measures=SimpleNamespace(maps=("a", "b")),
         comparison=SimpleNamespace(sessions=Visits()),
