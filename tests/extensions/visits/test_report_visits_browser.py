@@ -40,6 +40,7 @@ def trial(tmp_path_factory):
     with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
         command = [folder / "in", folder / "out", "participant", *options]
         assert main.main(list(map(str, command))) == 0
+        assert main.main(list(map(str, [*command[:3], "--reports-only"]))) == 0
     return folder / "out"
 
 
