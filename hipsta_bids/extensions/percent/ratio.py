@@ -86,10 +86,10 @@ def add_percent(analysis: Analysis, groups: Groups) -> Analysis:
     design = build_design(
         request.table, model, request.settings.design, request.references, has_random=True
     )
-    fitted, measures = dict(analysis.fitted), dict(analysis.measures)
+    rows, fitted, measures = rows_of(design), dict(analysis.fitted), dict(analysis.measures)
     for hemi, side in analysis.fitted.items():
         names = [name for name in side.fits if units.get(name) in _UNITS]
-        rows, fits = rows_of(design), dict(side.fits)
+        fits = dict(side.fits)
         for name, means in fit_maps(hemi, side.maps.only(names), rows).fits.items():
             fits[name] = _with_percent(fits[name], means, pairs, confidence, np.array(True))
         fitted[hemi] = replace(side, fits=fits)
