@@ -127,13 +127,13 @@ def read_sheet(
     are read; without ``shape`` the last row has the number of nodes.
     """
     try:
-        open_regular(path).close()
+        with open_regular(path) as file:
+            content = file.read()
         if numbers is None:
-            with path.open(encoding="utf-8") as file:
-                columns = file.readline().rstrip("\n").split("\t")
+            columns = content.partition(b"\n")[0].decode().rstrip("\r").split("\t")
             numbers = [name for name in columns if name not in {*NODES, *STATE}]
         read = _columns_by_arrow if find_spec("pyarrow") else _columns_by_pandas
-        x, y, *values = read(path, numbers, words)
+        x, y, *values = read(content, numbers, words)
         nx, ny = shape or (int(x[-1]), int(y[-1]))
     except (OSError, ValueError, KeyError, IndexError) as error:  # pyarrow's are among these
         first = str(error).partition("\n")[0]
@@ -149,15 +149,18 @@ def read_sheet(
 
 
 def _columns_by_arrow(
-    path: Path, numbers: Sequence[str], words: Sequence[str]
+    content: bytes, numbers: Sequence[str], words: Sequence[str]
 ) -> list[NDArray[Any]]:
-    """Read node numbers, numbers and words of a table with pyarrow, an optional extra."""
+    """Read node numbers, numbers and words of a table with pyarrow, an optional extra.
+
+    It gets no path: it cannot open one whose bytes are not of the locale.
+    """
     import pyarrow as pa  # noqa: PLC0415  (slow to load)
     from pyarrow import csv  # noqa: PLC0415  (likewise)
 
     types = dict.fromkeys(numbers, pa.float64()) | dict.fromkeys(words, pa.string())
     table = csv.read_csv(
-        path,
+        io.BytesIO(content),
         read_options=csv.ReadOptions(use_threads=False),
         parse_options=csv.ParseOptions(delimiter="\t"),
         convert_options=csv.ConvertOptions(
@@ -173,12 +176,11 @@ def _columns_by_arrow(
 
 
 def _columns_by_pandas(
-    path: Path, numbers: Sequence[str], words: Sequence[str]
+    content: bytes, numbers: Sequence[str], words: Sequence[str]
 ) -> list[NDArray[Any]]:
     """Read the same with pandas, which takes longer."""
     import pandas as pd  # noqa: PLC0415  (slow to load)
 
-    content = path.read_bytes()
     header, *lines = content.splitlines()
     if any(line.count(b"\t") != header.count(b"\t") for line in lines):
         raise ValueError("rows differ in their number of columns")

@@ -325,5 +325,7 @@ def _redirect(log: Path) -> None:
     os.dup2(handle, 2)
     os.close(handle)
     # A forked worker has the streams of its parent, whatever those are.
-    sys.stdout = sys.stderr = os.fdopen(2, "w", buffering=1, closefd=False)
+    sys.stdout = sys.stderr = os.fdopen(
+        2, "w", buffering=1, encoding="utf-8", errors="backslashreplace", closefd=False
+    )
     faulthandler.enable()

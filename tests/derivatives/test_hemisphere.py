@@ -1,5 +1,7 @@
 import json
+import os
 import sys
+from pathlib import Path
 
 import meshio
 import nibabel as nib
@@ -63,6 +65,17 @@ def test_pandas_reads_sheets_as_pyarrow_does(written, monkeypatch):
     for name, values in by_arrow.items():
         np.testing.assert_array_equal(by_pandas[name], values)
         assert by_pandas[name].dtype == values.dtype
+
+
+def test_sheets_are_read_where_a_folder_has_bytes_of_no_locale(written, tmp_path):
+    expected = read_sheet(written[0].path("sheet"))
+    folder = Path(os.fsdecode(os.fsencode(tmp_path) + b"/\xff\xc4"))
+    folder.mkdir()
+    path = folder / "sheet.tsv"
+    path.write_bytes(written[0].path("sheet").read_bytes())
+    columns = read_sheet(path)
+    assert list(columns) == list(expected)
+    np.testing.assert_array_equal(columns["thickness"], expected["thickness"])
 
 
 @pytest.mark.parametrize("library", ["pyarrow", "pandas"])

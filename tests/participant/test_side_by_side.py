@@ -154,3 +154,14 @@ def test_a_lost_worker_does_not_undo_what_another_run_did(tmp_path, monkeypatch,
     (row,) = read_status(tmp_path / "out")
     assert row["decision"] == result.outcomes[0].decision == ("use" if act == "ok" else "failed")
     assert row["reason"] == ("n/a" if act == "ok" else "timeout")
+
+
+def test_a_worker_can_print_any_letter_in_any_locale(tmp_path):
+    script = (
+        "import pathlib, sys; from hipsta_bids.participant import pool;"
+        "pool._redirect(pathlib.Path(sys.argv[1])); print('\\u0131 \\udcff')"
+    )
+    locale = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+    command = [sys.executable, "-c", script, tmp_path / "log"]
+    subprocess.run(command, env=os.environ | locale, check=True)
+    assert (tmp_path / "log").read_text(encoding="utf-8") == "\u0131 \\udcff\n"

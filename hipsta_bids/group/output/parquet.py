@@ -70,7 +70,10 @@ def write_blocks(path: Path, schema: pa.Schema, rows: Iterable[Columns]) -> None
     """
     repeated = [c.name for c in schema if c.name in "xy" or not pa.types.is_float32(c.type)]
     try:
-        with pq.ParquetWriter(path, schema, compression="zstd", use_dictionary=repeated) as writer:
+        with (
+            path.open("wb") as file,  # pyarrow opens no path whose bytes are not of the locale
+            pq.ParquetWriter(file, schema, compression="zstd", use_dictionary=repeated) as writer,
+        ):
             for columns in rows:
                 count = len(columns["hemi"])
                 arrays = [
