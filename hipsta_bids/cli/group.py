@@ -17,6 +17,7 @@ from hipsta_bids.cli.parser import (
     factor_level,
     from_namespace,
     given_settings,
+    model_text,
     positive_int,
 )
 from hipsta_bids.cli.participant import REGIONS
@@ -172,12 +173,13 @@ def _add_model(parser: Parser) -> None:
         " are read anyway)",
     )
     add("--model", "FILE.json", "BIDS Stats Model with one dataset node")
-    add("--formula", "TEXT", 'such as "thickness ~ group + age + sex"')
+    add("--formula", "TEXT", 'such as "thickness ~ group + age + sex"', type=model_text)
     add(
         "--contrast",
         "TEXT...",
         'such as "group[CU]-group[DAT]", or one-sided "arm[B]-arm[A] > -0.05"; rows of an F '
         "test are separated by commas",
+        type=model_text,
     )
     add(
         "--age-model",

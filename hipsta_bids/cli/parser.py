@@ -116,6 +116,8 @@ class Parser(argparse.ArgumentParser):
         if unknown != message:
             words = [text.partition("=")[0] for text in unknown.split() if text.startswith("-")]
             hint = did_you_mean(words, self._option_string_actions)
+            if not words and {"--formula", "--contrast"} & {*self._words}:
+                hint = "; put the text of --formula and of each --contrast into quotes"
         elif choice := _CHOICE.search(message):
             choices = [name.strip("'\"") for name in choice["known"].split(", ")]
             hint = did_you_mean([choice["word"]], choices)
@@ -256,6 +258,11 @@ def named_pattern(text: str) -> tuple[str, str]:
 def factor_level(text: str) -> tuple[str, str]:
     """Read ``FACTOR=LEVEL``."""
     return _pair(text, "FACTOR=LEVEL")
+
+
+def model_text(text: str) -> str:
+    r"""Read a formula or contrast; ``\|`` of a Markdown table, as in our guide, is a bar."""
+    return text.replace("\\|", "|")
 
 
 def _pair(text: str, form: str) -> tuple[str, str]:

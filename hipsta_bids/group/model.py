@@ -361,13 +361,13 @@ def _default_model(
     if groups is None and not (sessions.has_changes or comparison.asymmetry):
         columns = [str(name) for name in table.columns if name not in {PARTICIPANT, SESSION}]
         available = (
-            f"there are {formulas.listed(columns)}"
+            f"there are {formulas.listed(columns)}; give another question, such as"
+            ' --formula "age + sex" --contrast age'
             if columns
-            else "no participants.tsv of BIDS_DIR has further columns"
+            else "participants.tsv of BIDS_DIR has no further columns; add one, or --covariates"
         )
         raise ModelError(
-            f"no column has two groups ({', '.join(settings.model.group_columns)}); "
-            f'{available}; or give --formula "age + sex" --contrast age'
+            f"no column has two groups ({', '.join(settings.model.group_columns)}); {available}"
         )
     time = visits.column if visits else None
     sessions.check_default(table, time, settings)

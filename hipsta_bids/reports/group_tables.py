@@ -153,7 +153,10 @@ def _side(results: GroupResults, row: Mapping[str, Any]) -> dict[str, Any]:
     if sided:
         text = f"{n} {words}, {total - n} not shown ({_percent(share)} of {total} points)"
     if str(row.get("lenient", "")).lower() == "true":
-        text += f", uncorrected p up to {row['p_cutoff']:.2g} since the effect is widespread"
+        text += (
+            f", uncorrected p up to {row['p_cutoff']:.2g} since the effect is widespread, or all"
+            " values are shifted"
+        )
     return {"title": title, "share": share, "text": f"{text}; peak {_peak(results, first, points)}"}
 
 

@@ -75,6 +75,12 @@ class Contrast:
         signs = {side: sign for sign, side in _SIDES.items()}
         return f"{signs[self.side]} {self.margin:g}" if self.side else ""
 
+    def evidence(self, statistic: Float) -> Float:
+        """Return what rises with the evidence for the alternative: the size of t or F, or t."""
+        if not self.side:
+            return np.abs(statistic)
+        return statistic if self.side == "greater" else -statistic
+
 
 @dataclass(frozen=True)
 class ContrastSpec:

@@ -150,7 +150,9 @@ class Terms:
             return name
         levels = [f"{f}[{level}]" for f, levels in self.levels.items() for level in levels]
         names = [*self.names, *levels, *map(str, self.table.columns)]
-        hint = did_you_mean([name], names) or f"; known are {listed(names)}"
+        hint = did_you_mean([name], names) or f"; known are {listed(dict.fromkeys(names))}"
+        if complete := [level for level in levels if level.endswith(f"[{name}]")]:
+            hint = f"; write {' or '.join(complete)}"
         raise ModelError(f"contrast {contrast!r}: nothing is called {name!r}{hint}")
 
     def _split(self, name: str) -> tuple[str | None, str]:

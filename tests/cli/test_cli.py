@@ -299,6 +299,7 @@ def test_options_without_meaning_are_remembered_with_the_reason():
         ("settings x", "argument level: invalid choice: 'x'"),
         ("demo", "the following arguments are required: DIR"),
         ("demo-data a b", "unrecognized arguments: b"),
+        ("in out group --formula thickness ~ group", "put the text of --formula and of each"),
         (
             "group --seg A B in out",
             "group: the folders precede the level; write hipsta-bids BIDS_DIR OUT_DIR group --seg",

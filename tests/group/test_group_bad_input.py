@@ -184,7 +184,7 @@ def no_values(study):
     ("spoil", "options", "code", "words"),
     [
         (no_groups, [], 65, "no column has two groups"),
-        (no_table, [], 65, "no participants.tsv of BIDS_DIR has further columns"),
+        (no_table, [], 65, "participants.tsv of BIDS_DIR has no further columns"),
         (impossible_age, [], 65, "has sub-04 (1e+50), half of the others"),
         (negative_age, [], 65, "sub-04 (-3), which is impossible"),
         (age_in_months, [], 65, "sub-04 (150), which is impossible"),

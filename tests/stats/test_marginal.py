@@ -180,6 +180,7 @@ def test_bent_terms_are_tested_whole():
         ("group[AD] | sex=X", "sex has no level 'X', only F, M"),
         ("group[AD] | age=old", "age is a number, not 'old'"),
         ("group[AD] | wrong=1", "nothing is called 'wrong'"),
+        ("CN-AD", r"nothing is called 'CN'; write group\[CN\]"),
         ("group[AD] | sex", r"write fixed values as \| sex=M, age=70"),
         ("group - sex", "group has several rows; test it by itself"),
         ("group[AD] - (group[CN]", "cannot read"),

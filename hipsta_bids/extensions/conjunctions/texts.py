@@ -79,8 +79,8 @@ def _sided(piece: str) -> tuple[str, list[str]]:
     match = _WITHIN.fullmatch(piece)
     if match is None or not float(match["margin"]):
         raise ModelError(
-            f"contrast {piece!r}: write equivalence as |arm[B]-arm[A]| < 0.05, with a margin"
-            " above zero"
+            f"contrast {piece!r}: write equivalence as |arm[B]-arm[A]| < 0.05, with <, and a"
+            " number above zero"
         )
     body, margin, ending = match.groups(default="")
     return f"{body} within {margin}{ending}", [

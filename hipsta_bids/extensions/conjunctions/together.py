@@ -17,6 +17,7 @@ from hipsta_bids.extensions.conjunctions.texts import Plan
 from hipsta_bids.group.output.citations import escaped, joined
 from hipsta_bids.group.output.results import Analysis
 from hipsta_bids.group.output.tables import read_columns
+from hipsta_bids.stats.arrays import Float
 from hipsta_bids.stats.contrasts import Contrast
 from hipsta_bids.stats.glm import PointTest, PointwiseFit
 
@@ -58,6 +59,10 @@ class Conjunction(Contrast):
         if len(set(texts)) == 1:
             return f"{texts[0]} in each of {len(texts)} contrasts"
         return " and ".join(texts)
+
+    def evidence(self, statistic: Float) -> Float:
+        """Return the statistic, which is positive in the direction of the alternative."""
+        return statistic
 
 
 def combine(analysis: Analysis, planned: Plan) -> Analysis:

@@ -61,4 +61,6 @@ def methods(analysis: Analysis, cite: Callable[[str], str]) -> Iterator[str]:
     )
     if any(contrast.n_rows > 1 for contrast in analysis.design.contrasts):
         text += f" Contrasts of several rows were tested by F {cite('fai')}."
+    if note := analysis.design.notes.get("random"):
+        text += f" Note that {escaped(note.partition('; ')[0].partition(': ')[2])}, which are few."
     yield text

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from hipsta_bids.errors import InputError
+from hipsta_bids.errors import InputError, UsageError, did_you_mean
 from hipsta_bids.extensions.parcels import EXTENSION, SUBFIELDS, THIRDS
 from hipsta_bids.group.cohort.data import Cohort
 from hipsta_bids.group.cohort.read import THICKNESS
@@ -99,6 +99,8 @@ def find_regions(side: SideMaps, choice: str) -> Iterator[tuple[str, Bool]]:
     Thirds have rows of nodes in equal numbers, as far as possible.
     """
     if choice not in {SUBFIELDS, THIRDS}:
+        if not Path(choice).exists() and (hint := did_you_mean([choice], (SUBFIELDS, THIRDS))):
+            raise UsageError(f"--regions {choice}: file does not exist{hint}")
         regions = read_regions(Path(choice), side.shape)
         yield from zip(regions.names, regions.member[:, None], strict=True)
         return

@@ -142,7 +142,13 @@ def peak_table(
         **effect_columns(test),
     }
     del values["estimate"], values["se"]
-    clusters = find_clusters(discoveries.rejected.ravel(), test.statistic, frame.subfield, edges)
+    clusters = find_clusters(
+        discoveries.rejected.ravel(),
+        test.statistic,
+        frame.subfield,
+        edges,
+        evidence=test.contrast.evidence(test.statistic),
+    )
     return pd.DataFrame(
         [
             {
@@ -158,24 +164,31 @@ def peak_table(
 
 
 def find_clusters(
-    significant: Bool, statistic: Float, subfield: NDArray[np.str_], edges: Int
+    significant: Bool,
+    statistic: Float,
+    subfield: NDArray[np.str_],
+    edges: Int,
+    *,
+    evidence: Float | None = None,
 ) -> list[tuple[int, dict[str, object]]]:
     """Find connected regions of one sign among points, largest first.
 
-    Returns the point with the largest statistic, and the columns of tables of peaks. Without any
-    region, the peak of the whole map, if it has one, is a cluster of no points.
+    Returns the point with most ``evidence``, which is the size of the statistic unless given, and
+    the columns of tables of peaks. Without any region, the peak of the whole map, if it has one,
+    is a cluster of no points.
     """
+    evidence = np.abs(statistic) if evidence is None else evidence
     clusters: list[tuple[int, int, str]] = []
     for sign in (1, -1):
         labels, count = label_regions(significant & (sign * statistic > 0), edges)
         for number in range(1, count + 1):
             members = np.flatnonzero(labels == number)
-            peak = int(members[np.argmax(np.abs(statistic[members]))])
+            peak = int(members[np.argmax(evidence[members])])
             codes = subfield[members]
             names, counts = np.unique(codes[codes != MISSING], return_counts=True)
             shares = [f"{n} {c / len(members):.0%}" for n, c in zip(names, counts, strict=True)]
             clusters.append((len(members), peak, "; ".join(shares)))
     if not clusters and np.isfinite(statistic).any():
-        clusters = [(0, int(np.nanargmax(np.abs(statistic))), "")]
+        clusters = [(0, int(np.nanargmax(evidence)), "")]
     clusters.sort(key=lambda cluster: -cluster[0])
     return [(peak, {"extent": extent, "shares": shares}) for extent, peak, shares in clusters]

@@ -361,6 +361,8 @@ def _findings(analysis: Analysis) -> str:
         if count and np.isfinite(discoveries.cutoff):
             text += f" (p up to {discoveries.cutoff:.2g}, uncorrected)"
         if discoveries.lenient:
-            text += ", a cut-off above the level, as permitted with widespread effects"
+            text += (
+                ", a cut-off above the level, as widespread effects or shifts of all values permit"
+            )
         lines.append(f"- {escaped(text)}")
     return "\n".join(["Significant points after correction:", "", *lines])

@@ -239,6 +239,6 @@ def _check_margins(matrix: Design, cohort: data.Cohort, measures: data.Measures)
     units = {cohort.units[name] for name in (*measures.maps, *summaries) if name in cohort.units}
     if names and len(units) > 1:
         raise ModelError(
-            f"contrast {names[0]!r}: a margin has one unit, but maps and summary measures have"
-            f" {listed(sorted(units))}; choose both, as --measures thickness thickness_mean"
+            f"contrast {names[0]!r}: a margin has one unit, but the measures have"
+            f" {listed(sorted(units))}; choose one unit, as --measures thickness thickness_mean"
         )

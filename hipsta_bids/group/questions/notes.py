@@ -60,7 +60,8 @@ def _of_results(analysis: results.Analysis) -> Iterator[str]:
         if discoveries.lenient:
             yield (
                 f"{key.measure}, {key.contrast}, {key.hemi}: p up to {discoveries.cutoff:.3g}"
-                " survives, above the level; effects are widespread"
+                " survives, above the level; effects are widespread, or all values are"
+                " shifted"
             )
 
 

@@ -1,6 +1,7 @@
 """A study: what was read for a question of the group level, and how its results are written."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -41,6 +42,16 @@ from hipsta_bids.types import PARTICIPANT, SESSION, VisitKey
 _MOST_ABSENT = 0.1
 #: Hemispheres that notes name.
 _MOST_NOTES = 4
+
+#: What a record says of the question, by its keys.
+_QUESTION = {
+    "formula": "formula",
+    "contrasts": "contrasts",
+    "one_sided": "margins",
+    "comparison": "comparison",
+    "measures": "measures",
+    "settings": "settings",
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -260,6 +271,7 @@ class Study:
         name += options.part
         _describe_dataset(options)
         final = options.out_dir / write.GROUP_FOLDER / name
+        before = _question_in(final)
         with write.whole_folder(final) as folder:
             tell("tables and maps")
             record = {
@@ -291,9 +303,24 @@ class Study:
             folder=final,
             n_participants=counts[0],
             n_excluded=counts[1],
-            notes=tuple(notes),
+            notes=(*notes, *_replaced(before, final)),
             warnings=warnings,
         )
+
+
+def _question_in(folder: Path) -> dict[str, Any]:
+    """Return what an analysis asked; empty without a record."""
+    with suppress(InputError):
+        record = files.read_json(folder / "analysis.json")
+        return {name: record.get(key) for key, name in _QUESTION.items()}
+    return {}
+
+
+def _replaced(before: Mapping[str, Any], folder: Path) -> Iterator[str]:
+    """Return a note if the results of another question were replaced."""
+    now = _question_in(folder)
+    if changes := [name for name in before if before[name] != now[name]]:
+        yield f"{folder.name} had other {listed(changes)}; next time, keep both with --name"
 
 
 def read_study(

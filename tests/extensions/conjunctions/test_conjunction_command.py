@@ -130,6 +130,19 @@ def test_asymmetry_and_registration_have_conjunctions(cohort):
     assert len(table(folder / "alignment.tsv"))
 
 
+def test_without_findings_the_peak_has_the_smallest_p_and_a_second_run_is_noted(cohort, capsys):
+    for margin, replaced in ((0.001, False), (0.002, True)):
+        text = f"tight = |group[CN]-group[MCI]| < {margin}"
+        folder = run(cohort, "--contrast", text, "--no-reports", name="tight")
+        assert (
+            "tight had other margins; next time, keep both" in capsys.readouterr().out
+        ) == replaced
+        peaks = table(folder / "peaks.tsv").set_index("hemi")
+        for hemi in "LR":
+            assert peaks.loc[hemi, "extent"] == 0
+            assert peaks.loc[hemi, "p"] == points(folder, "Tight", hemi)["p"].min()
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [
@@ -138,6 +151,7 @@ def test_asymmetry_and_registration_have_conjunctions(cohort):
         (["--contrast", "group[CN] &"], "cannot read"),
         (["--contrast", "group[CN] & group[XY]"], "group[XY]"),
         (["--contrast", "|age| < 0"], "write equivalence as"),
+        (["--contrast", r"\|age\| > 1"], "contrast '|age| > 1': write equivalence as"),
         (["--contrast", "age & group[AD]", "age and group[AD]=age"], "same name"),
         (["--contrast", SAME, "--measures", "thickness", "curvature"], "a margin has one unit"),
     ],

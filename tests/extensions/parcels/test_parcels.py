@@ -231,6 +231,8 @@ def test_missing_file_and_map(dataset, tmp_path, capsys):
     call = [str(data), str(out), "group", *FAST, "--regions"]
     assert main([*call, str(tmp_path / "no.tsv")]) == ExitCode.BAD_DATA
     assert "file not found" in capsys.readouterr().err
+    assert main([*call, "subfield"]) == ExitCode.USAGE
+    assert "file does not exist; did you mean subfields?" in capsys.readouterr().err
     call = [str(data), str(out), "group", "--measures", "volume", "--regions", "subfields"]
     assert main(call) == ExitCode.BAD_DATA
     assert "no map or no subfield" in capsys.readouterr().err

@@ -78,6 +78,20 @@ def test_planted_effect_is_the_first_row():
     assert first["effect_low"] < first["effect_size"] == test.cohen_d[point] < first["effect_high"]
 
 
+@pytest.mark.parametrize("side", ["greater", "less"])
+def test_the_peak_of_a_one_sided_map_has_its_smallest_p(side):
+    random = np.random.default_rng(1)
+    matrix = np.column_stack([np.ones(60), np.arange(60) % 2])
+    maps = random.standard_normal((60, EDGES.max() + 1))
+    maps[1::2, 7] += -3.0 if side == "greater" else 3.0  # the wrong direction
+    contrast = Contrast("sided", [0, 1], side=side)
+    (test,) = fit_points(maps, matrix, [contrast], GlmSettings()).tests
+    nothing = control_fdr(np.ones_like(test.p), 0.05)
+    (row,) = peak_table(test, nothing, FRAME, EDGES).to_dict("records")
+    assert row["p"] == test.p.min() < 0.05
+    assert row["extent"] == 0
+
+
 def test_rows_of_a_table_of_peaks_are_exact():
     """Two clusters on a sheet of 3 x 2 nodes: every cell is known."""
     test, _ = planted(0.0)
