@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 
 from hipsta_bids.extensions.multilevel import EXTENSION
+from hipsta_bids.extensions.multilevel.rows import FEW_LEVELS
 from hipsta_bids.group.cohort.data import Cohort
 from hipsta_bids.group.output.citations import escaped
 from hipsta_bids.group.output.results import Analysis
@@ -61,6 +62,6 @@ def methods(analysis: Analysis, cite: Callable[[str], str]) -> Iterator[str]:
     )
     if any(contrast.n_rows > 1 for contrast in analysis.design.contrasts):
         text += f" Contrasts of several rows were tested by F {cite('fai')}."
-    if note := analysis.design.notes.get("random"):
-        text += f" Note that {escaped(note.partition('; ')[0].partition(': ')[2])}, which are few."
+    if len(counts) < FEW_LEVELS:
+        text += f" Of fewer than {FEW_LEVELS} levels, the variance between them is uncertain."
     yield text

@@ -43,15 +43,8 @@ _MOST_ABSENT = 0.1
 #: Hemispheres that notes name.
 _MOST_NOTES = 4
 
-#: What a record says of the question, by its keys.
-_QUESTION = {
-    "formula": "formula",
-    "contrasts": "contrasts",
-    "one_sided": "margins",
-    "comparison": "comparison",
-    "measures": "measures",
-    "settings": "settings",
-}
+#: Keys of a record that have the question.
+_QUESTION = ("formula", "contrasts", "one_sided", "comparison", "measures", "settings")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -271,7 +264,7 @@ class Study:
         name += options.part
         _describe_dataset(options)
         final = options.out_dir / write.GROUP_FOLDER / name
-        before = _question_in(final)
+        earlier = _question_in(final)
         with write.whole_folder(final) as folder:
             tell("tables and maps")
             record = {
@@ -303,7 +296,7 @@ class Study:
             folder=final,
             n_participants=counts[0],
             n_excluded=counts[1],
-            notes=(*notes, *_replaced(before, final)),
+            notes=(*notes, *_replaced(earlier, final)),
             warnings=warnings,
         )
 
@@ -312,15 +305,15 @@ def _question_in(folder: Path) -> dict[str, Any]:
     """Return what an analysis asked; empty without a record."""
     with suppress(InputError):
         record = files.read_json(folder / "analysis.json")
-        return {name: record.get(key) for key, name in _QUESTION.items()}
+        return {key: record.get(key) for key in _QUESTION}
     return {}
 
 
-def _replaced(before: Mapping[str, Any], folder: Path) -> Iterator[str]:
+def _replaced(earlier: Mapping[str, Any], folder: Path) -> Iterator[str]:
     """Return a note if the results of another question were replaced."""
-    now = _question_in(folder)
-    if changes := [name for name in before if before[name] != now[name]]:
-        yield f"{folder.name} had other {listed(changes)}; next time, keep both with --name"
+    written = _question_in(folder)
+    if changes := [key for key in earlier if earlier[key] != written[key]]:
+        yield f"{folder.name} had another question ({listed(changes)}); keep both with --name"
 
 
 def read_study(

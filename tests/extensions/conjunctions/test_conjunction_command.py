@@ -135,7 +135,7 @@ def test_without_findings_the_peak_has_the_smallest_p_and_a_second_run_is_noted(
         text = f"tight = |group[CN]-group[MCI]| < {margin}"
         folder = run(cohort, "--contrast", text, "--no-reports", name="tight")
         assert (
-            "tight had other margins; next time, keep both" in capsys.readouterr().out
+            "tight had another question (one_sided); keep both" in capsys.readouterr().out
         ) == replaced
         peaks = table(folder / "peaks.tsv").set_index("hemi")
         for hemi in "LR":
