@@ -142,7 +142,7 @@ def test_commands_write_the_numbers_of_the_sentence(commands, numbers, folder, m
     for name, column, *condition in (text.split(":", 2) for text in numbers):
         path = next(filter(Path.exists, (Path(place) / name for place in reversed(places))))
         rows = small_cohorts.table(path)
-        for key, value in (text.split("=", 1) for text in condition):
+        for key, value in (text.split("=", 1) for part in condition for text in part.split("&")):
             rows = rows[rows[key] == value]
         assert rows[column].notna().any(), (path, column, condition)
         if (column, condition) == ("n_significant", ["contrast=CN-AD"]):

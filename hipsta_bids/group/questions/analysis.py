@@ -240,5 +240,5 @@ def _check_margins(matrix: Design, cohort: data.Cohort, measures: data.Measures)
     if names and len(units) > 1:
         raise ModelError(
             f"contrast {names[0]!r}: a margin has one unit, but the measures have"
-            f" {listed(sorted(units))}; choose one unit, as --measures thickness thickness_mean"
+            f" {listed(sorted(units))}; choose one unit, as thickness + thickness_mean ~ group"
         )

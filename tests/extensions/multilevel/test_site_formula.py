@@ -85,7 +85,8 @@ def test_texts_name_the_random_intercept(results):
 
 
 def test_few_sites_give_a_note(sites, capsys):
-    run_named(sites, "--formula", "group + (1|half)", *FAST)
+    folder = run_named(sites, "--formula", "group + (1|half)", *FAST)
+    assert "Of fewer than 5 levels, the variance between them is uncertain" in methods_of(folder)
     assert "half has 2 levels; with fewer than 5, a fixed effect (+ half) is safer" in (
         capsys.readouterr().out
     )
