@@ -64,7 +64,8 @@ def write_hemisphere(place, thickness, curvature, *, volume=500.0, **record):
     mean = float(np.nanmean(thickness))
     row = [f"{mean:.4f}", f"{volume:.4f}", "n/a"]
     files.write_tsv(place.path("summary"), ["thickness_mean", "volume", "area_mid"], [row])
-    files.write_json(place.path("summary_sidecar"), {"volume": {"Units": "mm^3"}})
+    units = {"thickness_mean": {"Units": "mm"}, "volume": {"Units": "mm^3"}}
+    files.write_json(place.path("summary_sidecar"), units)
     digest = json.loads((place.root / "desc-settings.json").read_text())["hash"]
     content = {
         "decision": "use",
