@@ -14,7 +14,7 @@ from scipy.interpolate import CubicSpline
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry import digital
 from hipsta_bids.geometry import grid as grids
-from hipsta_bids.geometry.ends import EndPlanes
+from hipsta_bids.geometry.ends import EndPlane, EndPlanes
 from hipsta_bids.geometry.grid import WedgeGrid, continued_nodes, in_plane_voxel, smooth_body
 from hipsta_bids.geometry.outlines import SLIT_HALF_WIDTH, TOUCH_DISTANCE
 from hipsta_bids.protocols.protocol import Tissue
@@ -308,8 +308,8 @@ def test_slices_lie_across_the_body_up_to_sixty_degrees(degrees, across):
     assert grids.cut_across(body) is across
 
 
-@pytest.mark.parametrize("skew", [0.0, 0.3])
-def test_motion_of_cross_sections_behind_a_plane(skew):
+@pytest.mark.parametrize(("skew", "pose"), [(0.0, np.eye(4)), (0.3, np.eye(4)), (0.3, rigid())])
+def test_motion_of_cross_sections_behind_a_plane(skew, pose):
     """A rectangle that moves and changes linearly with the depth, in both directions."""
     change = np.array([[0.05, 0.04], [-0.02, -0.06]])
     grid = np.indices((60, 44, 36)).reshape(3, -1).T * 0.25
@@ -320,12 +320,19 @@ def test_motion_of_cross_sections_behind_a_plane(skew):
     flat = points[:, :2] - depth * [skew, -0.5 * skew]
     local = np.einsum("nij,nj->ni", np.linalg.inv(np.eye(2) + depth[..., None] * change), flat)
     tissue = (np.abs(local) < [4.0, 2.2]).all(axis=1).reshape(60, 44, 36)
-    body = plain_body(tissue, affine, replace(straight_ends(20.0), half_slice=0.125))
+    ends, spin = replace(straight_ends(20.0), half_slice=0.125), pose[:3, :3]
+    moved = [
+        EndPlane(spin @ plane.point + pose[:3, 3], spin @ plane.normal, "labels")
+        for plane in (ends.posterior, ends.anterior)
+    ]
+    ends = replace(ends, posterior=moved[0], anterior=moved[1], axis=spin @ ends.axis)
+    body = plain_body(tissue, pose @ affine, ends)
     inward = np.array([skew, -0.5 * skew, 1.0])
     turn = rotation(2, 30)
-    center, across, found = grids._motion(body, "posterior", inward, turn[:2])
-    np.testing.assert_allclose(center, 0.0, atol=0.1)
-    np.testing.assert_allclose(across, turn[:2], atol=EXACT)
+    leaning = turn[:2] + np.array([[0.0, 0, 0.2], [0, 0, -0.4]])
+    center, across, found = grids._motion(body, "posterior", spin @ inward, leaning @ spin.T)
+    np.testing.assert_allclose(center, pose[:3, 3], atol=0.1)
+    np.testing.assert_allclose(across, turn[:2] @ spin.T, atol=EXACT)
     np.testing.assert_allclose(found, turn[:2, :2] @ change @ turn[:2, :2].T, atol=0.025)
     if not skew:  # what lies a millimeter beyond the plane is read from this place in it
         body = replace(body, ends=replace(straight_ends(9.0), half_slice=0.125))
@@ -398,3 +405,50 @@ def test_filled_nodes_are_known_to_the_field(arc):
     nodes = np.argwhere(field.slits).astype(float)
     distance = np.linalg.norm(field.grid.to_ras(nodes)[:, None] - points, axis=-1).min(axis=1)
     assert distance.max() <= 0.5 * np.sqrt(3) * 0.4 + 1e-6  # half the diagonal of a voxel
+
+
+@pytest.mark.parametrize("hemi", ["L", "R"])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_grids_lie_along_the_most_lateral_edge_of_the_voxels(sign, hemi):
+    """A plate that gets more lateral along the second edge, and a little along the first."""
+    shape, turn = (7, 11, 5), rotation(0, 30) @ rotation(2, 25)
+    affine = np.eye(4)
+    affine[:3, :3] = turn * [0.5, 0.4, 0.6]
+    affine[:3, 3] = [40.0, -20.0, 7.0]
+    axis = turn @ [0.1, 0.0, np.sqrt(0.99)]
+    place = sign * (np.indices(shape)[1] + 0.3 * np.indices(shape)[0] - 5.9)
+    tissue = np.select([place < -2, place < 2], [Tissue.SUBICULUM, Tissue.CA1], Tissue.CA3)
+    body = plain_body(tissue, affine, replace(straight_ends(9.0), axis=axis))
+    points = body.inside_points()[1]
+    flat = points - np.outer(points @ axis, axis)
+    first, second = grids._directions_across(body, hemi, flat)
+    np.testing.assert_allclose(first, sign * turn[:, 1], atol=EXACT)
+    hand = 1 if hemi == "L" else -1
+    np.testing.assert_allclose(second, hand * np.cross(axis, first), atol=EXACT)
+
+
+@pytest.mark.parametrize("pose", [np.eye(4), rigid()])
+def test_a_slanting_prism_goes_on_along_itself(pose):
+    """Its sections move by 0.4 and -0.2 mm per mm, and the planes lie across the first axis."""
+    index = np.indices((52, 40, 40)).reshape(3, -1).T
+    affine = np.diag([0.3, 0.3, 0.3, 1.0])
+    affine[:3, 3] = [-6.0, -6.0, -1.0]
+    points = index @ affine[:3, :3].T + affine[:3, 3]
+    slope = np.array([0.4, -0.2])
+    local = np.abs(points[:, :2] - points[:, 2:] * slope)
+    tissue = (local < [3.0, 2.0]).all(axis=1).reshape(52, 40, 40)
+    ends, spin = straight_ends(9.0), pose[:3, :3]
+    moved = [
+        EndPlane(spin @ plane.point + pose[:3, 3], spin @ plane.normal, "labels")
+        for plane in (ends.posterior, ends.anterior)
+    ]
+    ends = replace(ends, posterior=moved[0], anterior=moved[1], axis=spin @ ends.axis)
+    body = plain_body(tissue, pose @ affine, ends)
+    body.inside[...] &= ((points[:, 2] > 0) & (points[:, 2] < 9)).reshape(tissue.shape)
+    nodes = np.array([[0.5, 1.0, -1.5], [-0.9, 0.3, 0.2], [1.0, -0.7, 8.9], [4.0, -1.0, 11.0]])
+    missing = np.array([[-2.0], [-0.3], [0.4], [2.5]])  # mm to half a mm inside of the planes
+    expected = nodes - missing * [*slope, 1.0]
+    places = nodes @ spin.T + pose[:3, 3]
+    across = np.array([[0.8, 0.6, 0.0], [-0.6, 0.8, 0.0]]) @ spin.T
+    read = continued_nodes(SimpleNamespace(node_points=places.copy, across=across), body, 0.5)
+    np.testing.assert_allclose((read - pose[:3, 3]) @ spin, expected, atol=0.08)
