@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from geometry_cases import degrees_between, rigid, rotation, short_phantom
+from scipy import stats
 from scipy.special import ndtr
 
 from hipsta_bids.errors import GeometryError
@@ -259,3 +260,10 @@ def test_sections_with_a_part_of_the_labels_are_left_out_beyond_what_smoothing_t
     grazed = np.clip((0.9 - fine / (ramp or 1e-9)) / 0.1, 0, 1).sum() * 0.25
     assert lost == pytest.approx(max(grazed - blurred, 0), abs=0.02)
     assert lost * 0.5 == automatic_ends._grazed(depth, area, (depth < 0) * 0.5, BODY)
+
+
+def test_errors_of_means_that_leave_out_one_value_are_standard_errors():
+    values = np.array([3.0, 4.5, -1.0, 7.0])
+    means = [float(np.delete(values, left).mean()) for left in range(4)]
+    assert automatic_ends._jackknife_error(means) == pytest.approx(stats.sem(values))
+    assert automatic_ends._jackknife_error(means[:1]) == 0

@@ -14,7 +14,7 @@ from scipy.interpolate import CubicSpline
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry import digital
 from hipsta_bids.geometry import grid as grids
-from hipsta_bids.geometry.ends import EndPlane, EndPlanes
+from hipsta_bids.geometry.ends import EndPlanes
 from hipsta_bids.geometry.grid import WedgeGrid, continued_nodes, in_plane_voxel, smooth_body
 from hipsta_bids.geometry.outlines import SLIT_HALF_WIDTH, TOUCH_DISTANCE
 from hipsta_bids.protocols.protocol import Tissue
@@ -308,6 +308,16 @@ def test_slices_lie_across_the_body_up_to_sixty_degrees(degrees, across):
     assert grids.cut_across(body) is across
 
 
+def moved(ends, pose):
+    """End planes after a rigid motion (4, 4)."""
+    spin, shift = pose[:3, :3], pose[:3, 3]
+    planes = [
+        plane._replace(point=spin @ plane.point + shift, normal=spin @ plane.normal)
+        for plane in (ends.posterior, ends.anterior)
+    ]
+    return replace(ends, posterior=planes[0], anterior=planes[1], axis=spin @ ends.axis)
+
+
 @pytest.mark.parametrize(("skew", "pose"), [(0.0, np.eye(4)), (0.3, np.eye(4)), (0.3, rigid())])
 def test_motion_of_cross_sections_behind_a_plane(skew, pose):
     """A rectangle that moves and changes linearly with the depth, in both directions."""
@@ -321,12 +331,7 @@ def test_motion_of_cross_sections_behind_a_plane(skew, pose):
     local = np.einsum("nij,nj->ni", np.linalg.inv(np.eye(2) + depth[..., None] * change), flat)
     tissue = (np.abs(local) < [4.0, 2.2]).all(axis=1).reshape(60, 44, 36)
     ends, spin = replace(straight_ends(20.0), half_slice=0.125), pose[:3, :3]
-    moved = [
-        EndPlane(spin @ plane.point + pose[:3, 3], spin @ plane.normal, "labels")
-        for plane in (ends.posterior, ends.anterior)
-    ]
-    ends = replace(ends, posterior=moved[0], anterior=moved[1], axis=spin @ ends.axis)
-    body = plain_body(tissue, pose @ affine, ends)
+    body = plain_body(tissue, pose @ affine, moved(ends, pose))
     inward = np.array([skew, -0.5 * skew, 1.0])
     turn = rotation(2, 30)
     leaning = turn[:2] + np.array([[0.0, 0, 0.2], [0, 0, -0.4]])
@@ -438,12 +443,7 @@ def test_a_slanting_prism_goes_on_along_itself(pose):
     local = np.abs(points[:, :2] - points[:, 2:] * slope)
     tissue = (local < [3.0, 2.0]).all(axis=1).reshape(52, 40, 40)
     ends, spin = straight_ends(9.0), pose[:3, :3]
-    moved = [
-        EndPlane(spin @ plane.point + pose[:3, 3], spin @ plane.normal, "labels")
-        for plane in (ends.posterior, ends.anterior)
-    ]
-    ends = replace(ends, posterior=moved[0], anterior=moved[1], axis=spin @ ends.axis)
-    body = plain_body(tissue, pose @ affine, ends)
+    body = plain_body(tissue, pose @ affine, moved(ends, pose))
     body.inside[...] &= ((points[:, 2] > 0) & (points[:, 2] < 9)).reshape(tissue.shape)
     nodes = np.array([[0.5, 1.0, -1.5], [-0.9, 0.3, 0.2], [1.0, -0.7, 8.9], [4.0, -1.0, 11.0]])
     missing = np.array([[-2.0], [-0.3], [0.4], [2.5]])  # mm to half a mm inside of the planes

@@ -441,3 +441,30 @@ def test_a_body_continues_two_nodes_before_and_behind_a_cut_or_beyond_an_end():
         assert not membranes._continues(nodes + np.array([0, 0, 2]), solid)
     solid[4, 1, 10:14] = True
     assert membranes._continues(nodes + np.array([0, 0, 2]), solid)
+
+
+def test_alternatives_are_of_the_other_kind_near_and_hardly_dearer():
+    """To a fill of price 3: within two nodes, and up to twice as dear."""
+    state = np.zeros((30, 12, 12), dtype=bool)
+    origin = np.array([[5, 5, 5], [5, 6, 5]])
+    fill = membranes.Edit("fill", origin, cost=1.0)
+    near, far = (membranes.Edit("cut", origin[:1] + np.array([gap, 0, 0])) for gap in (2, 3))
+    for price, cut, chosen in ((6.0, near, True), (6.1, near, False), (4.0, far, False)):
+        dearer = [(3.5, fill), (price, cut), (5.0, near._replace(nodes=origin + 9))]
+        found = membranes._alternative(3.0, fill, dearer, state)
+        assert (found is cut.nodes) is chosen
+        assert (found is None) is not chosen
+    cheap = fill._replace(cost=0.99)
+    assert membranes._alternative(3.0, cheap, [(3.5, near)], state) is None
+    other = membranes._alternative(3.0, near._replace(cost=1.0), [(3.5, fill)], state)
+    assert other[:2].tolist() == origin.tolist()
+    assert not state.any()
+
+
+def test_walls_are_as_thick_as_near_the_nodes():
+    """Half of 4 and of 8 nodes on two sides; one where there is no wall."""
+    wall = np.zeros((80, 12, 9), dtype=bool)
+    wall[:40, 4:8], wall[40:, 2:10] = True, True
+    found = membranes._half_thickness(wall, np.array([[5, 6, 4], [75, 6, 4]]))
+    np.testing.assert_allclose(found, [1.5, 3.5])
+    np.testing.assert_array_equal(membranes._half_thickness(wall & False, np.zeros((3, 3))), 1)

@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from hipsta_bids.errors import ModelError
-from hipsta_bids.stats import glm
+from hipsta_bids.stats import arrays, glm
 from hipsta_bids.stats.arrays import SideMaps
 from hipsta_bids.stats.contrasts import Contrast
 from hipsta_bids.stats.design import build_design
@@ -115,3 +115,33 @@ def test_small_things_of_points(monkeypatch):
     assert np.isnan(few.p).all()
     with pytest.raises(ModelError, match=r"maps of shape \(9,\) do not fit"):
         glm.check_design(values[:, 0], matrix, tests)
+
+
+def test_known_cells_of_parts_are_described_as_those_of_the_table():
+    table = np.random.default_rng(0).normal(
+        [5.0, -300.0, 0.1, 0.0, 7.0], [1, 2, 1e-3, 1, 1], (9, 5)
+    )
+    table[[0, 4, 8], 0] = np.nan
+    table[:6, 1] = np.nan  # none in the first part
+    table[:, 3] = np.nan
+    table[1:, 4] = np.nan  # a single value
+    known, mean, spread = arrays.describe_known([table[:5], table[5:6], table[6:]])
+    np.testing.assert_array_equal(known, np.isfinite(table))
+    np.testing.assert_allclose(mean[[0, 1, 2, 4]], np.nanmean(table[:, [0, 1, 2, 4]], axis=0))
+    np.testing.assert_allclose(spread[:3], np.nanstd(table[:, :3], axis=0, ddof=1), rtol=1e-9)
+    assert np.isnan([mean[3], spread[3], spread[4]]).all()
+    np.testing.assert_allclose(arrays.mean_of_known(table[:, :3], 1), np.nanmean(table[:, :3], 1))
+
+
+def test_sheets_of_some_rows_keep_all_that_belongs_to_them():
+    values = np.arange(5 * 3 * 2.0).reshape(5, 3, 2)
+    first = side_of(np.array([1, 3, 4, 6, 8]), values)
+    whole = replace(first, first=first, unmasked=values - 1, covariates={"x": values * 2})
+    cut = whole.take(np.isin(np.arange(9), [0, 3, 6, 7]))
+    assert cut.rows.tolist() == [1, 2]  # rows 3 and 6 of the table are its second and third
+    found = cut.maps["thickness"], cut.curvature + 1, cut.covariates["x"] / 2
+    for part in (*found, cut.first.maps["thickness"]):
+        np.testing.assert_array_equal(part, values[[1, 3]])
+    plain = first.sheets(np.arange(5) > 2)
+    assert (plain.first, plain.unmasked, plain.shape) == (None, None, (3, 2))
+    assert (first.sheets(np.ones(5, dtype=bool)), first.only(["thickness"])) == (first, first)
