@@ -468,3 +468,12 @@ def test_walls_are_as_thick_as_near_the_nodes():
     found = membranes._half_thickness(wall, np.array([[5, 6, 4], [75, 6, 4]]))
     np.testing.assert_allclose(found, [1.5, 3.5])
     np.testing.assert_array_equal(membranes._half_thickness(wall & False, np.zeros((3, 3))), 1)
+
+
+def test_balls_have_neither_tunnels_nor_cavities():
+    box, ring = np.zeros((9, 9, 9), dtype=bool), np.zeros((9, 9, 9), dtype=bool)
+    box[1:8, 1:8, 1:8] = ring[1:8, 1:8, 1:8] = True
+    ring[6, 6] = False
+    hollow, both = box.copy(), ring.copy()
+    hollow[3, 3, 3] = both[3, 3, 3] = False  # both: the Euler number is that of a ball
+    assert [membranes._is_ball(mask) for mask in (box, ring, hollow, both)] == [True] + [False] * 3
