@@ -247,6 +247,7 @@ def test_profiles_of_a_box_have_its_area_and_spread():
     ends = np.interp([1.5 * 1.2, 17.5 * 1.2], levels, area["sheet"])
     np.testing.assert_allclose(ends, 12, rtol=0.02)
     assert area["sheet"].sum() * 0.25 == pytest.approx(8 * 3 * 16 * 1.2, rel=1e-3)
+    assert np.average(levels, weights=area["core"] + area["CA1"]) == pytest.approx(9.5 * 1.2)
 
 
 @pytest.mark.parametrize("ramp", [0.0, 1.5])

@@ -452,21 +452,3 @@ def test_a_slanting_prism_goes_on_along_itself(pose):
     across = np.array([[0.8, 0.6, 0.0], [-0.6, 0.8, 0.0]]) @ spin.T
     read = continued_nodes(SimpleNamespace(node_points=places.copy, across=across), body, 0.5)
     np.testing.assert_allclose((read - pose[:3, 3]) @ spin, expected, atol=0.08)
-
-
-def test_shapes_are_interpolated_between_thick_slices_across_the_body_only():
-    body = box_body()
-    labels = body.tissue > 0
-    labels[:, 1] = True  # in the sheet, and beside it at y = -0.6 mm
-    body = replace(body, interior=labels)
-    for axis, shaped in ((None, False), (0, False), (2, True)):
-        step, affine = np.ones(3, dtype=int), body.affine.copy()
-        if axis is not None:
-            step[axis], affine[axis, axis] = 5, 2.0
-        thin = tuple(slice(None, None, n) for n in step)
-        names = ("tissue", "inside", "interior")
-        parts = {name: getattr(body, name)[thin] for name in names}
-        field = resampled(replace(body, affine=affine, **parts))
-        assert (field.separated is None) is shaped
-        beside = field.grid.to_ras(np.argwhere(field.interior).astype(float))
-        assert (np.abs(beside[:, 1] + 0.6) <= 0.2 + EXACT).all()

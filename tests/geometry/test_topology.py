@@ -461,15 +461,6 @@ def test_alternatives_are_of_the_other_kind_near_and_hardly_dearer():
     assert not state.any()
 
 
-def test_walls_are_as_thick_as_near_the_nodes():
-    """Half of 4 and of 8 nodes on two sides; one where there is no wall."""
-    wall = np.zeros((80, 12, 9), dtype=bool)
-    wall[:40, 4:8], wall[40:, 2:10] = True, True
-    found = membranes._half_thickness(wall, np.array([[5, 6, 4], [75, 6, 4]]))
-    np.testing.assert_allclose(found, [1.5, 3.5])
-    np.testing.assert_array_equal(membranes._half_thickness(wall & False, np.zeros((3, 3))), 1)
-
-
 def test_balls_have_neither_tunnels_nor_cavities():
     box, ring = np.zeros((9, 9, 9), dtype=bool), np.zeros((9, 9, 9), dtype=bool)
     box[1:8, 1:8, 1:8] = ring[1:8, 1:8, 1:8] = True

@@ -393,14 +393,6 @@ def test_predictions_that_are_all_the_same_are_shifted_to_the_share_of_cases(sco
     assert np.isnan(found.slope)
 
 
-@pytest.mark.parametrize(("n", "bins"), [(8, 2), (14, 2), (15, 3), (24, 4), (50, 10), (90, 10)])
-def test_groups_of_calibration_have_five_members_at_least(n, bins):
-    score = np.linspace(-1, 1, n)
-    settings = SETTINGS.changed(least_calibrated=2)
-    found = calibrate(score, np.arange(n) % 2 == 0, settings)
-    assert len(found.predicted) == len(found.observed) == bins
-
-
 @pytest.mark.parametrize("bent", [False, True])
 @pytest.mark.parametrize("free", [[True, True, True], [True, False, True]])
 def test_steps_of_firths_method_are_newtons_and_bounded(free, bent):

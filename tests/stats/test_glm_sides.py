@@ -131,17 +131,3 @@ def test_known_cells_of_parts_are_described_as_those_of_the_table():
     np.testing.assert_allclose(spread[:3], np.nanstd(table[:, :3], axis=0, ddof=1), rtol=1e-9)
     assert np.isnan([mean[3], spread[3], spread[4]]).all()
     np.testing.assert_allclose(arrays.mean_of_known(table[:, :3], 1), np.nanmean(table[:, :3], 1))
-
-
-def test_sheets_of_some_rows_keep_all_that_belongs_to_them():
-    values = np.arange(5 * 3 * 2.0).reshape(5, 3, 2)
-    first = side_of(np.array([1, 3, 4, 6, 8]), values)
-    whole = replace(first, first=first, unmasked=values - 1, covariates={"x": values * 2})
-    cut = whole.take(np.isin(np.arange(9), [0, 3, 6, 7]))
-    assert cut.rows.tolist() == [1, 2]  # rows 3 and 6 of the table are its second and third
-    found = cut.maps["thickness"], cut.curvature + 1, cut.covariates["x"] / 2
-    for part in (*found, cut.first.maps["thickness"]):
-        np.testing.assert_array_equal(part, values[[1, 3]])
-    plain = first.sheets(np.arange(5) > 2)
-    assert (plain.first, plain.unmasked, plain.shape) == (None, None, (3, 2))
-    assert (first.sheets(np.ones(5, dtype=bool)), first.only(["thickness"])) == (first, first)
