@@ -268,3 +268,12 @@ def test_errors_of_means_that_leave_out_one_value_are_standard_errors():
     means = [float(np.delete(values, left).mean()) for left in range(4)]
     assert automatic_ends._jackknife_error(means) == pytest.approx(stats.sem(values))
     assert automatic_ends._jackknife_error(means[:1]) == 0
+
+
+def test_levels_have_a_subfield_with_a_fifth_of_its_usual_area():
+    area = {
+        "CA1": np.array([0.05, 3, 10, 10, 10, 1, 0]),
+        "CA2-3": np.array([9.0, 9, 9, 9, 1, 9, 9]),
+    }
+    profile = automatic_ends._Profile(np.arange(7.0), area, {})
+    assert automatic_ends._has_subfields(profile).tolist() == [False, *[True] * 3, *[False] * 3]

@@ -206,3 +206,9 @@ def test_shares_of_a_notch_a_bump_and_an_intrusion(beyond):
         assert bump.limit == pytest.approx(CHECKS.bump_contrast * noise)
         place = [[x / 2, y / 2, at / 2 - 0.5] for x in (12, 13) for y in (2, 3, 4, 5)]
         assert bump.points.tolist() == intrusion.points.tolist() == place
+
+
+def test_rows_are_compared_with_the_widest_within_a_reach_on_both_sides():
+    middle = rows_of(np.ones(6), spacing=1.0).points[:, :, 1]
+    wider = sheet_checks._wider(np.array([1.0, 5, 2, 1, 3, 0]), middle, 2.0)
+    assert wider.tolist() == [1, 5, 3, 3, 3, 0]

@@ -398,16 +398,6 @@ def test_slices_on_either_side_show_that_a_ribbon_is_broken(order):
     assert [ndimage.label(image)[1] for image in found] == [1, 1, 2]
 
 
-@pytest.mark.parametrize(("width", "pieces"), [(23, 1), (24, 2), (30, 2)])
-def test_fragments_are_crumbs_below_a_size(width, pieces):
-    """Of 1.5 mm2, 24 pixels of 0.25 mm; three mm away."""
-    distance = np.full((40, 44), -1.0)
-    distance[4:20, 4:40] = distance[32, 6 : 6 + width] = 1.0
-    ranks = np.where(distance > 0, 3.0, np.nan)
-    found = outlines._join(distance, ranks, [], 0.25, SETTINGS)
-    assert ndimage.label(found > 0)[1] == pieces
-
-
 def test_displacements_are_smoothed_by_half_a_millimeter():
     """Without slopes there is no other change: the variance is that of the Gaussian."""
     flow = np.zeros((2, 1, 41, 41), dtype=np.float32)
@@ -430,3 +420,9 @@ def test_a_ribbon_has_each_subfield_once(uncus):
     outline = np.where(np.isfinite(rank), 1, -1).astype(np.float32)
     outlines.drop_doubles(outline, rank)
     np.testing.assert_array_equal(outline > 0, kept)
+
+
+def test_ends_are_kept_apart_by_a_slit_where_both_are_near():
+    """0.3 mm to each side of the middle, or what both are nearer than 0.6 mm."""
+    medial, lateral = np.array([[-0.2, 1.0, -3.0], [-0.5, -0.3, -0.1]])
+    np.testing.assert_allclose(outlines.keep_apart(medial, lateral), [-0.1, 0.35, 2.4])

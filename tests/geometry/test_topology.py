@@ -280,7 +280,7 @@ def test_an_interrupted_body_is_refused():
     mask = ribbon_mask()
     mask[..., 13:18] = False
     with pytest.raises(
-        GeometryError, match=r"the body is interrupted at .* fill in missing slices"
+        GeometryError, match=r"is interrupted at RAS \S+ \S+ 6.0 mm; fill in missing slices"
     ) as caught:
         solid_of(field_of(mask), TOPOLOGY)
     assert caught.value.reason == "body-interrupted"
@@ -397,6 +397,8 @@ def test_stumps_of_a_cut_lie_along_the_line_between_them():
     solid[3, 5, 4] = solid[6, 5, 8] = True
     assert membranes._stumps_along(cut[:1], solid) == 0
     assert membranes._stumps_along(cut, solid) == pytest.approx(16 / 25)
+    solid[3, 5, 5] = solid[6, 6, 8] = solid[4, 7, 6] = True  # the third piece is smaller
+    assert membranes._stumps_along(cut, solid) == pytest.approx(3.5**2 / (3**2 + 0.5**2 + 3.5**2))
 
 
 def test_cuts_between_turns_that_touch_sever_nothing(monkeypatch):

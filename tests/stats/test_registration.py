@@ -168,7 +168,6 @@ def test_shift_between_groups_is_reported():
         np.testing.assert_allclose(shifts[name]["shift"], part.mean(axis=0), atol=1e-12)
         np.testing.assert_allclose(shifts[name]["shift_se"], stats.sem(part, axis=0), atol=1e-12)
         assert shifts[name]["node_x"].tolist() == [*range(1, NODES + 1)]
-    assert (shifts["a"]["shift_se"][8:34] < 0.2).all()
 
 
 def test_curvature_that_is_larger_everywhere_moves_nobody():
