@@ -129,13 +129,11 @@ def test_sources_are_of_what_is_there(tmp_path):
         ("thickness", [2.0, 2.0], "thickness is 2 mm at all points"),
         ("volume", [2.0], None),
         ("volume", [1e6], "volume reaches 1e+06 mm^3, which no sheet does"),
-        ("extent_x", [999.0, 5.0], None),
         ("extent_x", [5.0, 1000.0], "extent_x reaches 1e+03 mm, which no sheet does"),
         ("area_CA1", [1e5], "area reaches"),
         ("curvature", [-100.0, 1.0], "curvature reaches -100 1/mm, which no sheet does"),
         ("gaussian_curvature_interior", [-9999.0, 9999.0], None),
         ("of_others", [-1.0, -1.0], None),
-        ("thickness", [np.nan, np.nan], None),
     ],
 )
 def test_values_that_no_sheet_has_are_named(name, values, message):

@@ -44,7 +44,6 @@ def test_statistic_is_that_of_the_model(contrast):
     (expected,) = fit_points(maps, matrix, [contrast], GlmSettings()).tests
     found = permute(maps, matrix, contrast, SHEET, settings=few)
     np.testing.assert_allclose(found.statistic, expected.statistic, rtol=1e-9)  # rounding
-    # With a map as a further column at each point.
     covariate = np.random.default_rng(9).normal(2, 0.3, (1, *maps.shape))
     (expected,) = fit_points(maps, matrix, [contrast], GlmSettings(), covariate).tests
     part = PermutationPart(maps, matrix, np.arange(40), sheet_edges(*SHEET), covariates=covariate)
