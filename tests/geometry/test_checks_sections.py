@@ -209,6 +209,6 @@ def test_shares_of_a_notch_a_bump_and_an_intrusion(beyond):
 
 
 def test_rows_are_compared_with_the_widest_within_a_reach_on_both_sides():
-    middle = rows_of(np.ones(6), spacing=1.0).points[:, :, 1]
-    wider = sheet_checks._wider(np.array([1.0, 5, 2, 1, 3, 0]), middle, 2.0)
+    middle = rows_of(np.ones(6), spacing=0.4).points[:, :, 1]
+    wider = sheet_checks._wider(np.array([1.0, 5, 2, 1, 3, 0]), middle, 0.8)
     assert wider.tolist() == [1, 5, 3, 3, 3, 0]
