@@ -410,8 +410,8 @@ def test_grids_lie_along_the_most_lateral_edge_of_the_voxels(sign, hemi):
     flat = points - np.outer(points @ axis, axis)
     first, second = grids._directions_across(body, hemi, flat)
     np.testing.assert_allclose(first, sign * turn[:, 1], atol=EXACT)
-    hand = 1 if hemi == "L" else -1
-    np.testing.assert_allclose(second, hand * np.cross(axis, first), atol=EXACT)
+    expected = np.cross(axis, first) * {"L": 1, "R": -1}[hemi]
+    np.testing.assert_allclose(second, expected, atol=EXACT)
 
 
 @pytest.mark.parametrize("pose", [np.eye(4), rigid()])
@@ -433,8 +433,8 @@ def test_a_slanting_prism_goes_on_along_itself(pose):
     body = plain_body(tissue, pose @ affine, ends)
     body.inside[...] &= ((points[:, 2] > 0) & (points[:, 2] < 9)).reshape(tissue.shape)
     nodes = np.array([[0.5, 1.0, -1.5], [-0.9, 0.3, 0.2], [1.0, -0.7, 8.9], [4.0, -1.0, 11.0]])
-    missing = np.array([[-2.0], [-0.3], [0.4], [2.5]])  # mm to half a mm inside of the planes
-    expected = nodes - missing * [*slope, 1.0]
+    # As many mm along z, to half a mm inside of the planes.
+    expected = nodes - np.array([[-2.0], [-0.3], [0.4], [2.5]]) * [*slope, 1.0]
     places = nodes @ spin.T + shift
     across = np.array([[0.8, 0.6, 0.2], [-0.6, 0.8, -0.4]]) @ spin.T  # turned into the planes
     read = continued_nodes(SimpleNamespace(node_points=places.copy, across=across), body, 0.5)
