@@ -410,8 +410,7 @@ def test_grids_lie_along_the_most_lateral_edge_of_the_voxels(sign, hemi):
     flat = points - np.outer(points @ axis, axis)
     first, second = grids._directions_across(body, hemi, flat)
     np.testing.assert_allclose(first, sign * turn[:, 1], atol=EXACT)
-    expected = np.cross(axis, first) * {"L": 1, "R": -1}[hemi]
-    np.testing.assert_allclose(second, expected, atol=EXACT)
+    np.testing.assert_allclose({"L": 1, "R": -1}[hemi] * second, np.cross(axis, first), atol=EXACT)
 
 
 @pytest.mark.parametrize("pose", [np.eye(4), rigid()])
