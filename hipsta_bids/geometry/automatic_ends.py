@@ -91,7 +91,6 @@ def find_ends(
         raise _no_body()
     absence, odd = _evidence(profile, typical)
     ends = _mean_ends(levels, _doubt(absence, odd), known_levels, settings)
-    # The standard error over the cues, by leaving each out once (jackknife).
     jackknife = [
         _mean_ends(
             levels, _doubt(absence, {k: odd[k] for k in odd if k != left}), known_levels, settings
@@ -101,10 +100,6 @@ def find_ends(
     results: dict[End, FoundEnd] = {}
     sides: tuple[tuple[End, float], ...] = (("posterior", 1.0), ("anterior", -1.0))
     for n, (end, sign) in enumerate(sides):
-        estimates = np.array([pair[n] for pair in jackknife])
-        error = (
-            float(np.sqrt((len(estimates) - 1) * estimates.var())) if len(estimates) > 1 else 0.0
-        )
         order = np.argsort(sign * levels)
         depth = sign * (levels[order] - ends[n])
         trim = max(
@@ -113,8 +108,14 @@ def find_ends(
         )
         trim += settings.end_margin
         rule = _main_evidence(levels, ends[n], sign, absence, odd)
+        error = _jackknife_error([pair[n] for pair in jackknife])
         results[end] = FoundEnd(ends[n] + sign * trim, rule, error)
     return results
+
+
+def _jackknife_error(estimates: list[float]) -> float:
+    """Compute the standard error from estimates that leave out one cue each (Tukey 1958)."""
+    return float(np.sqrt((len(estimates) - 1) * np.var(estimates)))
 
 
 def _no_body() -> GeometryError:

@@ -308,10 +308,10 @@ def _polygon_area(points: Float) -> Float:
 def labels_at(points: Float, body: Body) -> NDArray[np.uint8]:
     """Tissue (N,) at points (N, 3), RAS mm: of the body's voxel there, or else of the nearest."""
     voxel = np.rint(body.to_voxels(points)).astype(np.intp)
-    last = np.array(body.inside.shape) - 1
-    index = tuple(np.clip(voxel, 0, last).T)
+    # Of a place beyond the image, the nearest voxel of the image comes first.
+    index = tuple(np.clip(voxel, 0, np.array(body.inside.shape) - 1).T)
     labels = body.tissue[index]
-    outside = np.flatnonzero(~body.inside[index] | ((voxel < 0) | (voxel > last)).any(axis=1))
+    outside = np.flatnonzero(~body.inside[index])
     if len(outside):
         voxels, _ = body.inside_points()
         labels[outside] = body.tissue[tuple(voxels[body.nearest(points[outside])].T)]

@@ -2,6 +2,7 @@
 
 import json
 
+import numpy as np
 import pytest
 from bids import BIDSLayout
 from extension_marks import needs
@@ -13,7 +14,7 @@ from hipsta_bids.derivatives.hemisphere import remove_results, write_failure, wr
 from hipsta_bids.derivatives.names import OUTPUTS
 from hipsta_bids.derivatives.results import ResultPlace, list_results
 from hipsta_bids.errors import GeometryError
-from hipsta_bids.geometry.catalog import MAPS
+from hipsta_bids.geometry.catalog import MAPS, why_impossible
 from hipsta_bids.io import files
 
 COHORT = ("--n-subjects", "1", "--voxel-size", "0.6", "0.6", "0.6", "--thickness", "2.2")
@@ -117,3 +118,24 @@ def test_sources_are_of_what_is_there(tmp_path):
     assert left == {place.path(key) for key in ("qc", "body_mask", "body_sources")}
     remove_results(place)
     assert not list(place.path("qc").parent.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "message"),
+    [
+        ("thickness", [1.0, 2.0, np.nan], None),
+        ("thickness", [0.0, 2.0], "thickness reaches 0 mm, which no sheet does"),
+        ("thickness", [1.0, 10.0], "thickness reaches 10 mm, which no sheet does"),
+        ("thickness", [2.0, 2.0], "thickness is 2 mm at all points"),
+        ("volume", [2.0], None),
+        ("volume", [1e6], "volume reaches 1e+06 mm^3, which no sheet does"),
+        ("extent_x", [5.0, 1000.0], "extent_x reaches 1e+03 mm, which no sheet does"),
+        ("area_CA1", [1e5], "area reaches"),
+        ("curvature", [-100.0, 1.0], "curvature reaches -100 1/mm, which no sheet does"),
+        ("gaussian_curvature_interior", [-9999.0, 9999.0], None),
+        ("of_others", [-1.0, -1.0], None),
+    ],
+)
+def test_values_that_no_sheet_has_are_named(name, values, message):
+    found = why_impossible(name, np.array(values))
+    assert found is None if message is None else found.startswith(message.replace("area", name))

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from geometry_cases import degrees_between, rigid, rotation, short_phantom
+from scipy import stats
 from scipy.special import ndtr
 
 from hipsta_bids.errors import GeometryError
@@ -246,6 +247,7 @@ def test_profiles_of_a_box_have_its_area_and_spread():
     ends = np.interp([1.5 * 1.2, 17.5 * 1.2], levels, area["sheet"])
     np.testing.assert_allclose(ends, 12, rtol=0.02)
     assert area["sheet"].sum() * 0.25 == pytest.approx(8 * 3 * 16 * 1.2, rel=1e-3)
+    assert np.average(levels, weights=area["core"] + area["CA1"]) == pytest.approx(9.5 * 1.2)
 
 
 @pytest.mark.parametrize("ramp", [0.0, 1.5])
@@ -259,3 +261,19 @@ def test_sections_with_a_part_of_the_labels_are_left_out_beyond_what_smoothing_t
     grazed = np.clip((0.9 - fine / (ramp or 1e-9)) / 0.1, 0, 1).sum() * 0.25
     assert lost == pytest.approx(max(grazed - blurred, 0), abs=0.02)
     assert lost * 0.5 == automatic_ends._grazed(depth, area, (depth < 0) * 0.5, BODY)
+
+
+def test_errors_of_means_that_leave_out_one_value_are_standard_errors():
+    values = np.array([3.0, 4.5, -1.0, 7.0])
+    means = [float(np.delete(values, left).mean()) for left in range(4)]
+    assert automatic_ends._jackknife_error(means) == pytest.approx(stats.sem(values))
+    assert automatic_ends._jackknife_error(means[:1]) == 0
+
+
+def test_levels_have_a_subfield_with_a_fifth_of_its_usual_area():
+    area = {
+        "CA1": np.array([0.05, 3, 10, 10, 10, 1, 0]),
+        "CA2-3": np.array([9.0, 9, 9, 9, 1, 9, 9]),
+    }
+    profile = automatic_ends._Profile(np.arange(7.0), area, {})
+    assert automatic_ends._has_subfields(profile).tolist() == [False, *[True] * 3, *[False] * 3]

@@ -7,11 +7,10 @@ from geometry_cases import plain_body
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.body import Body, check_reach, extract_body, join_cortex
 from hipsta_bids.geometry.ends import EndPlane, EndPlanes
-from hipsta_bids.geometry.sheet import check_flipped, is_flipped
 from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.protocols.protocol import Tissue
 from hipsta_bids.settings import BodySettings
-from hipsta_bids.types import LabelVolume, Sheet
+from hipsta_bids.types import LabelVolume
 
 UP = np.array([0.0, 0.0, 1.0])
 ENDS = EndPlanes(
@@ -35,17 +34,6 @@ def volume(*tissues, protocol="ashsPMC"):
         affine=np.eye(4),
         protocol=load_protocol(protocol),
     )
-
-
-def curled_sheet(curl):
-    """A left sheet (x to the left, y forward, interior up) of constant curvature, 1/mm."""
-    s, y, z = np.meshgrid(
-        np.linspace(0.0, 10.0, 21), np.linspace(0.0, 8.0, 9), np.linspace(0, 1, 3), indexing="ij"
-    )
-    radius = 1 / curl + z - 0.5
-    angle = s * curl
-    points = np.stack([-radius * np.sin(angle), y, -radius * np.cos(angle)], axis=-1)
-    return Sheet(points=points, valid=np.ones((21, 9), dtype=bool))
 
 
 def test_cortex_is_joined_or_taken_alone():
@@ -78,19 +66,6 @@ def test_cortex_has_to_reach_along_nine_tenths(levels, enough):
     with pytest.raises(GeometryError, match=rf"{levels:.1f} of 10\.0 mm") as caught:
         check_reach(points, tissue, ENDS, settings)
     assert caught.value.reason == "cortex-incomplete"
-
-
-@pytest.mark.parametrize("curl", [0.2, -0.2, 0.01])
-def test_sides_follow_from_the_hemisphere_whatever_the_bend(curl):
-    sheet = curled_sheet(curl)
-    mirrored = Sheet(points=sheet.points * [-1, 1, 1], valid=sheet.valid)
-    turned = Sheet(points=sheet.points[:, :, ::-1], valid=sheet.valid)
-    assert not is_flipped(sheet, "L")
-    assert not is_flipped(mirrored, "R")
-    assert is_flipped(sheet, "R")
-    assert is_flipped(turned, "L")
-    assert not check_flipped(sheet, "L").raised
-    assert check_flipped(turned, "L").raised
 
 
 def test_lateral_is_near_the_hippocampus_in_cortex_alone():

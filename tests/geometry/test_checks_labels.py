@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from geometry_cases import plain_body, straight_ends
 
 from hipsta_bids.geometry import checks
 from hipsta_bids.geometry.checks import check_labels, describe_uncus
@@ -85,3 +86,15 @@ def test_slices_along_the_axis_count_by_their_distance(arc, axis):
     affine[axis, axis] = 2.0
     body = replace(arc.body, affine=affine)
     assert checks.voxel_across(body) == (0.5 if cut_across(body) else 2.0)
+
+
+def test_pinholes_have_the_sheet_on_five_or_six_sides():
+    """Of a block of 6 x 6 x 6 voxels: inside, in a face, and in an edge; and a loose corner."""
+    tissue = np.zeros((9, 9, 9), dtype=np.uint8)
+    tissue[1:7, 1:7, 1:7] = 3
+    tissue[3, 3, 3] = tissue[1, 4, 4] = tissue[1, 1, 3] = 0
+    tissue[7, 7, 7] = 3
+    noise, gap, loose = check_labels(plain_body(tissue, np.eye(4), straight_ends(9.0)), CHECKS)
+    assert sorted(noise.points.tolist()) == [[1, 4, 4], [3, 3, 3]]
+    assert (gap.value, loose.points.tolist()) == (0, [[7, 7, 7]])
+    assert (noise.value, loose.value) == pytest.approx((2 / 214, 1 / 214))

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 from geometry_cases import resampled, short_phantom
+from grids import straight_grid
 
 from hipsta_bids.geometry import sheet_checks
 from hipsta_bids.geometry.body import Body, extract_body
@@ -182,3 +183,32 @@ def test_an_edge_that_recedes_is_flagged_where_it_does(edge, depth, rows, flagge
         assert flag.value == pytest.approx(depth)
         end = sheet.points[0 if edge == "medial" else -1, 10, 1]
         assert np.linalg.norm(place_of(flag) - end) < 1.3  # mm, a row and a part of the notch
+
+
+@pytest.mark.parametrize("beyond", [0, 3])
+def test_shares_of_a_notch_a_bump_and_an_intrusion(beyond):
+    """10 x 8 nodes in each section, half a mm apart; levels beyond the planes do not count."""
+    values = np.full((24, 12, 24 + 2 * beyond), -0.5, dtype=np.float32)
+    values[2:12, 2:10] = 0.5
+    interior, at = np.zeros(values.shape, dtype=bool), beyond + 11
+    interior[12:22, 2:10] = True
+    field = Field(grid=straight_grid(values.shape), values=values.copy(), interior=interior)
+    plain = Field(grid=straight_grid((24, 12, 3)), values=values[:, :, 8:11])
+    assert [f.value for f in check_cross_sections(plain, 0.4, CHECKS)] == [0, 0, 0]
+    field.values[10:12, 2:10, at - 2 : at + 3] = -0.5
+    field.values[2:7, 10, at], field.values[12:14, 2:6, at - 1] = 0.5, 0.5
+    field.values[2:, 2:, :beyond] = 0.5
+    for step, noise in ((0.4, 0.02), (2.5, 0.05)):
+        notch, bump, intrusion = check_cross_sections(replace(field, beyond=beyond), step, CHECKS)
+        assert (notch.value, notch.limit) == (pytest.approx(16 / 64), 0.3)
+        assert bump.value == intrusion.value == pytest.approx(8 / 80)
+        assert intrusion.limit == pytest.approx(CHECKS.intrusion_contrast * noise)
+        assert bump.limit == pytest.approx(CHECKS.bump_contrast * noise)
+        place = [[x / 2, y / 2, at / 2 - 0.5] for x in (12, 13) for y in (2, 3, 4, 5)]
+        assert bump.points.tolist() == intrusion.points.tolist() == place
+
+
+def test_rows_are_compared_with_the_widest_within_a_reach_on_both_sides():
+    middle = rows_of(np.ones(6), spacing=0.4).points[:, :, 1]
+    wider = sheet_checks._wider(np.array([1.0, 5, 2, 1, 3, 0]), middle, 0.8)
+    assert wider.tolist() == [1, 5, 3, 3, 3, 0]

@@ -134,3 +134,26 @@ def test_an_edge_of_hardly_more_than_a_voxel_is_flagged(across, raised):
     assert not medial.raised
     assert lateral.raised == raised
     assert lateral.text.startswith(f"the lateral edge of the sheet is {across} voxels thick")
+
+
+@pytest.mark.parametrize(("left", "raised"), [(6, True), (7, False), (10, False)])
+def test_a_narrow_subfield_in_place_of_another_is_flagged(left, raised):
+    """CA3 is 3 mm wide; CA2 stands for it, 1.8, 2.1 or 3 mm wide: less by a mm or not."""
+    labels = subfields(10, slice(0), "lateral")
+    labels[-10:, 8:13] = Tissue.CA1
+    labels[-left:, 8:13] = Tissue.CA2
+    (gap,) = check_subfields(plates(), labels, CHECKS)
+    assert gap.raised is raised
+    assert gap.text.startswith("rows lack CA3 over 2.0 mm between" if raised else "")
+
+
+def test_rows_whose_labels_the_sheet_covers_lose_nothing():
+    """In half of the rows, labels begin 2.4 mm before the sheet does."""
+    body, (sheet, subfield) = labeled_plate(), stretched(2.6)
+    tissue = body.tissue.copy()
+    tissue[:7, 11:] = 0
+    body = plain_body(tissue, body.affine, body.ends)
+    medial, lateral = check_lost_labels(sheet, subfield, body, CHECKS)
+    assert medial.share == pytest.approx(0.5, abs=0.03)
+    assert medial.value == pytest.approx(1.2 / (9.4 + 1.2), abs=0.01)
+    assert (lateral.value, lateral.share) == (0, 0)

@@ -114,3 +114,13 @@ def test_normals_of_given_planes_point_along_the_axis(sign):
     end = GivenEnd(end="anterior", point=(1.0, 2.0, 3.0), normal=(0.0, 3.0 * sign, 4.0 * sign))
     plane = ends_mod._given_plane(end, X, Z)
     assert (plane.point.tolist(), plane.normal.tolist()) == ([1.0, 2.0, 3.0], [0.0, 0.6, 0.8])
+
+
+def test_a_plane_lies_where_the_points_next_to_it_do():
+    """Mean level of those within two mm; the plane's point may lie aside, or all be far away."""
+    plane = EndPlane(np.array([9.0, 1.0, 0.0]), np.array([0.6, 0.8, 0.0]), "labels")
+    near = plane.point + np.array([[-4, 3, 1.0], [-8, 6, 2]]) + [[0.6, 0.8, 0], [0.9, 1.2, 0]]
+    far = plane.point + np.array([[3.0, 4, 0], [-3, -4, 0]])
+    level = ends_mod._level(plane, np.vstack([near, far]), Y)
+    assert level == pytest.approx(1 + (3 + 0.8 + 6 + 1.2) / 2)
+    assert ends_mod._level(plane, far, Y) == 1.0

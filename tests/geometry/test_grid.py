@@ -23,12 +23,6 @@ from hipsta_bids.settings import CheckSettings
 EXACT = 1e-9  # rounding of coordinates of some ten mm
 
 
-def test_nodes_to_ras_and_back(case):
-    grid = case.field.grid
-    nodes = np.random.default_rng(1).uniform(-2, 60, size=(200, 3))
-    np.testing.assert_allclose(grid.to_nodes(grid.to_ras(nodes)), nodes, atol=EXACT)
-
-
 @settings(max_examples=25, deadline=None)
 @given(st.floats(-25, 25), st.floats(0, 5))
 def test_ras_to_nodes_and_back_with_tilted_planes(tilt, phase):
@@ -398,3 +392,49 @@ def test_filled_nodes_are_known_to_the_field(arc):
     nodes = np.argwhere(field.slits).astype(float)
     distance = np.linalg.norm(field.grid.to_ras(nodes)[:, None] - points, axis=-1).min(axis=1)
     assert distance.max() <= 0.5 * np.sqrt(3) * 0.4 + 1e-6  # half the diagonal of a voxel
+
+
+@pytest.mark.parametrize("hemi", ["L", "R"])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_grids_lie_along_the_most_lateral_edge_of_the_voxels(sign, hemi):
+    """A plate that gets more lateral along the second edge, and a little along the first."""
+    shape, turn = (7, 11, 5), rotation(0, 30) @ rotation(2, 25)
+    affine = np.eye(4)
+    affine[:3, :3] = turn * [0.5, 0.4, 0.6]
+    affine[:3, 3] = [40.0, -20.0, 7.0]
+    axis = turn @ [0.1, 0.0, np.sqrt(0.99)]
+    place = sign * (np.indices(shape)[1] + 0.3 * np.indices(shape)[0] - 5.9)
+    tissue = np.select([place < -2, place < 2], [Tissue.SUBICULUM, Tissue.CA1], Tissue.CA3)
+    body = plain_body(tissue, affine, replace(straight_ends(9.0), axis=axis))
+    points = body.inside_points()[1]
+    flat = points - np.outer(points @ axis, axis)
+    first, second = grids._directions_across(body, hemi, flat)
+    np.testing.assert_allclose(first, sign * turn[:, 1], atol=EXACT)
+    np.testing.assert_allclose({"L": 1, "R": -1}[hemi] * second, np.cross(axis, first), atol=EXACT)
+
+
+@pytest.mark.parametrize("pose", [np.eye(4), rigid()])
+def test_a_slanting_prism_goes_on_along_itself(pose):
+    """Its sections move by 0.4 and -0.2 mm per mm, and the planes lie across the first axis."""
+    index = np.indices((52, 40, 40)).reshape(3, -1).T
+    affine = np.diag([0.3, 0.3, 0.3, 1.0])
+    affine[:3, 3] = [-6.0, -6.0, -1.0]
+    points = index @ affine[:3, :3].T + affine[:3, 3]
+    slope = np.array([0.4, -0.2])
+    local = np.abs(points[:, :2] - points[:, 2:] * slope)
+    tissue = (local < [3.0, 2.0]).all(axis=1).reshape(52, 40, 40)
+    ends, spin, shift = straight_ends(9.0), pose[:3, :3], pose[:3, 3]
+    planes = [
+        plane._replace(point=spin @ plane.point + shift, normal=spin @ plane.normal)
+        for plane in (ends.posterior, ends.anterior)
+    ]
+    ends = replace(ends, posterior=planes[0], anterior=planes[1], axis=spin @ ends.axis)
+    body = plain_body(tissue, pose @ affine, ends)
+    body.inside[...] &= ((points[:, 2] > 0) & (points[:, 2] < 9)).reshape(tissue.shape)
+    nodes = np.array([[0.5, 1.0, -1.5], [-0.9, 0.3, 0.2], [1.0, -0.7, 8.9], [4.0, -1.0, 11.0]])
+    # As many mm along z, to half a mm inside of the planes.
+    expected = nodes - np.array([[-2.0], [-0.3], [0.4], [2.5]]) * [*slope, 1.0]
+    places = nodes @ spin.T + shift
+    across = np.array([[0.8, 0.6, 0.2], [-0.6, 0.8, -0.4]]) @ spin.T  # turned into the planes
+    read = continued_nodes(SimpleNamespace(node_points=places.copy, across=across), body, 0.5)
+    np.testing.assert_allclose((read - shift) @ spin, expected, atol=0.08)

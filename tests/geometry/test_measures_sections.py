@@ -60,3 +60,5 @@ def test_area_does_not_mind_how_the_section_is_cut_up():
     inner = points[1:-1, :, 1:-1]
     inner += np.random.default_rng(2).normal(0, 0.3, inner.shape) * [1, 0, 1]
     assert section_area(sheet_of(points)) == pytest.approx(np.full(21, 12 * 1.7))
+    points[-2] = plates().points[-2]  # 11.7 mm up to there
+    assert section_area(sheet_of(points[:-1])) == pytest.approx(np.full(21, 11.7 * 1.7))

@@ -22,8 +22,11 @@ def halves(border, *, size=(24, 16, 4)):
 
 def test_labels_are_those_of_the_voxel_or_of_the_nearest():
     body = halves(10)
+    body.tissue[:, :, 3], body.inside[:, :, 3] = Tissue.CA3, False  # beyond an end plane
     points = np.array([[4.99, 1, 1], [5.01, 1, 1], [-3, 4, 1], [20, 4, 1], [5.3, 4, 9]])
+    points = np.vstack([points, [[4.9, 4, 1.9], [5.1, 4, 1.9]]])
     wanted = [Tissue.SUBICULUM, Tissue.CA1, Tissue.SUBICULUM, Tissue.CA1, Tissue.CA1]
+    wanted += [Tissue.SUBICULUM, Tissue.CA1]
     assert labels_at(points, body).tolist() == wanted
 
 

@@ -8,7 +8,9 @@ from hypothesis import strategies as st
 
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.sheet import (
+    check_flipped,
     folded_fraction,
+    is_flipped,
     label_sheet,
     sample_sheet,
     sheet_levels,
@@ -203,3 +205,27 @@ def test_rows_of_the_head_and_the_tail_are_as_far_apart_as_those_of_the_body():
     np.testing.assert_allclose(sheet_levels(grid)[1], [-0.8, -0.4, 0, 0.4, 0.8], atol=EXACT)
     rows = sheet_levels(grid, "whole")[1]
     np.testing.assert_allclose(rows, 0.4 * np.arange(-4, 7), atol=EXACT)
+
+
+def curled_sheet(curl):
+    """A left sheet (x to the left, y forward, interior up) of constant curvature, 1/mm, moved."""
+    s, y, z = np.meshgrid(
+        np.linspace(0.0, 10.0, 21), np.linspace(0.0, 8.0, 9), np.linspace(0, 1, 3), indexing="ij"
+    )
+    radius = 1 / curl + z - 0.5
+    angle = s * curl
+    points = np.stack([-radius * np.sin(angle), y, -radius * np.cos(angle)], axis=-1)
+    return Sheet(points=points @ rigid()[:3, :3].T + 9.0, valid=np.ones((21, 9), dtype=bool))
+
+
+@pytest.mark.parametrize("curl", [0.2, -0.2, 0.01])
+def test_sides_follow_from_the_hemisphere_whatever_the_bend(curl):
+    sheet = curled_sheet(curl)
+    mirrored = Sheet(points=sheet.points * [-1, 1, 1], valid=sheet.valid)
+    turned = Sheet(points=sheet.points[:, :, ::-1], valid=sheet.valid)
+    assert not is_flipped(sheet, "L")
+    assert not is_flipped(mirrored, "R")
+    assert is_flipped(sheet, "R")
+    assert is_flipped(turned, "L")
+    assert not check_flipped(sheet, "L").raised
+    assert check_flipped(turned, "L").raised

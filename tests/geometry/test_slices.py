@@ -387,3 +387,41 @@ def test_pixels_have_their_distance_from_a_segment():
     row, column = np.indices((4, 9))
     beyond = np.maximum(np.maximum(3 - column, column - 6), 0)
     np.testing.assert_allclose(found, np.hypot(row - 2, beyond))
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_slices_on_either_side_show_that_a_ribbon_is_broken(order):
+    tissue = np.zeros((3, 60, 60), dtype=np.uint8)
+    tissue[:, 20:26, 5:28], tissue[:, 20:26, 34:50] = Tissue.CA1, Tissue.CA2
+    tissue[0, 20:26, 28:34] = Tissue.CA1
+    found = shapes._stacked(tissue[::order], PIXEL, SETTINGS).outlines[::order] > 0
+    assert [ndimage.label(image)[1] for image in found] == [1, 1, 2]
+
+
+def test_displacements_are_smoothed_by_half_a_millimeter():
+    """Without slopes there is no other change: the variance is that of the Gaussian."""
+    flow = np.zeros((2, 1, 41, 41), dtype=np.float32)
+    flow[:, 0, 20, 20] = 3.0, -2.0
+    found = shapes._improved(np.zeros((2, 41, 41), dtype=np.float32), flow, 0.25)
+    row, column = np.indices((41, 41)) - 20
+    for part in found[:, 0] / [[[3.0]], [[-2.0]]]:
+        sums = [(weight * part).sum() for weight in (1, row**2, column**2)]
+        assert sums == pytest.approx([1, 4, 4], rel=0.01)  # (0.5 mm / 0.25 mm)^2
+
+
+@pytest.mark.parametrize("uncus", [0, 1, 2])
+def test_a_ribbon_has_each_subfield_once(uncus):
+    """Pieces without a further subfield are dropped, however many."""
+    rank = np.full((12, 20), np.nan)
+    rank[1:7, 2:9], rank[8:10, 2:9] = 5, 6
+    kept = np.isfinite(rank)
+    rank[1:7:3, 12:15][:uncus] = 5
+    outline = np.where(np.isfinite(rank), 1, -1).astype(np.float32)
+    outlines.drop_doubles(outline, rank)
+    np.testing.assert_array_equal(outline > 0, kept)
+
+
+def test_ends_are_kept_apart_by_a_slit_where_both_are_near():
+    """0.3 mm to each side of the middle, or what both are nearer than 0.6 mm."""
+    medial, lateral = np.array([[-0.2, 1.0, -3.0], [-0.5, -0.3, -0.1]])
+    np.testing.assert_allclose(outlines.keep_apart(medial, lateral), [-0.1, 0.35, 2.4])

@@ -280,7 +280,7 @@ def test_an_interrupted_body_is_refused():
     mask = ribbon_mask()
     mask[..., 13:18] = False
     with pytest.raises(
-        GeometryError, match=r"the body is interrupted at .* fill in missing slices"
+        GeometryError, match=r"is interrupted at RAS \S+ \S+ 6.0 mm; fill in missing slices"
     ) as caught:
         solid_of(field_of(mask), TOPOLOGY)
     assert caught.value.reason == "body-interrupted"
@@ -397,6 +397,8 @@ def test_stumps_of_a_cut_lie_along_the_line_between_them():
     solid[3, 5, 4] = solid[6, 5, 8] = True
     assert membranes._stumps_along(cut[:1], solid) == 0
     assert membranes._stumps_along(cut, solid) == pytest.approx(16 / 25)
+    solid[3, 5, 5] = solid[6, 6, 8] = solid[4, 7, 6] = True  # the third piece is smaller
+    assert membranes._stumps_along(cut, solid) == pytest.approx(3.5**2 / (3**2 + 0.5**2 + 3.5**2))
 
 
 def test_cuts_between_turns_that_touch_sever_nothing(monkeypatch):
@@ -441,3 +443,30 @@ def test_a_body_continues_two_nodes_before_and_behind_a_cut_or_beyond_an_end():
         assert not membranes._continues(nodes + np.array([0, 0, 2]), solid)
     solid[4, 1, 10:14] = True
     assert membranes._continues(nodes + np.array([0, 0, 2]), solid)
+
+
+def test_alternatives_are_of_the_other_kind_near_and_hardly_dearer():
+    """To a fill of price 3: within two nodes, and up to twice as dear."""
+    state = np.zeros((30, 12, 12), dtype=bool)
+    origin = np.array([[5, 5, 5], [5, 6, 5]])
+    fill = membranes.Edit("fill", origin, cost=1.0)
+    near, far = (membranes.Edit("cut", origin[:1] + np.array([gap, 0, 0])) for gap in (2, 3))
+    for price, cut, chosen in ((6.0, near, True), (6.1, near, False), (4.0, far, False)):
+        dearer = [(3.5, fill), (price, cut), (5.0, near._replace(nodes=origin + 9))]
+        found = membranes._alternative(3.0, fill, dearer, state)
+        assert (found is cut.nodes) is chosen
+        assert (found is None) is not chosen
+    cheap = fill._replace(cost=0.99)
+    assert membranes._alternative(3.0, cheap, [(3.5, near)], state) is None
+    other = membranes._alternative(3.0, near._replace(cost=1.0), [(3.5, fill)], state)
+    assert other[:2].tolist() == origin.tolist()
+    assert not state.any()
+
+
+def test_balls_have_neither_tunnels_nor_cavities():
+    box, ring = np.zeros((9, 9, 9), dtype=bool), np.zeros((9, 9, 9), dtype=bool)
+    box[1:8, 1:8, 1:8] = ring[1:8, 1:8, 1:8] = True
+    ring[6, 6] = False
+    hollow, both = box.copy(), ring.copy()
+    hollow[3, 3, 3] = both[3, 3, 3] = False  # both: the Euler number is that of a ball
+    assert [membranes._is_ball(mask) for mask in (box, ring, hollow, both)] == [True] + [False] * 3

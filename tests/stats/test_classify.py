@@ -4,11 +4,13 @@ import numpy as np
 import pytest
 from scipy import optimize, special, stats
 from sklearn.calibration import calibration_curve
+from sklearn.metrics import roc_auc_score
 from sklearn.model_selection import RepeatedStratifiedKFold
 from statsmodels.discrete.discrete_model import Logit
+from statsmodels.tools.numdiff import approx_fprime, approx_hess
 
 from hipsta_bids.errors import ModelError
-from hipsta_bids.stats import logistic
+from hipsta_bids.stats import classify, logistic
 from hipsta_bids.stats.classify import (
     calibrate,
     compare_models,
@@ -277,6 +279,7 @@ def test_refuses_what_cannot_be_compared():
         "not independent": (base, base[:, 1:] * 3, case),
         "smaller group has 1 subjects": (base, added, only),
     }
+    classify._check(base, np.arange(40) < 2)  # two are enough
     for message, arguments in cases.items():
         with pytest.raises(ModelError, match=message):
             compare_models(*arguments, SETTINGS)
@@ -350,18 +353,26 @@ def test_firth_converges_where_groups_hardly_do_not_overlap():
 
 
 @pytest.mark.parametrize("effect", [0.5, 2.5, 8.0])  # of the last, all folds are separated
-def test_folds_fitted_at_once_are_those_fitted_one_by_one(effect):
+def test_folds_fitted_at_once_are_those_fitted_one_by_one(effect, monkeypatch):
     random = np.random.default_rng(4)
     case = np.arange(60) % 2 == 0
     matrix = np.column_stack([np.ones(60), random.normal(0, 1, (60, 2)) + effect * case[:, None]])
     settings = ClassificationSettings(repeats=2, folds=5)
-    score = np.zeros(60)
+    score, areas = np.zeros(60), []
     splits = RepeatedStratifiedKFold(n_splits=5, n_repeats=2, random_state=settings.seed)
     for train, test in splits.split(matrix, case):
         fit = fit_overlapping_or_firth(matrix[train], case[train])
-        score[test] += matrix[test] @ fit.coefficients / 2
-    *_, found = cross_validate(matrix, case, settings)
-    np.testing.assert_allclose(found, score, atol=1e-9)
+        log_odds = matrix[test] @ fit.coefficients
+        score[test] += log_odds / 2
+        areas.append(roc_auc_score(case[test], log_odds))
+    means = np.mean(np.reshape(areas, (2, 5)), axis=1)
+    for chunk in (classify._CHUNK, 1):
+        monkeypatch.setattr(classify, "_CHUNK", chunk)
+        area, spread, found = cross_validate(matrix, case, settings)
+        np.testing.assert_allclose(found, score, atol=1e-9)
+        assert (area, spread) == pytest.approx((means.mean(), means.std(ddof=1)), abs=1e-12)
+    area, spread, _ = cross_validate(matrix, case, settings.changed(repeats=1))
+    assert np.isnan(spread)
 
 
 def test_long_curves_are_thinned():
@@ -373,3 +384,44 @@ def test_long_curves_are_thinned():
     assert np.trapezoid(right, wrong) == pytest.approx(
         delong(score + case, case, 0.95).area, abs=1e-3
     )
+
+
+@pytest.mark.parametrize("score", [0.0, 2.0, -3.0])
+def test_predictions_that_are_all_the_same_are_shifted_to_the_share_of_cases(score):
+    found = calibrate(np.full(1000, score), np.arange(1000) < 100, SETTINGS)
+    assert found.intercept == pytest.approx(np.log(1 / 9) - score)
+    assert np.isnan(found.slope)
+
+
+@pytest.mark.parametrize("bent", [False, True])
+@pytest.mark.parametrize("free", [[True, True, True], [True, False, True]])
+def test_steps_of_firths_method_are_newtons_and_bounded(free, bent):
+    """By the information, or by second derivatives; none of a coefficient exceeds 5."""
+    base, added, case = simulated(1, n=40)
+    matrix, free = np.column_stack([base[:, :1], added]), np.array(free)
+    weights = np.array([np.ones(40), np.arange(40) % 4 > 0])
+    likelihood = logistic._Penalized(matrix, case)
+    for reach in (0.3, 4.5):
+        betas = reach * np.array([[1.0, -0.5, 0.2], [-0.6, 0.4, -0.8]]) * free
+        step, promised = likelihood.step(weights, betas, free, bent=bent)
+        for number, (own, beta) in enumerate(zip(weights, betas, strict=True)):
+
+            def value(part, own=own):
+                return likelihood.value(own[None], (np.eye(3)[free].T @ part)[None])[0]
+
+            at = beta[free]
+            slope = approx_fprime(at, value, centered=True)
+            chance = special.expit(matrix @ beta)
+            information = (matrix.T * own * chance * (1 - chance)) @ matrix
+            bend = information[free][:, free]
+            if bent:  # uphill along each main direction in units of the information
+                root = np.linalg.inv(np.linalg.cholesky(bend)).T
+                size, turned = np.linalg.eigh(-root.T @ approx_hess(at, value) @ root)
+                newton = root @ turned @ ((turned.T @ root.T @ slope) / np.abs(size))
+            else:
+                newton = np.linalg.solve(bend, slope)
+            share = min(1.0, 5 / np.abs(newton).max())
+            np.testing.assert_allclose(step[number][free], share * newton, rtol=2e-3, atol=1e-5)
+            assert promised[number] == pytest.approx(share * newton @ slope, rel=2e-3)
+        assert (step[:, ~free] == 0).all()
+    assert bent or np.abs(step).max() == pytest.approx(5)

@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from hipsta_bids.errors import ModelError
-from hipsta_bids.stats import glm
+from hipsta_bids.stats import arrays, glm
 from hipsta_bids.stats.arrays import SideMaps
 from hipsta_bids.stats.contrasts import Contrast
 from hipsta_bids.stats.design import build_design
@@ -115,3 +115,19 @@ def test_small_things_of_points(monkeypatch):
     assert np.isnan(few.p).all()
     with pytest.raises(ModelError, match=r"maps of shape \(9,\) do not fit"):
         glm.check_design(values[:, 0], matrix, tests)
+
+
+def test_known_cells_of_parts_are_described_as_those_of_the_table():
+    table = np.random.default_rng(0).normal(
+        [5.0, -300.0, 0.1, 0.0, 7.0], [1, 2, 1e-3, 1, 1], (9, 5)
+    )
+    table[[0, 4, 8], 0] = np.nan
+    table[:6, 1] = np.nan  # none in the first part
+    table[:, 3] = np.nan
+    table[1:, 4] = np.nan  # a single value
+    known, mean, spread = arrays.describe_known([table[:5], table[5:6], table[6:]])
+    np.testing.assert_array_equal(known, np.isfinite(table))
+    np.testing.assert_allclose(mean[[0, 1, 2, 4]], np.nanmean(table[:, [0, 1, 2, 4]], axis=0))
+    np.testing.assert_allclose(spread[:3], np.nanstd(table[:, :3], axis=0, ddof=1), rtol=1e-9)
+    assert np.isnan([mean[3], spread[3], spread[4]]).all()
+    np.testing.assert_allclose(arrays.mean_of_known(table[:, :3], 1), np.nanmean(table[:, :3], 1))

@@ -3,6 +3,7 @@
 import ast
 import contextlib
 import os
+from collections import deque
 
 import formulaic.materializers.base
 import numpy as np
@@ -13,6 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from hipsta_bids.errors import HipstaError, ModelError, UsageError
+from hipsta_bids.stats import grammar
 from hipsta_bids.stats.design import build_design
 from hipsta_bids.stats.formula import model_from_shortcut, parse_model
 from hipsta_bids.stats.grammar import closed_formula, split_random, without_variable
@@ -313,6 +315,9 @@ def test_watch_sees_what_is_evaluated(monkeypatch):
 def test_names_are_those_of_columns():
     closed = closed_formula("log(`weight in kg`) + C(group, contr.sum):age + I(age*sex)")
     assert closed.names == ("weight in kg", "group", "age", "sex")
+    assert closed.references == closed_formula("C(group, contr.helmert(True))").references == ()
+    coded = closed_formula('C(group, contr.treatment(base="CN"))')
+    assert coded.references == (("group", "CN"),)
 
 
 def test_names_with_blanks_keep_their_backticks():
@@ -332,3 +337,14 @@ def test_random_intercepts_are_taken_out():
     for text in (*more, "age * (1|site)", "(1||site)", "(1|1)"):
         with pytest.raises(UsageError, match=r"only one \(1\|NAME\) can be added"):
             split_random(text)
+
+
+PRODUCTS = {"": 1, "- 1 + 1": 2, "1 * 1 * 1": 7, "1 * 1 / 1": 4, "1 / 1 * 1": 5, "3 : 4 ** 2": 48}
+PRODUCTS |= {"1 + 1 * 1 : 2": 6, "( 1 + 1 ) ** 2 ** 3": 64, "- ( 2 + 3 ) : ( 1 * 2 )": 25}
+PRODUCTS |= {"1000 : 1": 1000, "50 : 50 : 50": 1001}
+
+
+@pytest.mark.parametrize("formula", PRODUCTS)
+def test_products_are_those_of_the_expanded_formula(formula):
+    """Numbers are of columns: a + b*c:d, of one, one, one and two, has a, b, c:d and b:c:d."""
+    assert grammar._products(deque(formula.split())) == PRODUCTS[formula]

@@ -44,6 +44,11 @@ def test_statistic_is_that_of_the_model(contrast):
     (expected,) = fit_points(maps, matrix, [contrast], GlmSettings()).tests
     found = permute(maps, matrix, contrast, SHEET, settings=few)
     np.testing.assert_allclose(found.statistic, expected.statistic, rtol=1e-9)  # rounding
+    covariate = np.random.default_rng(9).normal(2, 0.3, (1, *maps.shape))
+    (expected,) = fit_points(maps, matrix, [contrast], GlmSettings(), covariate).tests
+    part = PermutationPart(maps, matrix, np.arange(40), sheet_edges(*SHEET), covariates=covariate)
+    (found,) = permute_parts([part], contrast, settings=few)
+    np.testing.assert_allclose(found.statistic, expected.statistic, rtol=1e-9)
 
 
 def test_uncorrected_p_approaches_that_of_all_permutations():

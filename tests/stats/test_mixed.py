@@ -8,6 +8,7 @@ from scipy import stats
 from statsmodels.regression.mixed_linear_model import MixedLM
 
 from hipsta_bids.errors import ModelError
+from hipsta_bids.stats import random_slope
 from hipsta_bids.stats.contrasts import Contrast
 from hipsta_bids.stats.glm import fit_points
 from hipsta_bids.stats.mixed import CORRELATIONS, MAX_CORRELATION, fit_mixed
@@ -348,3 +349,13 @@ def test_slopes_of_participants_keep_the_level_that_intercepts_exceed():
     # Of 400 tests of nothing, 20 with an SD of 4.4 are expected.
     assert shares[0] > 0.08
     assert shares[1] == pytest.approx(0.05, abs=0.025)
+
+
+def test_second_derivatives_of_a_quadratic_function_are_its_matrix():
+    matrix = np.array([[2.0, -1.0, 0.5], [-1.0, 3.0, 0.7], [0.5, 0.7, -4.0]])
+    at = np.array([[0.3, -0.2, 1.0], [2.0, 0.1, -0.4]])
+
+    def value(point):
+        return np.einsum("pi,ij,pj->p", point, matrix, point) / 2 + point @ [5.0, 1.0, -2.0]
+
+    np.testing.assert_allclose(random_slope._second(value, at), [matrix, matrix], atol=1e-7)
