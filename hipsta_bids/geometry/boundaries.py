@@ -197,8 +197,8 @@ def _local_mean(at: Float, points: Float, vectors: Float, weight: Float, sd: flo
     distance, near = (np.asarray(part) for part in cKDTree(points).query(at, k=count))
     distance, near = distance.reshape(len(at), -1), near.reshape(len(at), -1)
     # Relative to the nearest: far from all of them, none would count.
-    share = weight[near] * np.exp(-0.5 * (distance**2 - distance[:, :1] ** 2) / sd**2)
-    return np.asarray(np.einsum("mk,mkd->md", share, vectors[near]))
+    share = weight.take(near) * np.exp(-0.5 * (distance**2 - distance[:, :1] ** 2) / sd**2)
+    return np.asarray(np.einsum("mk,mkd->md", share, vectors.take(near, axis=0)))
 
 
 class LocalMean:
@@ -219,7 +219,7 @@ class LocalMean:
         low, high = points.min(axis=0), points.max(axis=0)
         half = np.ceil((high - low) / 2 / step).astype(int) + 6
         self._low, self._shape = 0.5 * (high + low) - half * step, 2 * half + 1
-        centers = sum(points[corner] for corner in laplace.cells.T) / 4
+        centers = points.take(laplace.cells.T, axis=0).mean(axis=0)
         node = np.rint((centers - self._low) / step).astype(np.intp)
         self._node = np.ravel_multi_index(tuple(node.T), tuple(self._shape))
 

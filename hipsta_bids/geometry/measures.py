@@ -331,8 +331,8 @@ def subfield_areas(whole: Sheet, body: Body) -> dict[Tissue, float]:
 
 def subfield_volumes(mesh: TetMesh, body: Body) -> dict[Tissue, float]:
     """Volume in each subfield between the end planes, mm3."""
-    centers = mesh.vertices[mesh.tetrahedra.T].mean(axis=0)
-    depth = body.ends.depth(mesh.vertices)[mesh.tetrahedra.T]
+    centers = mesh.vertices.take(mesh.tetrahedra.T, axis=0).mean(axis=0)
+    depth = body.ends.depth(mesh.vertices).take(mesh.tetrahedra.T)
     between = np.maximum(depth, 0).sum(axis=0) / np.maximum(np.abs(depth).sum(axis=0), 1e-12)
     return _sums(labels_at(centers, body), between * tetra_volumes(mesh.vertices, mesh.tetrahedra))
 

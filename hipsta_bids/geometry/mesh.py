@@ -74,13 +74,13 @@ def close_gaps(faces: Int, count: int) -> Int:
 
 def signed_volume(vertices: Float, triangles: Int) -> float:
     """Volume enclosed by outward triangles, mm3."""
-    a, b, c = (vertices[triangles[:, k]] for k in range(3))
+    a, b, c = (vertices.take(triangles[:, k], axis=0) for k in range(3))
     return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
 
 
 def triangle_areas(vertices: Float, triangles: Int) -> Float:
     """Areas of triangles, (F,), mm2."""
-    a, b, c = (vertices[triangles[:, k]] for k in range(3))
+    a, b, c = (vertices.take(triangles[:, k], axis=0) for k in range(3))
     return np.asarray(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1))
 
 
@@ -265,7 +265,8 @@ def _sharpest_fold(surface: Surface) -> Float:
 
 def tetra_volumes(vertices: Float, tetrahedra: Int) -> Float:
     """Signed volumes of tetrahedra, (T,), mm3."""
-    corners = vertices.T[:, tetrahedra.T]  # coordinates are next to each other: half the time
+    # Coordinates are next to each other; `take` needs a quarter of the time of an index.
+    corners = vertices.T.take(tetrahedra.T, axis=1)
     (ax, bx, cx), (ay, by, cy), (az, bz, cz) = corners[:, 1:] - corners[:, :1]
     return np.asarray(
         (ax * (by * cz - bz * cy) + ay * (bz * cx - bx * cz) + az * (bx * cy - by * cx)) / 6
@@ -288,7 +289,7 @@ def tetra_quality(mesh: TetMesh) -> Float:
 
     Liu & Joe 1994, BIT 34:268-287: 12 (3 volume)^(2/3) / sum of squared edge lengths.
     """
-    corners = np.moveaxis(mesh.vertices.T[:, mesh.tetrahedra.T], 1, 0)
+    corners = np.moveaxis(mesh.vertices.T.take(mesh.tetrahedra.T, axis=1), 1, 0)
     squares = sum(((b - a) ** 2).sum(axis=0) for a, b in combinations(corners, 2))
     volume = tetra_volumes(mesh.vertices, mesh.tetrahedra)
     return np.asarray(12 * np.cbrt(3 * volume) ** 2 / squares)

@@ -9,7 +9,7 @@ import numpy as np
 
 from hipsta_bids.geometry import checks
 from hipsta_bids.geometry.body import Body
-from hipsta_bids.geometry.columns import find_walls
+from hipsta_bids.geometry.columns import ends_inside
 from hipsta_bids.geometry.grid import before_mending
 from hipsta_bids.geometry.measures import column_area, measure_thickness
 from hipsta_bids.geometry.topology import SolidField, repaired_columns
@@ -42,8 +42,9 @@ def repair_metrics(sheet: Sheet, solid: SolidField, repaired: Bool, body: Body) 
     kinds = [repair.kind for repair in solid.repairs] + ["uncus"] * bool(len(body.uncus))
     area, change = column_area(sheet), 0.0
     if repaired.any():
-        walls = find_walls(sheet, np.eye(4), before_mending(solid.before)).raw
-        change = np.nansum((area * (walls[..., 0] - walls[..., 1]))[repaired]) / np.nansum(area)
+        columns = Sheet(points=sheet.points[repaired][None], valid=sheet.valid[repaired][None])
+        walls = ends_inside(columns, np.eye(4), before_mending(solid.before))[0]
+        change = np.nansum(area[repaired] * (walls[:, 0] - walls[:, 1])) / np.nansum(area)
     return {
         "repair_kinds": dict(Counter(kinds)),
         "repaired_fraction": float(repaired.mean()),

@@ -231,7 +231,7 @@ def moves_between(first: Float, second: Float, points: Float) -> Float:
     gap, nearest = cKDTree(0.5 * (first + second)).query(points, k=_NEIGHBORS)
     weight = 1 / (np.asarray(gap) ** 2 + 0.25)  # within half a pixel all nodes count about the same
     weight /= np.sum(weight, axis=1, keepdims=True)
-    return np.asarray(np.einsum("nk,nkd->nd", weight, (second - first)[nearest]))
+    return np.asarray(np.einsum("nk,nkd->nd", weight, (second - first).take(nearest, axis=0)))
 
 
 def keep_whole(outline: Float, nodes: Float, pixel: float) -> None:

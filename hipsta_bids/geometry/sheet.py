@@ -160,7 +160,7 @@ def _invert(mesh: TetMesh, values: Float, axes: tuple[Float, Float, Float]) -> F
     first = np.array([axis[0] for axis in axes])
     step = np.array([(axis[-1] - axis[0]) / (len(axis) - 1) for axis in axes])
     nodes = (values - first) / step
-    corners = nodes[mesh.tetrahedra.T]
+    corners = nodes.take(mesh.tetrahedra.T, axis=0)
     slack = 1e-6  # nodes on the outer faces must not fall out by rounding
     low = np.maximum(np.ceil(corners.min(axis=0) - slack), 0).astype(int)
     high = np.minimum(np.floor(corners.max(axis=0) + slack), np.array(shape) - 1).astype(int)
@@ -178,7 +178,7 @@ def _invert(mesh: TetMesh, values: Float, axes: tuple[Float, Float, Float]) -> F
         ]
     )
     node += low[cell]
-    weights, regular = _barycentric(corners[:, cell], node.astype(float))
+    weights, regular = _barycentric(corners.take(cell, axis=1), node.astype(float))
     worst = np.where(regular, weights.min(axis=0), -np.inf)
     flat = np.ravel_multi_index(tuple(node.T), shape)
     inside = worst > -1e-3  # noqa: PLR2004 -- a thousandth of a tetrahedron bridges rounding gaps
@@ -208,9 +208,11 @@ def _barycentric(corners: Float, points: Float) -> tuple[Float, Bool]:
 
 def coordinates_at(mesh: TetMesh, coordinates: Coordinates, points: Float) -> Float:
     """Coordinates (N, 3) of points (N, 3), RAS mm; NaN outside of the mesh."""
-    corners = mesh.vertices[mesh.tetrahedra.T]
+    corners = mesh.vertices.take(mesh.tetrahedra.T, axis=0)
     near = np.asarray(cKDTree(corners.mean(axis=0)).query(points, k=_CANDIDATES)[1])
-    weights, regular = _barycentric(corners[:, near.ravel()], points.repeat(_CANDIDATES, axis=0))
+    weights, regular = _barycentric(
+        corners.take(near.ravel(), axis=1), points.repeat(_CANDIDATES, axis=0)
+    )
     worst = np.where(regular, weights.min(axis=0), -np.inf).reshape(near.shape)
     best = np.arange(len(points)), worst.argmax(axis=1)
     weights = weights.reshape(4, *near.shape)[:, *best]

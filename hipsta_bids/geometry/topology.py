@@ -418,7 +418,7 @@ def repaired_columns(sheet: Sheet, solid: SolidField) -> Bool:
     defined = np.isfinite(dense).all(axis=-1)
     # A balanced tree takes longer to make than it saves.
     tree = cKDTree(dense[defined], balanced_tree=False, compact_nodes=False)
-    hit = np.unique(np.concatenate(tree.query_ball_point(nodes, radii)).astype(np.intp))
+    hit = np.concatenate(tree.query_ball_point(nodes, radii)).astype(np.intp)
     owner = candidates[np.nonzero(defined)[0][hit]]
     marked[tuple(owner.T)] = True
     return marked

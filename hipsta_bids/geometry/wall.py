@@ -180,7 +180,7 @@ def _one_piece(triangles: Int) -> Int:
 
 def vertex_normals(vertices: Float, triangles: Int) -> Float:
     """(V, 3) unit normals, weighted by area."""
-    a, b, c = (vertices[triangles[:, k]] for k in range(3))
+    a, b, c = (vertices.take(triangles[:, k], axis=0) for k in range(3))
     faces = np.repeat(np.cross(b - a, c - a), 3, axis=0)
     index = triangles.ravel()
     total = np.stack([np.bincount(index, column, len(vertices)) for column in faces.T], 1)
