@@ -35,9 +35,8 @@ _SVG_TAG = re.compile(rb"<svg[^>]*>")
 #: Style of drawings in a dark page. Lines on maps stay as they are: colors are behind them.
 _DARK = b"""<style>@media (prefers-color-scheme: dark) {
 text { fill: #e4e7ea } text[style*="fill: #4c4c4c"] { fill: #a7b0ba !important }
-text[style*="stroke: #ffffff"] { stroke: #15191d !important }
 [style*="fill: #ffffff"] { fill: #15191d !important }
-:is([id="axes"], [id^="matplotlib.axis"], [id^="patch"], [id^="figure"] > [id^="line2d"])
+:is([id^="matplotlib.axis"], [id^="patch"], [id^="figure"] > [id^="line2d"])
 [style*="stroke: #000000"] { stroke: #e4e7ea !important } }</style>"""
 
 SHADES = 128

@@ -26,7 +26,10 @@ _PATTERN = (
     '"rotate(45)"><path d="{}" stroke="#000" stroke-width="1.6"/></pattern>'
 )
 _HATCHES = _PATTERN.format("doubtful", "M0 0V4.2") + _PATTERN.format("filled", "M0 0V4.2M0 0H4.2")
-_HEAD = f"<style>text {{ font: 10px sans-serif }}</style><defs>{_HATCHES}</defs>"
+_STYLE = """text { font: 10px sans-serif }
+@media (prefers-color-scheme: dark) { #axes path { stroke: #e4e7ea !important }
+text[style*="stroke: #ffffff"] { stroke: #15191d !important } }"""
+_HEAD = f"<style>{_STYLE}</style><defs>{_HATCHES}</defs>"
 #: Names on maps.
 _NAME = "font-size: 9px; paint-order: stroke; stroke: #ffffff; stroke-width: 3px"
 _PIXELS = 8  # per column, so that its edges are sharp
