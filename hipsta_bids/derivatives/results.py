@@ -179,7 +179,8 @@ def _columns_by_arrow(
     import pyarrow as pa  # noqa: PLC0415  (slow to load)
     from pyarrow import csv  # noqa: PLC0415  (likewise)
 
-    types = dict.fromkeys(numbers, pa.float64()) | dict.fromkeys(words, pa.string())
+    types = dict.fromkeys(NODES, pa.int64()) | dict.fromkeys(numbers, pa.float64())
+    types |= dict.fromkeys(words, pa.dictionary(pa.int32(), pa.string()))
     table = csv.read_csv(
         pa.BufferReader(content),
         read_options=csv.ReadOptions(use_threads=False),
@@ -191,9 +192,20 @@ def _columns_by_arrow(
             strings_can_be_null=True,
         ),
     )
-    columns = [table.column(name) for name in (*NODES, *numbers)]
-    columns += [table.column(name).fill_null("") for name in words]
-    return [column.to_numpy() for column in columns]
+    columns = []
+    for name in (*NODES, *numbers, *words):  # pyarrow's to_numpy and fill_null would load pandas
+        column = table.column(name).combine_chunks()
+        is_word = name in words
+        validity, buffer = (column.indices if is_word else column).buffers()
+        kind = "i4" if is_word else "i8" if name in NODES else "f8"
+        values = np.frombuffer(buffer, kind, len(column))
+        if column.null_count:
+            bits = np.unpackbits(np.frombuffer(validity, np.uint8), bitorder="little")
+            values = np.where(bits[: len(values)] == 1, values, -1 if is_word else np.nan)
+        if is_word:
+            values = np.array([*column.dictionary.to_pylist(), ""], dtype=object)[values]
+        columns.append(values)
+    return columns
 
 
 def _columns_by_pandas(

@@ -7,6 +7,7 @@ import shutil
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -220,6 +221,7 @@ def p_ticks(level: float, top: float) -> list[tuple[float, str]]:
     return ticks
 
 
+@cache
 def colors_of(name: str, n: int = 64) -> NDArray[np.str_]:
     """List the colors of one of matplotlib's color maps as ``#rrggbb``."""
     with separate_settings():
