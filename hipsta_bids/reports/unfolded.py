@@ -261,7 +261,8 @@ def draw_profiles(
     bands = [np.nanpercentile(values, [5, 95], axis=1) for values in values_of]
     # Columns next to the edges of the sheet may be far off; they must not squeeze the rest.
     low, high = np.nanpercentile(np.concatenate(bands), [3, 97]).tolist()
-    y = low - 0.15 * (high - low), high + 0.2 * (high - low)
+    spread = max(high - low, 1e-6)  # a map may have one value only
+    y = low - 0.15 * spread, high + 0.2 * spread
     axes = _Axes(left=48, top=16, width=346, height=152, x=(0, 100), y=y)
     lines = axes.rule(0.0, _LINE.replace("#000000", "#999") + "0.7") if kind.centered else ""
     legend = []

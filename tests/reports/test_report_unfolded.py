@@ -68,3 +68,12 @@ def test_names_are_escaped_and_rows_without_a_value_leave_a_gap(out):
     assert "<b>" in [text.text for text in root.iterfind(".//{*}text")]
     mean = next(p for p in root.iterfind(".//{*}path") if "stroke-width: 1.5" in p.get("style", ""))
     assert [len(re.findall("[ML]", part)) for part in mean.get("d").split("M")[1:]] == [2, 36]
+
+
+def test_a_map_of_one_value_has_a_profile(out):
+    hemisphere = next(find_results(out, "01"))
+    sheet = hemisphere.sheet
+    columns = {**sheet.columns, "thickness": np.full(sheet.shape, 2.0)}
+    hemisphere.__dict__["sheet"] = replace(sheet, columns=columns)
+    picture = unfolded.draw_profiles(THICKNESS, [hemisphere], {})
+    assert b"nan" not in picture.content
