@@ -2,21 +2,21 @@
 
 import argparse
 import os
+import statistics
 import subprocess
 import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-from discovery import write_stubs
-from group import write_study
 from report import print_table, write_report
 
 ROOT = Path(__file__).resolve().parents[1]
 COMMAND = ("-m", "hipsta_bids.cli.main")
-FIND = """import sys, pathlib, hipsta_bids.inputs.search as s
-s.find_inputs(s.InputRequest(bids_dir=pathlib.Path(sys.argv[1])))"""
+PATHS = "import sys, pathlib; a, *b = map(pathlib.Path, sys.argv[1:]); "
+FIND = f"{PATHS}import hipsta_bids.inputs.search as s; s.find_inputs(s.InputRequest(bids_dir=a))"
+STUBS = f"{PATHS}import discovery; discovery.write_stubs(a, int(str(b[0])))"
+STUDY = f"{PATHS}import group; group.write_study(a, b[0], int(str(b[1])))"
 N_SUBJECTS, TURNS = 10_000, 3
 
 
@@ -24,16 +24,16 @@ def list_commands(work: Path, options: argparse.Namespace) -> dict[str, tuple[st
     """Prepare data in ``work``; return arguments of Python by title. ``OUT`` is a new folder."""
     phantoms, stubs = work / "phantoms", work / "stubs"
     run(ROOT, (*COMMAND, "phantom", str(phantoms), "--n-subjects", "2"))
-    write_stubs(stubs, N_SUBJECTS)
+    run(ROOT, ("-c", STUBS, str(stubs), str(N_SUBJECTS)))
     measure = (*COMMAND, str(phantoms), "OUT", "participant")
     commands = {"start": (*COMMAND, "--version"), "first run": measure, "phantoms": measure}
     if options.bids_dir:
         commands["BIDS_DIR"] = (*COMMAND, str(options.bids_dir.resolve()), "OUT", "participant")
     commands[f"find {N_SUBJECTS} x 2"] = ("-c", FIND, str(stubs))
     for size in options.sizes:
-        study = work / f"study-{size}"
-        write_study(study / "bids", study / "out", size)
-        commands[f"group {size}"] = (*COMMAND, str(study / "bids"), str(study / "out"), "group")
+        study = f"{work}/bids-{size}", f"{work}/results-{size}"
+        run(ROOT, ("-c", STUDY, *study, str(size)))
+        commands[f"group {size}"] = (*COMMAND, *study, "group")
     return commands
 
 
@@ -41,7 +41,7 @@ def run(tree: Path, arguments: Sequence[str], *, compile_all: bool = False) -> t
     """Run Python in a checkout; return CPU time of all its processes, s, and peak memory, MB."""
     with tempfile.TemporaryDirectory() as folder:
         command = [sys.executable, *(a.replace("OUT", f"{folder}/out") for a in arguments)]
-        environment = os.environ | {"PYTHONPATH": str(tree), "PYTHONDONTWRITEBYTECODE": ""}
+        environment = os.environ | {"PYTHONPATH": f"{tree}:{tree}/benchmarks"}
         environment |= {"PYTHONPYCACHEPREFIX": f"{folder}/compiled"} if compile_all else {}
         process = subprocess.Popen(command, stdout=subprocess.DEVNULL, cwd=tree, env=environment)  # noqa: S603
         _, process.returncode, used = os.wait4(process.pid, 0)
@@ -56,18 +56,20 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--sizes", type=int, nargs="*", default=(40, 500), metavar="N")
     parser.add_argument("--json", type=Path, metavar="FILE")
     options = parser.parse_args(arguments)
-    rows: dict[str, list[float]] = {}
+    rows = dict[str, list[float]]()
     with tempfile.TemporaryDirectory() as folder:
         commands, before = list_commands(Path(folder), options), Path(folder) / "baseline"
         worktree = ("git", "-C", str(ROOT), "worktree")
         subprocess.run([*worktree, "add", "-q", "--detach", before, options.baseline], check=True)  # noqa: S603
         try:
             for title, command in commands.items():
-                trees, is_fresh = (before, ROOT) * TURNS, title == "first run"
-                costs = [run(tree, command, compile_all=is_fresh) for tree in trees]
-                cpu, memory = np.reshape(costs, (-1, 2, 2)).transpose(2, 0, 1)
-                ratio = np.median(cpu[:, 1] / cpu[:, 0])
-                rows[title] = [*np.median(cpu, axis=0), ratio, *memory.max(axis=0)]
+                fresh, trees = title == "first run", (before, ROOT)
+                turns = [
+                    [run(tree, command, compile_all=fresh) for tree in trees] for _ in range(TURNS)
+                ]
+                cpu, memory = ([[pair[n][k] for pair in turns] for n in (0, 1)] for k in (0, 1))
+                ratio = statistics.median(now / earlier for earlier, now in zip(*cpu, strict=True))
+                rows[title] = [*map(statistics.median, cpu), ratio, *map(max, memory)]
         finally:
             subprocess.run([*worktree, "remove", "--force", before], check=True)  # noqa: S603
     print_table(["CPU s, MB", "before", "now", "ratio", "MB before", "MB now"], rows)
