@@ -7,7 +7,7 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat, model_validator
 
 from hipsta_bids.errors import SettingsError
 from hipsta_bids.group.settings import GroupSettings
-from hipsta_bids.protocols.toml import flatten, resolve, settings_hash, settings_toml
+from hipsta_bids.protocols.toml import flatten, read_meanings, resolve, settings_hash, settings_toml
 from hipsta_bids.settings import Settings, load_settings
 from hipsta_bids.types.tables import Numbers, Odd, SettingsTable, settings_from
 
@@ -157,8 +157,9 @@ def test_flat_names():
 @pytest.mark.parametrize("settings", [Settings(), GroupSettings()])
 def test_every_setting_has_a_meaning_and_refuses_what_is_no_number(settings):
     for group, values in settings:
+        meanings = read_meanings(type(values))
         for name, field in type(values).model_fields.items():
-            assert field.description, name
+            assert meanings[name], name
             if field.annotation is float:
                 with pytest.raises(SettingsError, match=f"{name} is nan"):
                     settings.changed(**{group: {name: float("nan")}})

@@ -27,6 +27,7 @@ from hipsta_bids.geometry.catalog import MAPS, PER_SUBFIELD, SECTIONS, SUMMARY, 
 from hipsta_bids.group.output.tables import COLUMNS, read_columns
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.joints import find_extensions, is_present, load
+from hipsta_bids.protocols.toml import read_meanings
 from hipsta_bids.reports.page import read_table
 from hipsta_bids.settings import Settings
 
@@ -272,9 +273,10 @@ def _settings(
     """Name settings with default and meaning; settings with the same texts share a row."""
     names: dict[tuple[str, str], list[str]] = {}
     for stage, values in settings:
-        for name, field in type(values).model_fields.items():
+        meanings = read_meanings(type(values))
+        for name in type(values).model_fields:
             if listed(stage, name):
-                texts = json.dumps(getattr(values, name)), _words(field.description)
+                texts = json.dumps(getattr(values, name)), _words(meanings[name])
                 names.setdefault(texts, []).append(f"`{stage}.{name}`")
     return ((", ".join(rows), f"`{value}`", words) for (value, words), rows in names.items())
 

@@ -5,6 +5,7 @@
 
 import io
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -27,7 +28,7 @@ from hipsta_bids.derivatives.names import (
 from hipsta_bids.errors import InputError
 from hipsta_bids.geometry.catalog import MAPS
 from hipsta_bids.io import files
-from hipsta_bids.opening import open_regular
+from hipsta_bids.opening import TABLE, read_bounded
 
 #: Columns of the tables that are no measures: definition and unit.
 NODES, POSITION, STATE = (TABLES[name] for name in ("nodes", "position", "state"))
@@ -127,13 +128,11 @@ def read_sheet(
     are read; without ``shape`` the last row has the number of nodes.
     """
     try:
-        with open_regular(path) as file:
-            content = file.read()
+        content = read_bounded(path, TABLE)
         if numbers is None:
             columns = content.partition(b"\n")[0].decode().rstrip("\r").split("\t")
             numbers = [name for name in columns if name not in {*NODES, *STATE}]
-        read = _columns_by_arrow if find_spec("pyarrow") else _columns_by_pandas
-        x, y, *values = read(content, numbers, words)
+        x, y, *values = _columns(content, numbers, words)
         nx, ny = shape or (int(x[-1]), int(y[-1]))
     except (OSError, ValueError, KeyError, IndexError) as error:  # pyarrow's are among these
         first = str(error).partition("\n")[0]
@@ -148,19 +147,42 @@ def read_sheet(
     return {name: column.reshape(nx, ny) for name, column in zip(names, values, strict=True)}
 
 
+def read_alike(
+    paths: Sequence[Path], numbers: Sequence[str], words: Sequence[str], shape: tuple[int, int]
+) -> dict[str, NDArray[Any]]:
+    """Read columns of tables of one shape as (tables, Nx, Ny) arrays, in half of the time."""
+    with suppress(OSError, ValueError, KeyError):
+        contents = [read_bounded(path, TABLE) for path in paths]
+        header = contents[0][: contents[0].index(b"\n") + 1]
+        if all(content.startswith(header) for content in contents):
+            rows = b"".join(content[len(header) :] for content in contents)
+            x, y, *values = _columns(header + rows, numbers, words)
+            expected = np.divmod(np.arange(shape[0] * shape[1]), shape[1])
+            nodes = np.stack([x, y], axis=-1).reshape(len(paths), -1, 2) - 1
+            if (nodes == np.stack(expected, axis=-1)).all():
+                names = (*numbers, *words)
+                return {n: v.reshape(-1, *shape) for n, v in zip(names, values, strict=True)}
+    tables = [read_sheet(path, numbers, words, shape) for path in paths]
+    return {name: np.stack([table[name] for table in tables]) for name in tables[0]}
+
+
+def _columns(content: bytes, numbers: Sequence[str], words: Sequence[str]) -> list[NDArray[Any]]:
+    """Read node numbers, numbers and words of a table."""
+    read = _columns_by_arrow if find_spec("pyarrow") else _columns_by_pandas
+    return read(content, numbers, words)
+
+
 def _columns_by_arrow(
     content: bytes, numbers: Sequence[str], words: Sequence[str]
 ) -> list[NDArray[Any]]:
-    """Read node numbers, numbers and words of a table with pyarrow, an optional extra.
-
-    It gets no path: it cannot open one whose bytes are not of the locale.
-    """
+    """Read node numbers, numbers and words of a table with pyarrow, an optional extra."""
     import pyarrow as pa  # noqa: PLC0415  (slow to load)
     from pyarrow import csv  # noqa: PLC0415  (likewise)
 
-    types = dict.fromkeys(numbers, pa.float64()) | dict.fromkeys(words, pa.string())
+    types = dict.fromkeys(NODES, pa.int64()) | dict.fromkeys(numbers, pa.float64())
+    types |= dict.fromkeys(words, pa.dictionary(pa.int32(), pa.string()))
     table = csv.read_csv(
-        io.BytesIO(content),
+        pa.BufferReader(content),
         read_options=csv.ReadOptions(use_threads=False),
         parse_options=csv.ParseOptions(delimiter="\t"),
         convert_options=csv.ConvertOptions(
@@ -170,9 +192,20 @@ def _columns_by_arrow(
             strings_can_be_null=True,
         ),
     )
-    columns = [table.column(name) for name in (*NODES, *numbers)]
-    columns += [table.column(name).fill_null("") for name in words]
-    return [column.to_numpy() for column in columns]
+    columns = []
+    for name in (*NODES, *numbers, *words):  # pyarrow's to_numpy and fill_null would load pandas
+        column = table.column(name).combine_chunks()
+        is_word = name in words
+        validity, buffer = (column.indices if is_word else column).buffers()
+        kind = "i4" if is_word else "i8" if name in NODES else "f8"
+        values = np.frombuffer(buffer, kind, len(column))
+        if column.null_count:
+            bits = np.unpackbits(np.frombuffer(validity, np.uint8), bitorder="little")
+            values = np.where(bits[: len(values)] == 1, values, -1 if is_word else np.nan)
+        if is_word:
+            values = np.array([*column.dictionary.to_pylist(), ""], dtype=object)[values]
+        columns.append(values)
+    return columns
 
 
 def _columns_by_pandas(

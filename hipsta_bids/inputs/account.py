@@ -148,15 +148,16 @@ def unused_of_visit(
     top = root / visit.folders[0].path.relative_to(root).parts[0]
     entry_of = partial(tree.Ignored, subject=visit.subject, session=visit.session, inside=top)
     used_paths = {
-        path for item in items for path in (*item.files, *map(item.path_of, dict(item.passed_over)))
+        str(path)
+        for item in items
+        for path in (*item.files, *map(item.path_of, dict(item.passed_over)))
     }
     n_other = sum(len(folder.names) for folder in visit.folders) - len(used_paths)
     has_labels = bool(items)
     for folder in visit.folders:
         for name in filter(layout_of, folder.names):
-            path = folder.path / name
-            if path not in used_paths:
-                has_labels = True
+            if os.path.join(folder.path, name) not in used_paths:  # noqa: PTH118 (many of them)
+                path, has_labels = folder.path / name, True
                 reason, quiet = _why_not(path, context)
                 yield entry_of(path=path, reason=reason, quiet=quiet)
         for name in folder.inner:

@@ -43,7 +43,7 @@ _MISSING = re.compile(
     r"|stated|tested)|prefernotto(answer|say)|desconocido|inconnu|keineangabe|unbekannt)?"
 )
 #: A cell as R writes text.
-_QUOTED = re.compile(r'\s*"([^"]*)"\s*')
+_QUOTED = re.compile(r'^\s*"([^"]*)"\s*$')
 _SIGNS = re.compile(r"[\s?!.*/\\|()\[\]_\u2010-\u2015\u2026\u2212-]+")
 
 _DEEPEST = 100  # lists and objects within each other in JSON
@@ -240,7 +240,8 @@ def read_json(path: Path, limit: float = opening.TABLE) -> dict[str, Any]:
     try:
         text = opening.read_text(path, limit)
         value = json.loads(text)
-        _check_depth(value)
+        if text.count("{") + text.count("[") > _DEEPEST:
+            _check_depth(value)
         if _HALF_LETTERS in text.lower():  # can be read, but not be written
             json.dumps(value, ensure_ascii=False).encode()
     except FileNotFoundError as error:
@@ -281,10 +282,9 @@ def write_tsv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[str]])
 def read_tsv(path: Path) -> list[dict[str, str]]:
     """Read a BIDS table as text cells."""
     text = _read_table_text(path)
-    lines = [
-        [(match[1] if (match := _QUOTED.fullmatch(cell)) else cell) for cell in line.split("\t")]
-        for line in re.split(r"\r\n?|\n", text)
-    ]
+    lines = [line.split("\t") for line in text.split("\n")]
+    if '"' in text:
+        lines = [[_QUOTED.sub(r"\1", cell) for cell in cells] for cells in lines]
     rows = [(number, cells) for number, cells in enumerate(lines, 1) if any(map(str.strip, cells))]
     header = [name.strip() for name in _shortened(rows[0][1], 0)] if rows else []
     size = len(header)

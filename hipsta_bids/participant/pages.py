@@ -162,9 +162,9 @@ def _start(page: Path) -> str:
 def warm_up() -> None:
     """Load the libraries, so that no page's time includes it."""
     import hipsta_bids.reports.participant  # noqa: F401, PLC0415  (loaded in workers only)
-    from hipsta_bids.reports.maps import new_figure  # noqa: PLC0415
+    from hipsta_bids.reports.display import THICKNESS, colors_of  # noqa: PLC0415
 
-    new_figure((1.0, 1.0), "constrained")
+    colors_of(THICKNESS.colors)
 
 
 def _page_name(visit: VisitKey | None) -> str:

@@ -1,11 +1,13 @@
 """Settings as TOML files: reading, printing, hashing."""
 
+import ast
 import hashlib
 import inspect
 import json
 import textwrap
 import tomllib
 from collections.abc import Iterator, Mapping
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +15,7 @@ from pydantic import BaseModel
 
 from hipsta_bids import opening
 from hipsta_bids.errors import MissingSettingsError, SettingsError
-from hipsta_bids.types.tables import Table, settings_from
+from hipsta_bids.types.tables import Table, TomlTable, settings_from
 
 _LINE = 96
 
@@ -68,18 +70,30 @@ def _toml_lines(group: BaseModel, prefix: str) -> Iterator[str]:
     yield from _comment(inspect.getdoc(type(group)))
     if prefix:
         yield f"[{prefix.rstrip('.')}]"
-    nested = []
-    for name, entry in type(group).model_fields.items():
+    nested, meanings = [], read_meanings(type(group))
+    for name in type(group).model_fields:
         value = getattr(group, name)
         if isinstance(value, BaseModel):
             nested.append((name, value))
             continue
-        yield from _comment(entry.description)
+        yield from _comment(meanings.get(name))
         # TOML writes numbers, booleans, basic strings and lists as JSON does.
         yield f"{name} = {json.dumps(value)}"
     for name, table in nested:
         yield ""
         yield from _toml_lines(table, f"{prefix}{name}.")
+
+
+def read_meanings(kind: type[BaseModel]) -> dict[str, str]:
+    """Read the docstrings of fields, by name, from the source of a class and its bases."""
+    meanings: dict[str, str] = {}
+    for base in reversed(kind.__mro__):
+        if issubclass(base, TomlTable):
+            (definition,) = ast.parse(inspect.getsource(base)).body
+            for field, text in pairwise(definition.body):  # type: ignore[attr-defined]  # a class
+                if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr):
+                    meanings[ast.unparse(field.target)] = ast.literal_eval(text.value)
+    return meanings
 
 
 def _comment(text: str | None) -> list[str]:

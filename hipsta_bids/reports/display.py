@@ -1,12 +1,18 @@
 """How values look, the same on all pages and figures: color scales, palettes, and orientation."""
 
-from collections.abc import Sequence
+import atexit
+import contextlib
+import os
+import shutil
+import sys
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 
+from hipsta_bids.io.files import scratch_folder
 from hipsta_bids.protocols.protocol import Part, Protocol
 from hipsta_bids.types import HATCHED_FROM, Float
 
@@ -32,6 +38,9 @@ HEMISPHERE_COLORS = {"L": COLORS[0], "R": COLORS[1]}
 EFFECT_COLORS, P_COLORS, DESIGN_COLORS = "RdBu_r", "PuOr_r", "cividis"
 #: Of effects and significance that have no sign.
 _UNSIGNED = "Reds", "Oranges"
+
+#: What a user may have in the environment that would change figures.
+_PREFERENCES = ("MPLBACKEND", "MATPLOTLIBRC")
 
 _EFFECTS = 99.0  # percentile of sizes that the colors of effects span
 _LEVEL = 0.05
@@ -93,6 +102,27 @@ _CHANGE = MapKind(
 )
 
 
+@contextlib.contextmanager
+def separate_settings() -> Iterator[None]:
+    """Let matplotlib load with a temporary folder, which is removed when this process ends.
+
+    It keeps a list of fonts in the user's home, which may be missing or read-only in containers
+    and on clusters, and would read that user's preferences there.
+    """
+    if "matplotlib" in sys.modules:
+        yield
+        return
+    folder = str(scratch_folder("fonts"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    before = {name: os.environ.pop(name, None) for name in (*_PREFERENCES, "MPLCONFIGDIR")}
+    os.environ["MPLCONFIGDIR"] = folder
+    try:
+        yield
+    finally:
+        del os.environ["MPLCONFIGDIR"]
+        os.environ.update({name: value for name, value in before.items() if value is not None})
+
+
 def kind_of(measure: str, *, change: bool = False) -> MapKind:
     """Choose how a measure of the group level is shown: as on the pages of participants.
 
@@ -148,6 +178,8 @@ class Effects:
         ready = np.isfinite(self.sizes) & np.isfinite(self.statistic) & (self.statistic != 0)
         if not ready.any():
             return 0.0
+        from scipy import stats  # noqa: PLC0415  (slow to load)
+
         df = float(np.median(np.broadcast_to(self.df, ready.shape)[ready]))
         t = float(stats.t.isf(_LEVEL / ready.sum() / 2, df))
         if self.kind == "F":
@@ -189,10 +221,12 @@ def p_ticks(level: float, top: float) -> list[tuple[float, str]]:
     return ticks
 
 
+@cache
 def colors_of(name: str, n: int = 64) -> NDArray[np.str_]:
     """List the colors of one of matplotlib's color maps as ``#rrggbb``."""
-    from matplotlib import colormaps  # noqa: PLC0415  (slow to load)
-    from matplotlib.colors import to_hex  # noqa: PLC0415
+    with separate_settings():
+        from matplotlib import colormaps  # noqa: PLC0415  (slow to load)
+        from matplotlib.colors import to_hex  # noqa: PLC0415
 
     return np.array([to_hex(color) for color in colormaps[name](np.linspace(0, 1, n))])
 

@@ -22,7 +22,6 @@ from hipsta_bids.reports.display import (
     scale_of,
     subfield_title,
 )
-from hipsta_bids.reports.maps import draw_map, draw_profiles
 from hipsta_bids.reports.page import Section, build_sections, number, render, usual_ranges
 from hipsta_bids.reports.results import (
     SURFACES,
@@ -34,6 +33,7 @@ from hipsta_bids.reports.results import (
     read_views,
 )
 from hipsta_bids.reports.slices import stack_of
+from hipsta_bids.reports.unfolded import draw_map, draw_profiles
 from hipsta_bids.reports.verdict import of_flag
 from hipsta_bids.types import RATINGS, Decision, Float
 

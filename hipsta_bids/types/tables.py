@@ -42,9 +42,7 @@ class TomlTable(BaseModel):
     """A table of a TOML file; nothing is converted but whole numbers to floats."""
 
     # Workers get their settings pickled and need no validator: it is built where one is used.
-    model_config = ConfigDict(
-        frozen=True, extra="forbid", strict=True, use_attribute_docstrings=True, defer_build=True
-    )
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, defer_build=True)
 
 
 Table = TypeVar("Table", bound=TomlTable)

@@ -12,6 +12,7 @@ from scipy import stats
 
 from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.reports import maps as maps_module
+from hipsta_bids.reports import unfolded
 from hipsta_bids.reports.cohort import read_cohort
 from hipsta_bids.reports.display import (
     CURVATURE,
@@ -100,20 +101,16 @@ def test_maps_of_both_hemispheres_lie_alike(out, monkeypatch):
     )
     values = np.arange(12.0).reshape(4, 3)
     pictures = []
-    monkeypatch.setattr(maps_module, "_palette_png", lambda picture, _: pictures.append(picture))
+    monkeypatch.setattr(maps_module, "palette_png", lambda p, _: pictures.append(p) or "")
     maps_module.make_sprites([dict.fromkeys(("thickness", "curvature"), values)] * 2)
     tile = pictures[0][:, :4]
     np.testing.assert_array_equal(tile, pictures[0][:, 4:])
     assert tile[-1].tolist() == sorted(tile[-1].tolist())  # posterior below, medial left
-    drawn = []
-    encode = maps_module._encode
-    monkeypatch.setattr(
-        maps_module, "_encode", lambda *a, **b: drawn.append(a[0]) or encode(*a, **b)
-    )
-    maps_module.draw_map(THICKNESS, [left, right])
-    for axis in drawn[0].axes[:2]:
-        assert not axis.xaxis_inverted()
-        assert axis.get_xlabel() == "medial  ←  mm  →  lateral"
+    content = unfolded.draw_map(THICKNESS, [left, right]).content.decode()
+    assert content.count(">medial  ←  mm  →  lateral</text>") == 2
+    for hemisphere, pixels in zip((left, right), pictures[-3:], strict=False):
+        shades = maps_module.shades_of(hemisphere.sheet.columns["thickness"], (0.5, 3.0))
+        np.testing.assert_array_equal(pixels[4::8, 4::8], shades)
 
 
 @pytest.mark.parametrize("name", ["sub-01.html", "sub-02.html", "report.html"])

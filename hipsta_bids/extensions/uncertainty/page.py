@@ -5,8 +5,8 @@ from typing import Any
 
 from hipsta_bids.derivatives.results import read_sheet
 from hipsta_bids.reports.display import MapKind
-from hipsta_bids.reports.maps import draw_map
 from hipsta_bids.reports.results import Hemisphere
+from hipsta_bids.reports.unfolded import draw_map
 
 #: In phantoms it is about 0.1 mm.
 UNCERTAINTY = MapKind(

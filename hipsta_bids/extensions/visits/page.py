@@ -10,10 +10,10 @@ from hipsta_bids.derivatives.names import natural_order
 from hipsta_bids.errors import InputError
 from hipsta_bids.io import files, gifti
 from hipsta_bids.reports.display import THICKNESS, MapKind
-from hipsta_bids.reports.maps import draw_map
 from hipsta_bids.reports.page import Section
 from hipsta_bids.reports.participant import Series
 from hipsta_bids.reports.results import Hemisphere, find_results
+from hipsta_bids.reports.unfolded import draw_map
 
 #: Noise is about 0.1 mm.
 THICKNESS_CHANGE = MapKind(

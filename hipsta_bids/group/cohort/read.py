@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from hipsta_bids.derivatives.names import NAMED_TABLES
-from hipsta_bids.derivatives.results import read_sheet, read_summary, read_units
+from hipsta_bids.derivatives.results import read_alike, read_sheet, read_summary, read_units
 from hipsta_bids.errors import InputError, did_you_mean
 from hipsta_bids.geometry.catalog import MAPS, why_impossible
 from hipsta_bids.geometry.sheet import sheet_levels
@@ -37,6 +37,7 @@ LEAST_SHARE = 0.5
 #: Number of measures that a message lists.
 _MOST_NAMES = 12
 _ROWS = 1000  # of summaries that are words at once
+_TABLES = 8  # of sheets that are read at once
 
 
 def choose_measures(
@@ -237,14 +238,16 @@ def _read_side(
     sampled = [name for name in names if name not in SHEET_MAPS]
     subfield = np.empty((len(records), *shape), dtype=np.int8)
     codes: dict[str, int] = {}
-    for i, record in enumerate(records):
-        columns = read_sheet(record.result.path("sheet"), measured, ["subfield"], shape)
+    for part in blocks(len(records), _TABLES):
+        paths = [record.result.path("sheet") for record in records[part]]
+        columns = read_alike(paths, measured, ["subfield"], shape)
+        for name in measured:
+            maps[name][part] = columns[name]
+        subfield[part] = _encode(columns["subfield"], codes)
+    for i, record in enumerate(records if sampled else ()):
         for name in sampled:
             if path := _sampled_table(record, name):
-                columns |= read_sheet(path, [name], shape=shape)
-        for name in maps.keys() & columns.keys():
-            maps[name][i] = columns[name]
-        subfield[i] = _encode(columns["subfield"], codes)
+                maps[name][i] = read_sheet(path, [name], shape=shape)[name]
     summary = pd.concat(
         [
             pd.DataFrame(
