@@ -15,7 +15,6 @@ A picture of labels on an image from another space misleads, so pages show only 
   grid of voxels.
 """
 
-import gc
 import os
 import re
 from collections import Counter
@@ -30,7 +29,7 @@ from hipsta_bids.inputs.account import looked_into, unused_of_visit
 from hipsta_bids.inputs.ashs import choose_atlas
 from hipsta_bids.inputs.edits import EditedFile, attach_edits, each_once, edits_of_visit, list_edits
 from hipsta_bids.inputs.generic import forget_tables, without_side
-from hipsta_bids.inputs.layouts import LAYOUTS, atlas_finder, find, volume_table
+from hipsta_bids.inputs.layouts import LAYOUTS, Layout, atlas_finder, find, volume_table
 from hipsta_bids.inputs.probabilities import attach_probabilities
 from hipsta_bids.inputs.scan import HEMIS, HemisphereInput, InputRequest, Source
 from hipsta_bids.inputs.selection import Context, Selection, make_selection
@@ -109,14 +108,8 @@ def find_inputs(request: InputRequest) -> Findings:
     results = _Search()
     sources = scan.list_sources(request, results.unused)
     results.edited = list_edits(request, selection, results.unused)
-    was_enabled = gc.isenabled()
-    gc.disable()  # a fifth of the time, though nothing here refers to itself
-    try:
-        for source in sources:
-            _search(source, selection, option, results)
-    finally:
-        if was_enabled:
-            gc.enable()
+    for source in sources:
+        _search(source, selection, option, results)
     results.unused += _without_dataset(request, sources)
     entries = [entry for entry in results.entries(sources) if selection.misses(entry)]
     ignored = tuple(entry for entry in entries if not entry.quiet)
@@ -298,20 +291,29 @@ def _search(
     for visit in visits:
         results.edited += edits_of_visit(visit, source.path, source.name, in_dataset=True)
         visit_context = replace(context, visit=visit)
-        names = "\n".join(name for folder in visit.folders for name in folder.names)
-        fitting = [layout for layout in searched if layout.mark in names]
+        fitting = _with_mark(searched, visit)
         items = [item for layout in fitting for item in find(layout, visit_context)]
         results.unused += without_side(visit) if "named" in source.layouts else ()
         explain = visit.subject not in explained
         results.unused += unused_of_visit(visit_context, items, explain=explain)
         notes = renaming.get((visit.subject, visit.session), ())
-        for item in items:
-            problem = refused.get(item.subject) or item.problem or _not_fetched(item.files)
-            results.items.append(
-                replace(item, problem=problem, notes=(*item.notes, *notes))
-                if notes or problem is not item.problem
-                else item
-            )
+        results.items += [_noted(item, refused.get(item.subject), notes) for item in items]
+
+
+def _with_mark(layouts: Iterable[Layout], visit: tree.VisitFolders) -> list[Layout]:
+    """Return the layouts whose names of files a visit can have."""
+    names = "\n".join(name for folder in visit.folders for name in folder.names)
+    return [layout for layout in layouts if layout.mark in names]
+
+
+def _noted(
+    item: HemisphereInput, refusal: InputError | None, notes: Sequence[str]
+) -> HemisphereInput:
+    """Add notes and the first problem, if there are any."""
+    problem = refusal or item.problem or _not_fetched(item.files)
+    if problem is item.problem and not notes:
+        return item
+    return replace(item, problem=problem, notes=(*item.notes, *notes))
 
 
 def _not_fetched(paths: Sequence[Path]) -> InputError | None:

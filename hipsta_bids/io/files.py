@@ -283,8 +283,7 @@ def read_tsv(path: Path) -> list[dict[str, str]]:
     """Read a BIDS table as text cells."""
     text = _read_table_text(path)
     lines = [line.split("\t") for line in text.split("\n")]
-    if '"' in text:
-        lines = [[_QUOTED.sub(r"\1", cell) for cell in cells] for cells in lines]
+    lines = [[*map(_unquoted, cells)] for cells in lines] if '"' in text else lines
     rows = [(number, cells) for number, cells in enumerate(lines, 1) if any(map(str.strip, cells))]
     header = [name.strip() for name in _shortened(rows[0][1], 0)] if rows else []
     size = len(header)
@@ -301,6 +300,10 @@ def read_tsv(path: Path) -> list[dict[str, str]]:
             f"{path}: column {repeated[0]!r} occurs more than once; keep one", reason="bad-table"
         )
     return [dict(zip(header, cells, strict=True)) for _, cells in table]
+
+
+def _unquoted(cell: str) -> str:
+    return _QUOTED.sub(r"\1", cell)
 
 
 def _read_table_text(path: Path) -> str:

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -244,10 +245,9 @@ def _read_side(
         for name in measured:
             maps[name][part] = columns[name]
         subfield[part] = _encode(columns["subfield"], codes)
-    for i, record in enumerate(records if sampled else ()):
-        for name in sampled:
-            if path := _sampled_table(record, name):
-                maps[name][i] = read_sheet(path, [name], shape=shape)[name]
+    for i, name in product(range(len(records)), sampled):
+        if path := _sampled_table(records[i], name):
+            maps[name][i] = read_sheet(path, [name], shape=shape)[name]
     summary = pd.concat(
         [
             pd.DataFrame(
