@@ -198,10 +198,11 @@ def _columns_by_arrow(
         is_word = name in words
         validity, buffer = (column.indices if is_word else column).buffers()
         kind = "i4" if is_word else "i8" if name in NODES else "f8"
-        values = np.frombuffer(buffer, kind, len(column))
+        part = slice(column.offset, column.offset + len(column))
+        values = np.frombuffer(buffer, kind)[part]
         if column.null_count:
-            bits = np.unpackbits(np.frombuffer(validity, np.uint8), bitorder="little")
-            values = np.where(bits[: len(values)] == 1, values, -1 if is_word else np.nan)
+            bits = np.unpackbits(np.frombuffer(validity, np.uint8), bitorder="little")[part]
+            values = np.where(bits == 1, values, -1 if is_word else np.nan)
         if is_word:
             values = np.array([*column.dictionary.to_pylist(), ""], dtype=object)[values]
         columns.append(values)

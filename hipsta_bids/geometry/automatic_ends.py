@@ -115,7 +115,7 @@ def find_ends(
 
 def _jackknife_error(estimates: list[float]) -> float:
     """Compute the standard error from estimates that leave out one cue each (Tukey 1958)."""
-    return float(np.sqrt((len(estimates) - 1) * np.var(estimates)))
+    return float(np.sqrt((len(estimates) - 1) * np.var(estimates))) if estimates else 0.0
 
 
 def _no_body() -> GeometryError:

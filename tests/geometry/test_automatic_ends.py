@@ -267,7 +267,7 @@ def test_errors_of_means_that_leave_out_one_value_are_standard_errors():
     values = np.array([3.0, 4.5, -1.0, 7.0])
     means = [float(np.delete(values, left).mean()) for left in range(4)]
     assert automatic_ends._jackknife_error(means) == pytest.approx(stats.sem(values))
-    assert automatic_ends._jackknife_error(means[:1]) == 0
+    assert automatic_ends._jackknife_error(means[:1]) == automatic_ends._jackknife_error([]) == 0
 
 
 def test_levels_have_a_subfield_with_a_fifth_of_its_usual_area():
