@@ -95,10 +95,10 @@ def settle_settings(root: Path, settings: Settings) -> str:
         before = earlier.get("settings")
         recorded = flatten(before if isinstance(before, dict) else {})
         current = flatten(resolved)
-        if recorded.keys() - current.keys():
+        if former := recorded.keys() - current.keys():
             raise SettingsError(
-                f"{root}: results of version {earlier.get('version', 'unknown')} with other "
-                "settings; use a new output folder, or delete this one"
+                f"{root}: results of version {earlier.get('version', 'unknown')}, of whose settings "
+                f"{len(former)} are gone ({min(former)}, ...); use a new output folder"
             )
         keys = current if is_same_version else recorded
         changes = [
@@ -137,7 +137,8 @@ def upgrade_notes(root: Path) -> list[str]:
     if earlier in {None, __version__}:
         return []
     return [
-        f"{root}: results of version {earlier}; all hemispheres are measured again by {__version__}"
+        f"{root}: results of version {earlier}; {__version__} measures all hemispheres again,"
+        " with the same settings only"
     ]
 
 

@@ -27,7 +27,7 @@ _PATTERN = (
 )
 _HATCHES = _PATTERN.format("doubtful", "M0 0V4.2") + _PATTERN.format("filled", "M0 0V4.2M0 0H4.2")
 _STYLE = """text { font: 10px sans-serif }
-@media (prefers-color-scheme: dark) { #axes path { stroke: #e4e7ea !important }
+@media (prefers-color-scheme: dark) { .axes path { stroke: #e4e7ea !important }
 text[style*="stroke: #ffffff"] { stroke: #15191d !important } }"""
 _HEAD = f"<style>{_STYLE}</style><defs>{_HATCHES}</defs>"
 #: Names on maps.
@@ -79,7 +79,7 @@ class _Axes:
             ticks += f"M{self.left:.2f} {y:.2f}h-3.5"
             marks.append(_text(self.left - 6, y, text, "end"))
         edges = f"M{self.left:.2f} {self.top:.2f}V{low:.2f}H{right:.2f}{ticks}"
-        yield f'<g id="axes">{_path(edges, _LINE + "0.8")}</g>' + "".join(marks)
+        yield f'<g class="axes">{_path(edges, _LINE + "0.8")}</g>' + "".join(marks)
         yield _text((self.left + right) / 2, low + 25, bottom)
         yield _text(8, self.top + self.height / 2, left, turned=True)
 
@@ -249,7 +249,7 @@ def _color_bar(
         y = axes.down(value)
         outline += f"M{left + 8} {y:.2f}h3.5"
         yield _text(left + 14, y, text, "start")
-    yield f'<g id="axes">{_path(outline, _LINE + "0.8")}</g>'
+    yield f'<g class="axes">{_path(outline, _LINE + "0.8")}</g>'
     yield _text(left + 46, top + height / 2, label, turned=True)
 
 

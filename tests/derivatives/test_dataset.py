@@ -8,6 +8,7 @@ import pytest
 from stand_ins import make_scheme
 
 from hipsta_bids import __version__
+from hipsta_bids import __version__
 from hipsta_bids.derivatives import dataset
 from hipsta_bids.derivatives.dataset import COLUMNS, read_status, update_status, write_sidecar
 from hipsta_bids.derivatives.names import DATASET_FILES
@@ -76,7 +77,7 @@ def test_damaged_settings_are_other_settings(tmp_path, damage):
 def test_settings_that_are_gone_are_those_of_another_version(tmp_path):
     earlier = {"hash": "0", "version": "0.0.9", "settings": {"body": {"plane_tilt": 10.0}}}
     files.write_json(tmp_path / "desc-settings.json", earlier)
-    with pytest.raises(SettingsError, match=r"results of version 0\.0\.9.*new output folder"):
+    with pytest.raises(SettingsError, match=r"version 0\.0\.9, .* 1 are gone \(body\.plane_tilt.*new output folder"):
         dataset.settle_settings(tmp_path, Settings())
 
 
@@ -89,7 +90,7 @@ def test_a_new_version_may_add_settings(tmp_path):
     del earlier["settings"]["grid"]
     files.write_json(path, earlier)
     (note,) = dataset.upgrade_notes(tmp_path)
-    assert "results of version 0.0.9; all hemispheres are measured again" in note
+    assert note.endswith(f"; {__version__} measures all hemispheres again, with the same settings only")
     assert dataset.settle_settings(tmp_path, Settings()) == digest
     assert files.read_json(path) == current
     files.write_json(path, earlier)
