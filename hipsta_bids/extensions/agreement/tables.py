@@ -178,33 +178,6 @@ def _comparable(first: Tested, second: Tested) -> bool:
     )
 
 
-def _flat_grounds(
-    entries: Sequence[Entry], measure: str
-) -> tuple[list[dict[str, Ground]], list[dict[str, None]]]:
-    """Read unfolded sheets by side, and names of subfields, of each analysis."""
-    grounds = [read_grounds(entry.results, entry.measure or measure) for entry in entries]
-    flat = [{hemi: replace(g, surface=None) for hemi, g in sides.items()} for sides in grounds]
-    return flat, [dict.fromkeys(n for g in sides.values() for n in g.names) for sides in flat]
-
-
-def _comparable_tests(
-    entry: Entry, first: Mapping[MapKey, Tested], measure: str, contrast: str
-) -> dict[str, Any]:
-    """Return the tests of a map, by side, that can be compared with the first analysis."""
-    keys = [key for key in first if (key.measure, key.contrast) == (measure, contrast)]
-    maps = entry.maps
-    return {k.hemi: maps[k][0] for k in keys if k in maps and _comparable(first[k], maps[k])}
-
-
-def _scale(tests: Iterable[Mapping[str, Any]]) -> tuple[str, dict[str, Any]]:
-    """Return name and colors of the effects of some tests, which are by side."""
-    every_test = [test for by_side in tests for test in by_side.values()]
-    kind = every_test[0].kind
-    effects = [display.Effects(t.kind, t.effect, t.statistic, t.df) for t in every_test]
-    reach, (low, colors, _) = display.effect_reach(effects), display.effect_colors(kind)
-    return EFFECT_NAMES[kind], {"cmap": colors, "vmin": low * reach, "vmax": reach}
-
-
 def effect_rows(
     entries: Sequence[Entry], measure: str
 ) -> tuple[dict[str, Ground], list[list[Row]]]:

@@ -15,7 +15,6 @@ from hipsta_bids.types.tables import Fraction, OpenFraction, TomlTable
 _TEMPLATE_ARRAYS = ("knots", "mean", "components", "center")
 #: Bytes of the largest file that is read.
 LARGEST_FILE = 1_000_000_000
-_FLAT = frozenset({"mean", "sd", "ratio"})
 #: Least distance of the knots of a template, and from 0 and 1.
 _CLOSEST = 1e-6
 
