@@ -1,6 +1,6 @@
 """Finished analyses side by side: one table of effects, one figure, and agreement of maps."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations, count
