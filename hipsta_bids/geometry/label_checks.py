@@ -90,18 +90,20 @@ def check_label_image(volume: LabelVolume, hemi: str, settings: CheckSettings) -
     return [*_check_volumes(volume), *_check_axes(volume, hemi)]
 
 
-def note_position(volume: LabelVolume, hemi: str) -> list[str]:
-    """Note that labels lie on the other side of the origin, where no hemisphere of their side is.
+def note_labels(volume: LabelVolume, hemi: str) -> list[str]:
+    """Note subfields of the protocol without a label, and labels on the other side of the origin.
 
-    No map depends on it: a header may have lost the place of the image in the scanner.
+    No map depends on the side: a header may have lost the place of the image in the scanner.
     """
+    absent = [tissue.name for tissue in _absent(volume)]
+    notes = [f"no label of {', '.join(absent)}; the sheet has the other subfields"] * bool(absent)
     points = voxel_points(hippocampal_voxels(volume), volume.affine)
     right = float(points[:, 0].mean()) if len(points) else 0.0
     if (right if hemi == "L" else -right) <= _WRONG_SIDE:
-        return []
+        return notes
     side, opposite = ("left", "right") if hemi == "L" else ("right", "left")
     place = f"the {side} hippocampus lies {abs(right):.0f} mm to the {opposite} of the origin"
-    return [f"{place}. Check the affine of the image. Maps do not depend on it."]
+    return [*notes, f"{place}. Check the affine of the image. Maps do not depend on it."]
 
 
 @contextmanager
@@ -130,14 +132,18 @@ def border_sides(inside: Bool, affine: Float) -> str:
     return " and ".join(sides)
 
 
+def _absent(volume: LabelVolume) -> list[Tissue]:
+    """List subfields of the protocol's sheet that have no label."""
+    present = set(np.unique(volume.tissue).tolist())
+    return [tissue for tissue in volume.protocol.sheet if tissue not in present]
+
+
 def _check_tissues(volume: LabelVolume) -> None:
     """Refuse an image in which an end or the middle of the protocol's sheet has no label at all."""
-    sheet = volume.protocol.sheet
-    present = set(np.unique(volume.tissue).tolist())
-    absent = [tissue for tissue in sheet if tissue not in present]
+    sheet, absent = volume.protocol.sheet, _absent(volume)
     lateral = set(sheet).intersection(LATERAL_END)
     needed = [tissue.name for tissue in (Tissue.SUBICULUM, Tissue.CA1) if tissue in absent]
-    if lateral and lateral.isdisjoint(present):
+    if lateral and lateral.issubset(absent):
         needed.append(" or ".join(tissue.name for tissue in LATERAL_END if tissue in lateral))
     if needed and len(absent) < len(sheet):  # without any there is a separate message
         raise GeometryError(

@@ -359,16 +359,7 @@ def _default_model(
     """Return formula and contrasts; ModelError without groups or changes to test."""
     sessions = comparison.sessions
     if groups is None and not (sessions.has_changes or comparison.asymmetry):
-        columns = [str(name) for name in table.columns if name not in {PARTICIPANT, SESSION}]
-        available = (
-            f"there are {formulas.listed(columns)}; give another question, such as"
-            ' --formula "age + sex" --contrast age'
-            if columns
-            else "participants.tsv of BIDS_DIR has no further columns; add one, or --covariates"
-        )
-        raise ModelError(
-            f"no column has two groups ({', '.join(settings.model.group_columns)}); {available}"
-        )
+        raise _no_groups(table, settings.model.group_columns)
     time = visits.column if visits else None
     sessions.check_default(table, time, settings)
     covariates = visits.covariates if visits else settings.model.covariates
@@ -377,6 +368,23 @@ def _default_model(
     bent = [] if settings.model.age == "linear" else bent
     bends = [f"{name} nonlinear = {NONLINEAR}({name})" for name in bent]
     return formula, sessions.contrasts(groups, visits, bends)
+
+
+def _no_groups(table: pd.DataFrame, group_columns: Sequence[str]) -> ModelError:
+    """Say why no groups can be compared."""
+    columns = [str(name) for name in table.columns if name not in {PARTICIPANT, SESSION}]
+    available = (
+        f"there are {formulas.listed(columns)}; give another question, such as"
+        ' --formula "age + sex" --contrast age'
+        if columns
+        else "BIDS_DIR/participants.tsv is missing or has no further columns; add one, or"
+        " --covariates"
+    )
+    for name in columns:
+        if name.casefold() in group_columns and table[name].nunique() == 1:
+            level = table[name].dropna().iloc[0]
+            available = f"{name} is {level} for all in the analysis; see --seg, excluded.tsv"
+    return ModelError(f"no column has two groups ({', '.join(group_columns)}); {available}")
 
 
 def _formula_contrasts(

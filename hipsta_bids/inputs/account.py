@@ -29,6 +29,9 @@ _OTHER_FOLDERS = {
     *("func", "dwi", "fmap", "perf", "pet", "meg", "eeg", "beh", "figures", "log", "logs"),
 }
 
+#: Folders with the labels of one subject: FreeSurfer's, and ASHS's.
+_OF_ONE_SUBJECT = {"mri", "final"}
+
 #: How deep, and at how many entries, labels are looked for where they do not belong.
 _DEPTH, _MOST_ENTRIES = 5, 3000
 
@@ -120,7 +123,12 @@ def looked_into(entry: tree.Ignored) -> tree.Ignored:
         return entry
     reason = f"labels in it ({name}), but it is no subject's by its name"
     reason = reason if name else "labels, but in no subject's folder"
-    reason += "; name the participants of the folders with --participants-map FILE"
+    folder = entry.path if name else entry.path.parent
+    reason += (
+        f"; give the folder of all subjects, {folder.parent.parent}"
+        if folder.name in _OF_ONE_SUBJECT
+        else "; name the participants of the folders with --participants-map FILE"
+    )
     return replace(entry, reason=reason, status=tree.NOT_USED, quiet=False)
 
 

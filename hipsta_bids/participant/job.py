@@ -319,7 +319,7 @@ def check_item(item: HemisphereInput, settings: Settings) -> list[str]:
     except HipstaError as error:
         return [f"will be refused: {error}"]
     flags = [f"will be flagged: {f.text}: {f.remedy}" for f in findings if f.raised]
-    notes = (*volume.notes, *checks.note_position(volume, item.hemi))
+    notes = (*volume.notes, *checks.note_labels(volume, item.hemi))
     return [*flags, *(f"will be noted: {note}" for note in notes)]
 
 
@@ -406,9 +406,9 @@ def _measure(
 
     Notes and sources are added to the record.
     """
-    from hipsta_bids.geometry.label_checks import naming_causes, note_position  # noqa: PLC0415  (workers only)
+    from hipsta_bids.geometry.label_checks import naming_causes, note_labels  # noqa: PLC0415  (workers only)
 
-    noted = (*volume.notes, *note_position(volume, job.item.hemi))
+    noted = (*volume.notes, *note_labels(volume, job.item.hemi))
     record["notes"] = [*record["notes"], *noted]
     with naming_causes(volume):
         maps = measure(volume, job.item.hemi, job.settings, clock)

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from hipsta_bids.cli import main
 from hipsta_bids.errors import ExitCode, GeometryError
 from hipsta_bids.geometry import label_checks
-from hipsta_bids.geometry.label_checks import check_label_image, naming_causes, note_position
+from hipsta_bids.geometry.label_checks import check_label_image, naming_causes, note_labels
 from hipsta_bids.inputs.labels import read_label_volume
 from hipsta_bids.phantom import (
     KINDS,
@@ -247,11 +247,19 @@ def test_a_hemisphere_far_on_the_other_side_of_the_origin_is_noted(body, hemi, o
         affine = body.affine.copy()
         middle = affine[0, :3] @ np.argwhere(body.tissue > 0).mean(axis=0)
         affine[0, 3] = sign * right - middle
-        return note_position(replace(body, affine=affine), hemi)
+        return note_labels(replace(body, affine=affine), hemi)
 
     (note,) = at(31.0)
     assert f"31 mm to the {other} of the origin" in note
     assert at(5.0) == at(-25.0) == []
+
+
+def test_subfields_without_a_label_are_noted(body):
+    assert note_labels(body, "L") == []
+    lacking = np.isin(body.tissue, [Tissue.PRESUBICULUM])
+    assert lacking.any()
+    (note,) = note_labels(replace(body, tissue=np.where(lacking, 0, body.tissue)), "L")
+    assert note == "no label of PRESUBICULUM; the sheet has the other subfields"
 
 
 def test_few_voxels_decide_nothing(body):

@@ -25,6 +25,10 @@ def no_groups(study):
     write_participants(study.data, rows, ("participant_id", "age", "sex"))
 
 
+def one_group(study):
+    write_participants(study.data, [[r[0], "CN", *r[2:]] for r in read_participants(study.data)])
+
+
 def no_table(study):
     (study.data / "participants.tsv").unlink()
 
@@ -184,7 +188,8 @@ def no_values(study):
     ("spoil", "options", "code", "words"),
     [
         (no_groups, [], 65, "no column has two groups"),
-        (no_table, [], 65, "participants.tsv of BIDS_DIR has no further columns"),
+        (no_table, [], 65, "BIDS_DIR/participants.tsv is missing or has no further"),
+        (one_group, [], 65, "group is CN for all in the analysis; see --seg"),
         (impossible_age, [], 65, "has sub-04 (1e+50), half of the others"),
         (negative_age, [], 65, "sub-04 (-3), which is impossible"),
         (age_in_months, [], 65, "sub-04 (150), which is impossible"),

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from input_cases import touch
 
-from hipsta_bids.errors import InputError
+from hipsta_bids.errors import InputError, NothingToDoError
 from hipsta_bids.inputs.account import count_inputs, input_table, other_entries_table
 from hipsta_bids.inputs.search import InputRequest, find_inputs
 
@@ -111,6 +111,14 @@ def test_labels_outside_of_subjects_folders(tmp_path):
     assert (status, reason[:6]) == ("not used", "labels")
     status, reason = rows["derivatives/ashs/collected"]
     assert status == "not used"
+
+
+@pytest.mark.parametrize("inner", ["sub-01", "sub-01/mri"])
+def test_the_folder_of_one_subject_is_answered_by_that_of_all(tmp_path, inner):
+    fs = tmp_path / "fs"
+    put_freesurfer(fs / "sub-01")
+    with pytest.raises(NothingToDoError, match=rf"give the folder of all subjects, {fs}$"):
+        find_inputs(InputRequest(bids_dir=tmp_path, freesurfer_dir=fs / inner))
 
 
 def test_people_of_the_dataset_without_any_labels(tmp_path):
