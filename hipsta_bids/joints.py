@@ -35,8 +35,8 @@ class Command:
     """Function of the arguments; returns the exit code."""
     arguments: str = ""
     """For the help."""
-    meaning: str | None = None
-    """For the help; ``None`` hides the command."""
+    meaning: str
+    """For the help."""
     parser: str | None = None
     """Function that returns the parser, for the documentation."""
 

@@ -57,6 +57,13 @@ def tracked_files() -> list[Path]:
     return [path for path in paths if path.is_file() and path.suffix != ".png"]
 
 
+def hooks() -> list[dict[str, object]]:
+    """Hooks for commits, in their order."""
+    (repository,) = yaml.safe_load((ROOT / ".pre-commit-config.yaml").read_text("utf-8"))["repos"]
+    assert repository["repo"] == "local"
+    return repository["hooks"]
+
+
 @pytest.mark.parametrize(
     ("lock", "requirements"),
     [
@@ -236,6 +243,34 @@ def test_each_setting_is_on_one_of_two_pages():
     )
     assert sorted([*changed, *others]) == sorted(known)
     assert len(changed) == sum(len(names.split()) for names in CHANGED.values()) <= 40
+
+
+def test_hooks_run_what_lint_runs():
+    recipe = (ROOT / "Makefile").read_text(encoding="utf-8").partition("\nlint: ")[2]
+    commands = re.findall(r"^\t(.+)", recipe.partition("\n\n")[0], re.MULTILINE)
+    *checks, subject = hooks()
+    assert [hook["entry"] for hook in checks] == [
+        re.sub(r'"\$\(BIN\)/(.+?)"', r".venv/bin/\1", command) for command in commands
+    ]
+    assert {hook["language"] for hook in checks} == {"system"}  # versions of the lock, no network
+    assert (subject["language"], subject["stages"]) == ("pygrep", ["commit-msg"])
+
+
+@pytest.mark.parametrize(
+    ("message", "refused"),
+    [
+        ("x" * 65, False),
+        ("x" * 66, True),
+        ("Say it briefly\n\n" + "a body is longer " * 9, False),
+        ("fixup! " + "x" * 65, False),
+    ],
+)
+def test_long_subjects_of_commits_are_refused(message, refused):
+    assert bool(re.search(hooks()[-1]["entry"], message, re.MULTILINE | re.DOTALL)) == refused
+
+
+def test_contributing_is_short():
+    assert len((ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8").split()) <= 900
 
 
 @pytest.mark.parametrize("page", ["CONTRIBUTING.md", "docs/architecture.md"])

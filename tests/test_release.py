@@ -105,6 +105,17 @@ def test_ci_installs_the_wheel_on_each_python_that_is_named():
     assert (ROOT / "tools" / "test-install").is_file()
 
 
+def test_workflows_run_actions_of_one_commit_with_its_version_beside_it():
+    """A tag can be moved to other code; a hash cannot."""
+    texts = [path.read_text("utf-8") for path in (ROOT / ".github" / "workflows").glob("*.yml")]
+    used = {line for text in texts for line in re.findall(r"uses: (?!\./)(.+)", text)}
+    assert used
+    assert [
+        u for u in used if not re.fullmatch(r"[\w./-]+@[0-9a-f]{40}  # v\d+\.\d+\.\d+", u)
+    ] == []
+    assert len({line.partition("@")[0] for line in used}) == len(used)  # one version of each
+
+
 def test_the_definition_for_apptainer_converts_this_image():
     text = read("descriptors/hipsta_bids.def")
     assert f"From: hipsta_bids:{hipsta_bids.__version__}" in text

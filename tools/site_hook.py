@@ -23,10 +23,14 @@ BESIDE = ("CONTRIBUTING.md", "CHANGELOG.md")
 
 #: Weights of pages in the search, by their section of the navigation: a question is answered by a
 #: guide, a name by the reference. Pages without a section weigh 1.
-WEIGHTS = {"Tutorials": 1.0, "Guides": 3.0, "Reference": 1.5, "Explanation": 0.5}
+WEIGHTS = {"First study": 3.0, "More": 3.0, "Reference": 1.5, "Explanation": 0.5}
 
-#: Weights of other pages: long lists, notebooks, and the tables of the validation.
+#: Weights of other pages: tutorials, long lists, notebooks, and the tables of the validation.
 LISTS = {
+    "tutorial-own-data.md": 1.0,
+    "tutorial-phantom.md": 1.0,
+    "tutorial-consortium.md": 1.0,
+    "outputs.md": 1.5,
     "CHANGELOG.md": 0.1,
     "CONTRIBUTING.md": 0.1,
     "api.md": 0.3,

@@ -179,11 +179,3 @@ def draw_figure(arguments: Sequence[str]) -> ExitCode:
     return ExitCode.OK
 
     return ExitCode.OK
-
-
-def run_validation(arguments: Sequence[str]) -> ExitCode:
-    """Refuse, as validation is no part of the package; takes any arguments."""
-    raise UsageError(
-        "validate: run it from a checkout of hipsta_bids, by `make validation` or"
-        f" `{' '.join(('python -m validation', *arguments))}`"
-    )

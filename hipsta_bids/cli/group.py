@@ -133,7 +133,7 @@ def _add_selection(add: Callable[..., None]) -> None:
         type=bids_label("sub-"),
     )
     add(
-        "--exclude-look --exclude-flagged",
+        "--exclude-look",
         "",
         "exclude hemispheres to look at first, unless --ratings has use",
     )

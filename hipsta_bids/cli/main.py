@@ -26,14 +26,12 @@ _SIGNALED = 128  # shells report death by signal n as 128 + n
 #: Commands other than the BIDS App: name, its function in `commands`, arguments and meaning for the
 #: help. They are loaded when they are called.
 _CORE = (
-    ("protocols", "list_protocols", "", "list the known segmentation protocols (also: schemes)"),
-    ("schemes", "list_protocols", "", None),
+    ("protocols", "list_protocols", "", "list the known segmentation protocols"),
     ("settings", "print_settings", "[group]", "print all settings with their meaning, as TOML"),
     ("demo-data", "write_demo_data", "DIR", "write a synthetic dataset with known thickness"),
     ("demo", "run_demo", "DIR", "write it, run on it, and compare with the truth"),
     ("phantom", "write_phantoms", "DIR", "write a synthetic cohort with a known effect"),
     ("figure", "draw_figure", "WHAT OUT", "draw a figure for a paper from results"),
-    ("validate", "run_validation", "", None),
 )
 COMMANDS = {
     name: Command(
@@ -50,7 +48,6 @@ EPILOG = "\n".join(
         *(
             f"  hipsta-bids {f'{name} {command.arguments}':<18} {command.meaning}"
             for name, command in COMMANDS.items()
-            if command.meaning
         ),
         f"  hipsta-bids {_DESCRIPTOR:<18} print the Boutiques descriptor of both levels",
         "",

@@ -2,19 +2,28 @@
 
 import doctest
 import inspect
+import re
 import subprocess
 import sys
 from importlib import import_module
+from pathlib import Path
 
 import pytest
 from extension_marks import PRESENT, needs
 
 import hipsta_bids as hb
+from hipsta_bids.errors import ExitCode
 
 MODULES = (
     *(f"hipsta_bids.api.{name}" for name in ("maps", "datasets", "plots")),
     "hipsta_bids.api.models",
 )
+#: What 1.x promises: names may be added here, none may be removed or renamed before 2.0.
+NAMES = (
+    *("correlate", "example", "figure", "group", "load", "measure", "plot_group", "plot_sheet"),
+    *("plot_surface", "register"),
+)
+CODES = {0, 1, 64, 65, 66, 70, 73}
 LIBRARIES = ("xarray", "matplotlib.pyplot")
 
 
@@ -78,6 +87,15 @@ def test_every_name_is_there_and_documented(name):
     assert callable(found)
     for section in ("Parameters", "Returns", "Raises", "Examples"):
         assert f"\n    {section}\n    ---" in found.__doc__
+
+
+def test_names_and_exit_codes_are_the_promised_and_the_documented_ones():
+    page = (Path(__file__).parents[2] / "docs" / "api.md").read_text(encoding="utf-8")
+    assert tuple(hb.__all__) == NAMES
+    assert tuple(re.findall(r"`hb\.(\w+)`", page)) == NAMES
+    assert set(ExitCode) == CODES  # with their meaning in docs/command-line.md: test_project.py
+    paths = [f".{name}\n" for name in NAMES]
+    assert [path for path in paths if path not in page.partition("## One hemisphere")[0]] == []
 
 
 def test_other_names_are_refused():

@@ -198,7 +198,7 @@ def test_parts_are_told_as_they_are_done():
         ("in out particpant", "did you mean participant?"),
         ("in out groop", "did you mean group?"),
         ("protocls", "'protocls' is no command and no dataset; did you mean protocols?"),
-        ("shcemes --help", "did you mean schemes?"),
+        ("protocls --help", "did you mean protocols?"),
         ("in out participant --region bodi", "did you mean body?"),
         ("in out group --correction permutaton-max", "did you mean permutation-max?"),
         ("in out group --asymetry", "did you mean --asymmetry?"),

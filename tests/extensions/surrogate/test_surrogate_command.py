@@ -143,14 +143,6 @@ def test_nothing_to_do(tmp_path, capsys):
     assert capsys.readouterr().err.count("\n") == 1
 
 
-def test_validation_is_run_from_a_checkout(capsys):
-    assert main.main(["validate", "--suite", "group"]) == ExitCode.USAGE
-    message = capsys.readouterr().err
-    assert "run it from a checkout" in message
-    assert "`python -m validation --suite group`" in message
-    assert message.count("\n") == 1
-
-
 def test_a_dataset_may_be_called_surrogate(bids_dir, tmp_path, monkeypatch):
     shutil.copytree(bids_dir, tmp_path / "surrogate")
     monkeypatch.chdir(tmp_path)

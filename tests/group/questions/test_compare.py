@@ -353,7 +353,7 @@ def test_left_out_hemispheres_are_listed_with_the_reason(tmp_path, quick):
         str(out),
         "group",
         *quick,
-        "--exclude-flagged",
+        "--exclude-look",
         "--exclude",
         str(listed),
     ]
