@@ -16,7 +16,7 @@ from typing import Any
 import hipsta_bids
 
 #: Where packages lie: that of an installed wheel is not in the checkout.
-_ROOTS = (Path(hipsta_bids.__file__).parents[1], Path(__file__).parents[1])
+_ROOTS = (Path(hipsta_bids.__file__).parents[1], Path(__file__).resolve().parents[1])
 #: What shows, names and writes results, and changes no number. Packages: the version is in one.
 _APART = re.compile(
     r"hipsta_bids|hipsta_bids\.(api|cli|derivatives|reports)\b.*|validation|validation\.(report|sources)"

@@ -88,6 +88,7 @@ def random_case(seed=0, subjects=60, points=40):
     return random, matrix, random.normal(2, 0.3, (subjects, points))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("settings", [SETTINGS, HC3], ids=["ordinary", "hc3"])
 def test_missing_values_give_the_fit_of_those_present(settings):
     random, matrix, maps = random_case()

@@ -51,6 +51,7 @@ def test_statistic_is_that_of_the_model(contrast):
     np.testing.assert_allclose(found.statistic, expected.statistic, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_uncorrected_p_approaches_that_of_all_permutations():
     """Six subjects have 720 orders; a fair sample of them has their p-value."""
     random = np.random.default_rng(1)
@@ -74,6 +75,7 @@ def test_large_samples_give_the_p_of_the_t_test():
     np.testing.assert_allclose(found.p_uncorrected, test.p, atol=0.032)
 
 
+@pytest.mark.slow
 def test_family_wise_error_is_kept_on_null_maps():
     few = SETTINGS.changed(permutations=40)
     smallest = []
@@ -97,6 +99,7 @@ def test_enhancement_finds_weak_wide_effects_that_the_maximum_misses():
     assert hits[1] > 2 * hits[0]
 
 
+@pytest.mark.slow
 def test_blocks_keep_a_site_effect_from_looking_like_a_group_effect():
     """Group and site go together and the site shifts values: only shuffling inside sites holds."""
     rejections = np.zeros(2)

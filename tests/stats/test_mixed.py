@@ -171,6 +171,7 @@ def test_missing_values_give_the_fit_of_those_present():
             assert test.df[point] == pytest.approx(one.df[0], rel=1e-5)
 
 
+@pytest.mark.slow
 def test_error_rates_are_kept_in_small_samples():
     """Taking sessions for participants would reject a group effect far too often."""
     who, matrix, maps = case(7, people=10, points=4000)

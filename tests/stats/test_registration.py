@@ -187,6 +187,7 @@ def test_curvature_that_is_larger_everywhere_moves_nobody():
     assert root_mean_square(new.warps - same.warps) < 0.2 / (NODES - 1)
 
 
+@pytest.mark.slow
 def test_groups_that_are_moved_apart_are_told_from_those_that_are_not():
     def tested(shift, seed, people=None, groups=("a", "b")):
         profiles, _, group = simulated(60, seed=seed, shift=shift)
