@@ -287,6 +287,7 @@ def test_flips_of_real_labels_are_noticed_and_rotations_are_not():
             assert verdict(moved(turned, np.diag(signs)), hemi)
 
 
+@pytest.mark.slow
 def test_a_dry_run_says_what_is_wrong(tmp_path, capsys):
     spec = PhantomSpec(kind="arc", length=8.0, width=12.0)
     hemispheres = [Hemisphere(subject="01", hemi=hemi, spec=spec) for hemi in "LR"]

@@ -268,6 +268,7 @@ def meander(points):
     return gap < 0.5 * WALL
 
 
+@pytest.mark.slow
 def test_strands_are_not_taken_for_their_neighbors():
     """A meander moves by 2 mm a slice; its next strand is 1.2 mm away on the other side."""
     pixel, step, moved = 0.4, 2.0, 2.0

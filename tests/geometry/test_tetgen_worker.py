@@ -135,6 +135,7 @@ def test_a_process_that_died_between_calls_is_replaced(client):
     assert_works()
 
 
+@pytest.mark.slow
 def test_taking_too_long_is_reported_and_the_next_call_works(client, arc):
     busy = {"maxvolume": 1e-6, "fixedvolume": True, "nobisect": False}
     assert_works()

@@ -152,6 +152,7 @@ def test_separated_groups_get_finite_answers_and_are_told():
         fit_logistic(np.hstack([base, added]), case, firth=False)
 
 
+@pytest.mark.slow
 def test_likelihood_ratio_does_not_depend_on_units_and_keeps_its_size():
     p = []
     quick = SETTINGS.changed(folds=2, repeats=1)

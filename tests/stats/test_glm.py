@@ -206,6 +206,7 @@ def test_points_that_cannot_be_fitted_are_missing_alone():
     assert np.isnan(fit.sigma[:4]).all()
 
 
+@pytest.mark.slow
 def test_planted_effect_is_recovered_with_honest_limits():
     """Limits of d, of eta squared and p-values keep their promised rates."""
     random = np.random.default_rng(5)

@@ -167,6 +167,7 @@ def visits(seed=0, people=30, points=4):
     return np.array([f"sub-{i:02d}" for i in who]), time, matrix, maps, covariate
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("slopes", [False, True])
 def test_a_mixed_model_has_the_covariate_of_each_point(slopes):
     who, time, matrix, maps, covariate = visits()

@@ -67,6 +67,7 @@ def test_uncorrected_p_approaches_that_of_all_permutations():
         assert found.p_uncorrected[point] == pytest.approx(exact, abs=0.02)
 
 
+@pytest.mark.slow
 def test_large_samples_give_the_p_of_the_t_test():
     _, matrix, maps = case(2, subjects=80)
     found = permute(maps, matrix, GROUP, SHEET, settings=SETTINGS.changed(permutations=4000))
@@ -89,6 +90,7 @@ def test_family_wise_error_is_kept_on_null_maps():
     assert (rates >= 0.018).all()
 
 
+@pytest.mark.slow
 def test_enhancement_finds_weak_wide_effects_that_the_maximum_misses():
     hits = np.zeros(2)
     for seed in range(10):
@@ -153,6 +155,7 @@ def repeated(random, slope_sd=0.3, people=30):
     return who, time, np.column_stack([np.ones(len(who)), group, time, group * time]), maps
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("column", "slope_sd"), [(3, 0.3), (2, 0.3), (2, 0.0)])
 def test_repeated_visits_keep_the_level(column, slope_sd):
     """Blocks change places for the difference of changes; for the change of the others, signs flip
