@@ -77,16 +77,15 @@ unit: $(STAMP)
 	tools/install-wheel "$(BIN)/python" "$(INSTALLED)"
 	cd "$(INSTALLED)/away" && $(THREADS) HIPSTA_BIDS_INSTALLED=required ../bin/python -m pytest \
 		-n 2 --dist loadfile -c "$(CURDIR)/pyproject.toml" --rootdir "$(CURDIR)" \
-		-o "pythonpath=tools benchmarks" --ignore "$(CURDIR)/tests/validation" "$(CURDIR)/tests"
+		-o "pythonpath=tools benchmarks" "$(CURDIR)/tests"
 
 quick: $(STAMP)
-	$(PYTEST) $(QUICK:%=tests/%)
+	$(PYTEST) -m "not slow" $(QUICK:%=tests/%)
 
 separable: $(STAMP)
 	PYTHON="$(BIN)/python" tools/test-separable
 
 release: $(STAMP) validation separable
-	$(PYTEST) tests/validation
 	set -e; for script in tutorials questions faults fuzz container cluster reports long install; do \
 		PYTHON="$(BIN)/python" "tools/test-$$script"; done
 

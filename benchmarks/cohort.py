@@ -26,7 +26,7 @@ from pathlib import Path
 import pandas as pd
 from report import describe_machine, print_table, write_report
 
-from validation.report import Cells, Suite, Table, commit, write
+from validation.report import Cells, Suite, Table, describe, write
 
 COMMAND = (sys.executable, "-m", "hipsta_bids.cli.main")
 
@@ -110,7 +110,7 @@ def write_tables(data: Path, out: Path) -> None:
     table = Table(name="command", title=f"{name}, whole command", rows=rows, notes=notes)
     text = "The command is run on a dataset of real labels, from start to report.html."
     suite = Suite(name="cost", title=name, text=text, tables=(table,))
-    write(suite, out, "benchmarks/cohort.py BIDS_DIR --tables DIR", commit())
+    write(suite, out, describe("cost", "benchmarks/cohort.py BIDS_DIR --tables DIR"))
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

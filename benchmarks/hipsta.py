@@ -21,7 +21,6 @@ import sys
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -33,11 +32,10 @@ from scipy.interpolate import RegularGridInterpolator
 from scipy.spatial import KDTree
 from specimens import SIDES, Drawing, Specimen, specimens
 
-from hipsta_bids import __version__
 from hipsta_bids.io import files
 from hipsta_bids.phantom import Phantom
 from hipsta_bids.types import Float
-from validation.report import commit
+from validation.report import describe
 
 HIPSTA = "hipsta"
 #: Programs by name in the tables; the others are values of ``--method``.
@@ -401,10 +399,7 @@ def write_tables(folder: Path, tables: Mapping[str, pd.DataFrame], command: str,
         "text": f"{TEXT}Machine: {about['processor']}.",
         "tables": entries,
         "figures": [],
-        "command": command,
-        "version": __version__,
-        "commit": commit(),
-        "date": datetime.now(UTC).date().isoformat(),
+        **describe("beside-hipsta", command),
         "libraries": {"python": about["python"], "Hipsta": peer, **about["versions"]},
     }
     files.write_json(folder / "beside-hipsta.json", record)

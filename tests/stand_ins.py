@@ -135,7 +135,8 @@ class Act(str):
 
     __slots__ = ()
     affine = np.diag([-0.4, 0.4, 1.2, 1.0])
-    tissue = np.pad(np.full((8, 8, 8), Tissue.CA1, np.uint8), 1)
+    protocol = make_scheme()
+    tissue = np.pad(np.resize(np.array(TISSUES, np.uint8), (8, 8, 8)), 1)
 
     @property
     def notes(self):

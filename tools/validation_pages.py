@@ -12,7 +12,7 @@ from typing import Any
 from claims import read_claims, refresh
 
 from hipsta_bids.io.files import read_tsv
-from validation.report import MET, MISSED, SUITES, Cells, Table, markdown
+from validation.report import MET, MISSED, SUITES, Cells, Table, markdown, stale
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 #: Folder of tables, figures and their texts, below docs/; also of the appendix on the site.
@@ -27,7 +27,7 @@ Record = Mapping[str, Any]
 def records() -> dict[str, Record]:
     """Read the records of all suites, in the order of ``suites.toml``; others follow."""
     paths = {path.stem: path for path in sorted((DOCS / FOLDER).glob("*.json"))}
-    names = [*(name for name in SUITES if name in paths), *(set(paths) - set(SUITES))]
+    names = [*(name for name in SUITES if name in paths), *sorted(set(paths) - set(SUITES))]
     return {name: json.loads(paths[name].read_text("utf-8")) for name in names}
 
 
@@ -51,10 +51,10 @@ def count_targets(record: Record) -> tuple[int, int]:
 def appendix() -> Iterator[tuple[str, str]]:
     """Write a page per suite: name of the file below ``FOLDER``, and Markdown."""
     for name, record in records().items():
-        yield f"{name}.md", "\n\n".join(_parts(record)) + "\n"
+        yield f"{name}.md", "\n\n".join(_parts(name, record)) + "\n"
 
 
-def _parts(record: Record) -> Iterator[str]:
+def _parts(name: str, record: Record) -> Iterator[str]:
     met, targets = count_targets(record)
     yield f"# {record['title']}"
     if targets:
@@ -63,8 +63,10 @@ def _parts(record: Record) -> Iterator[str]:
     if "command" in record:
         yield (
             f"Measured on {record['date']} by `{record['command']}` of version"
-            f" {record['version']} (commit {record['commit']})."
+            f" {record['version']} (commit {record['commit']}){_time(record)}."
         )
+        if folders := stale(name, record):
+            yield f"**Stale**: code changed since, in {', '.join(folders)}."
     yield "[All claims](../validation.md)"
     for entry in record["tables"]:
         key = anchor(entry["file"])
@@ -72,6 +74,13 @@ def _parts(record: Record) -> Iterator[str]:
         yield f"{_without_title(read_table(entry))}\n\n[This table as TSV]({entry['file']})"
     for entry in record["figures"]:
         yield f"![{entry['caption']}]({entry['file']})\n\n*{entry['caption']}*"
+
+
+def _time(record: Record) -> str:
+    if "seconds" not in record:
+        return ""
+    wall, cpu = (record[name] / 60 for name in ("seconds", "cpu_seconds"))
+    return f" in {wall:.1f} min, {cpu:.1f} min of CPU time"
 
 
 def anchor(file: str) -> str:
@@ -104,14 +113,16 @@ def _without_title(table: Table) -> str:
 
 
 def _suites() -> Iterator[Cells]:
-    for record in records().values():
+    for name, record in records().items():
         if "command" in record:
             met, targets = count_targets(record)
             score = f"{met} of {targets}" if targets else "none"
             place = re.sub(r"[^a-z0-9]+", "-", record["title"].lower())
             files = [entry["file"] for entry in record["tables"]]
+            minutes = f"{record['seconds'] / 60:.1f}" if "seconds" in record else "n/a"
+            old = "-stale" if stale(name, record) else ""
             yield {
                 "suite": f'<a id="{place}"></a>{record["title"]}',
-                "targets met; date, commit": f"{score}; {record['date']}, {record['commit']}",
+                "targets met; commit; minutes": f"{score}; {record['commit']}{old}; {minutes}",
                 "tables": ", ".join(f"[{anchor(file)}]({FOLDER}/{file})" for file in files),
             }

@@ -14,7 +14,7 @@ def build_parser() -> Parser:
     """Describe the command."""
     parser = Parser(
         prog="python -m validation",
-        description="measure phantoms with known truth; write tables and figures",
+        description="measure phantoms with known truth; write tables; resume",
         epilog="the exit code is 0 whether or not targets are met: the tables show which are",
     )
     add = adder(parser)
@@ -40,6 +40,7 @@ def build_parser() -> Parser:
         "a dataset with segmentations, to be measured as well, as is a folder hippunfold beside it",
         type=Path,
     )
+    add("--again", "", "repeat suites whose record in DIR is of this code and this command")
     return parser
 
 
@@ -48,7 +49,12 @@ def main(arguments: Sequence[str]) -> int:
     options = build_parser().parse_args(arguments)
     try:
         missed = validate(
-            options.out, full=options.full, names=options.suite, labels=options.labels, report=echo
+            options.out,
+            full=options.full,
+            names=options.suite,
+            labels=options.labels,
+            again=options.again,
+            report=echo,
         )
     except HipstaError as error:
         warn(f"{error}")

@@ -1,5 +1,7 @@
 """Validation suites: their tables with targets, their figures, and the files of both."""
 
+import json
+import os
 import platform
 import subprocess
 import tomllib
@@ -19,6 +21,7 @@ from hipsta_bids.errors import UsageError, did_you_mean
 from hipsta_bids.io import files
 from hipsta_bids.reports.maps import new_figure
 from hipsta_bids.types import Float
+from validation.sources import changed, code_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -31,6 +34,12 @@ SUITES: Mapping[str, str] = {name: row["run"] for name, row in _TABLE.items()}
 WITH_LABELS = frozenset(name for name, row in _TABLE.items() if row.get("labels"))
 #: What each suite asks, as the sentence that would hold if all its targets were met.
 QUESTIONS: Mapping[str, str] = {name: row["question"] for name, row in _TABLE.items()}
+
+#: Benchmarks whose records lie beside those of suites: the modules that decide their numbers.
+BENCHMARKS: Mapping[str, tuple[str, ...]] = {
+    "beside-hipsta": ("benchmarks.hipsta", "hipsta_bids.participant.run"),
+    "cost": ("benchmarks.cohort", "hipsta_bids.participant.run"),
+}
 
 #: How a target that was met, or missed, is written.
 MET, MISSED = "met", "missed"
@@ -221,15 +230,40 @@ def run_suite(name: str, *, full: bool, labels: Path | None = None) -> Suite:
     return run(full, labels) if name in WITH_LABELS else run(full)
 
 
+def modules_of(name: str) -> tuple[str, ...]:
+    """Return the modules whose code, with all that they import, decides the numbers of a record."""
+    return BENCHMARKS.get(name) or (f"validation.{SUITES[name].partition(':')[0]}",)
+
+
+def stale(name: str, record: Mapping[str, Any]) -> list[str]:
+    """List the folders whose code changed since a record was written."""
+    return changed(record, *modules_of(name))
+
+
+def describe(name: str, command: str) -> dict[str, object]:
+    """Return what a record says of its origin; to be called before anything is measured."""
+    return {
+        "command": command,
+        "version": __version__,
+        "commit": commit(),
+        "code": code_of(*modules_of(name)),
+        "date": datetime.now(UTC).date().isoformat(),
+    }
+
+
 def validate(
     out: Path,
     *,
     full: bool,
     names: Sequence[str] = (),
     labels: Path | None = None,
+    again: bool = False,
     report: Callable[[str], None] = lambda _: None,
 ) -> int:
-    """Run suites, write the files of each, and count the targets that were missed."""
+    """Run suites, write the files of each when it is done, and count the targets that were missed.
+
+    Suites whose record is of this code, and of the same command, are skipped unless ``again``.
+    """
     unknown = [name for name in names if name not in SUITES]
     if unknown:
         raise UsageError(
@@ -238,21 +272,44 @@ def validate(
             reason="unknown-suite",
         )
     files.check_writable(out)
-    missed, code = 0, commit()
+    missed = 0
     for name in names or SUITES:
+        options = [" --full"] * full + [" --labels BIDS_DIR"] * bool(labels and name in WITH_LABELS)
+        command = f"python -m validation --suite {name}{''.join(options)}"
+        if not again and _is_present(out, name, command):
+            report(f"{name}: skipped, its record is of this code")
+            continue
+        origin, start = describe(name, command), os.times()
         suite = run_suite(name, full=full, labels=labels)
-        options = (" --full" if full else "") + (" --labels BIDS_DIR" if labels else "")
-        write(suite, out, f"python -m validation --suite {name}{options}", code)
+        spent = _spent(start, os.times())
+        write(suite, out, {**origin, **spent})
         missed += suite.missed
-        report(f"{suite.title}: {suite.targets - suite.missed} of {suite.targets} targets met")
+        report(
+            f"{suite.title}: {suite.targets - suite.missed} of {suite.targets} targets met;"
+            f" {spent['seconds']:.0f} s, {spent['cpu_seconds']:.0f} s of CPU time"
+        )
     return missed
 
 
-def write(suite: Suite, out: Path, command: str, code: str) -> None:
+def _is_present(out: Path, name: str, command: str) -> bool:
+    path = out / f"{name}.json"
+    if not path.is_file():
+        return False
+    record = json.loads(path.read_text("utf-8"))
+    return record.get("command") == command and not stale(name, record)
+
+
+def _spent(start: os.times_result, end: os.times_result) -> dict[str, float]:
+    """Return wall time, and the CPU time of this process and of its children."""
+    *cpu, wall = (later - earlier for earlier, later in zip(start, end, strict=True))
+    return {"seconds": round(wall, 1), "cpu_seconds": round(sum(cpu), 1)}
+
+
+def write(suite: Suite, out: Path, origin: Mapping[str, object]) -> None:
     """Write a suite: a table per TSV file, its figures, and their texts as JSON.
 
-    Replaces the files of this suite, and leaves those of others as they are. ``code`` is the commit
-    that was run.
+    Replaces the files of this suite, and leaves those of others as they are. ``origin`` is what
+    ``describe`` returns, with times.
     """
     files.remove(out.glob(f"{suite.name}--*.tsv"))
     for one in suite.tables:
@@ -270,25 +327,32 @@ def write(suite: Suite, out: Path, command: str, code: str) -> None:
             for one in suite.tables
         ],
         "figures": [{"file": one.file, "caption": one.caption} for one in suite.pictures],
-        "command": command,
-        "version": __version__,
-        "commit": code,
-        "date": datetime.now(UTC).date().isoformat(),
+        **origin,
         "libraries": {"python": platform.python_version(), **libraries},
     }
     files.write_json(out / f"{suite.name}.json", texts)
 
 
 def commit() -> str:
-    """Return the commit of this checkout; a change that is not committed shows as ``-dirty``."""
-    command = ["git", "describe", "--always", "--dirty", "--exclude", "*"]
+    """Return the commit of this checkout; code that is not committed shows as ``-dirty``."""
+    code = [":/hipsta_bids", ":/validation", ":/benchmarks"]
     try:
-        done = subprocess.run(  # noqa: S603  (a fixed command)
-            command, cwd=Path(__file__).parent, capture_output=True, text=True, check=False
-        )
+        name = _git("rev-parse", "--short=8", "HEAD")
+        dirty = _git("status", "--porcelain", "--", *code)
     except OSError:
         return files.MISSING
-    return done.stdout.strip() or files.MISSING
+    return f"{name}-dirty" if name and dirty else name or files.MISSING
+
+
+def _git(*arguments: str) -> str:
+    done = subprocess.run(  # noqa: S603  (fixed commands)
+        ["git", *arguments],  # noqa: S607
+        cwd=Path(__file__).parent,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    return done.stdout.strip()
 
 
 def markdown(table: Table) -> str:

@@ -111,6 +111,7 @@ def test_nothing_but_the_layer_changes(arc):
     assert arc.body.layer_voxels == 0
 
 
+@pytest.mark.slow
 def test_layer_of_the_wall_is_given_back():
     """The phantom's truth is the whole wall, so the layer must return to the sheet."""
     plain = short_phantom().label_volume(FREESURFER)

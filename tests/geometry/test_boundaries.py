@@ -163,6 +163,7 @@ def test_labels_on_the_other_side_change_sides(arc):
     np.testing.assert_array_equal(found.exterior, arc.boundaries.interior)
 
 
+@pytest.mark.slow
 def test_the_mirror_image_has_the_same_boundaries():
     volume = short_phantom().label_volume(load_protocol("freesurfer"))
     image = replace(volume, affine=np.diag([-1.0, 1, 1, 1]) @ volume.affine)

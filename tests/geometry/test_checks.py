@@ -89,6 +89,7 @@ def test_a_sheet_that_is_lost_between_its_voxels_is_refused():
         surface_of("slab", 1.0, 0.9)
 
 
+@pytest.mark.slow
 def test_the_same_sheet_is_fine_at_finer_voxels():
     across = check_voxels_across(*surface_of("slab", 0.3, 1.2), CHECKS)
     assert across == pytest.approx(1.2 / 0.3, rel=0.15)  # rims count as wall

@@ -37,6 +37,7 @@ def test_columns_that_run_into_a_fold_follow_their_neighbors(sheet):
     assert walls.moves[~walls.known][:, 1] == pytest.approx(0.1, abs=0.15)
 
 
+@pytest.mark.slow
 def test_a_wall_that_moves_away_loses_its_weight_gradually(sheet):
     def moves(distance):
         field = plate_field(

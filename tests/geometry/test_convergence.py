@@ -1,6 +1,7 @@
 """Errors fall as voxels become finer."""
 
 import numpy as np
+import pytest
 from geometry_cases import short_phantom, solve_case
 
 from hipsta_bids.geometry.measures import measure_thickness
@@ -12,6 +13,7 @@ def thickness_error(voxel):
     return float(np.sqrt(np.mean((measure_thickness(sheet)[4:-4] - 2.0) ** 2)))
 
 
+@pytest.mark.slow
 def test_thickness_error_falls_with_the_voxel_size():
     coarse, middle, fine = (thickness_error(voxel) for voxel in (0.8, 0.5, 0.3))
     assert coarse > middle > fine

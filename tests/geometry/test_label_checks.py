@@ -277,6 +277,7 @@ def real():
     return [(read_label_volume(item), item.hemi) for item in items]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not DATA.is_dir(), reason="shared test data not found")
 def test_flips_of_real_labels_are_noticed_and_rotations_are_not():
     random = np.random.default_rng(5)
@@ -294,6 +295,7 @@ def test_flips_of_real_labels_are_noticed_and_rotations_are_not():
             assert verdict(moved(turned, np.diag(signs)), hemi)
 
 
+@pytest.mark.slow
 def test_a_dry_run_says_what_is_wrong(tmp_path, capsys):
     spec = PhantomSpec(kind="arc", length=8.0, width=12.0)
     hemispheres = [Hemisphere(subject="01", hemi=hemi, spec=spec) for hemi in "LR"]

@@ -188,6 +188,7 @@ def radius_at(z, radii):
     return float((out[0] + 0.02 * inside.shape[1] - 0.02 * inside[:, ::-1].argmax(axis=1)).mean())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("smoothing", [0.0, 1.0])
 def test_the_ribbon_follows_a_smooth_path_through_the_slices(smoothing, monkeypatch):
     """Cubic paths through, or B-splines over, radii that are 0.8 mm more in one slice."""
@@ -267,6 +268,7 @@ def meander(points):
     return gap < 0.5 * WALL
 
 
+@pytest.mark.slow
 def test_strands_are_not_taken_for_their_neighbors():
     """A meander moves by 2 mm a slice; its next strand is 1.2 mm away on the other side."""
     pixel, step, moved = 0.4, 2.0, 2.0
@@ -289,6 +291,7 @@ def test_strands_are_not_taken_for_their_neighbors():
     assert 2 * both / (found.sum() + truth.sum()) > 0.93
 
 
+@pytest.mark.slow
 def test_the_order_of_voxels_in_the_image_decides_nothing():
     """An even number of slices, so that the middle of the stack is a matter of its direction."""
     size, pixel, step = 60, 0.4, 2.0

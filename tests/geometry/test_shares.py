@@ -164,6 +164,7 @@ def error(volume):
     return maps, errors[np.isfinite(errors)]
 
 
+@pytest.mark.slow
 def test_shares_halve_the_error_and_certain_ones_change_nothing(volume):
     maps, binary = error(replace(volume, shares={}))
     _, soft = error(volume)
@@ -175,12 +176,14 @@ def test_shares_halve_the_error_and_certain_ones_change_nothing(volume):
     np.testing.assert_array_equal(again.subfield, maps.subfield)
 
 
+@pytest.mark.slow
 def test_probabilities_that_contradict_labels_are_flagged(volume):
     moved = {kind: np.roll(share, 4, axis=0) for kind, share in volume.shares.items()}
     maps = cases.measure_body(replace(volume, shares=moved), "L")
     assert "probabilities-unlike" in {flag.reason for flag in maps.flags}
 
 
+@pytest.mark.slow
 @needs("uncertainty")
 def test_copies_move_more_where_probabilities_are_broad(volume):
     from hipsta_bids.extensions.uncertainty.copies import estimate_uncertainty  # noqa: PLC0415  (may be absent)

@@ -31,6 +31,7 @@ def test_rows_of_a_slab_are_even(slab, straight):
     assert steps[2:-2].std() / steps[2:-2].mean() < 0.02
 
 
+@pytest.mark.slow
 def test_columns_are_numbered_anew_and_stay_where_they_are(slab, straight):
     """A line of equal y and z is the same, and thickness at a place."""
     np.testing.assert_array_equal(straight.values[:, 1:], slab.coordinates.values[:, 1:])

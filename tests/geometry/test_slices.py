@@ -247,6 +247,7 @@ def test_what_an_oblique_end_label_hides_is_continued():
     assert (there > 0.5).mean() > 0.99
 
 
+@pytest.mark.slow
 def test_shares_place_the_walls_of_a_slab_that_bends_between_slices():
     """Means through slices, over offsets in a pixel: at one half alone, it is 0.17 mm too thin."""
     errors = np.concatenate([_errors_of_bent_slab(offset) for offset in np.arange(5) * PIXEL / 5])
@@ -307,6 +308,7 @@ def test_thick_slices_are_recognized_by_the_voxel(voxel, thick):
     assert has_thick_slices(np.diag([*voxel, 1.0]), SETTINGS) == thick
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["arc", "spiral"])
 def test_thickness_on_thick_slices_across_the_axis(kind):
     """2 mm slices, drawn like a scanner's across the long axis: the mean holds within 0.04 mm."""

@@ -58,6 +58,7 @@ def test_a_self_intersecting_surface_is_an_error_and_the_next_call_works():
     assert_works()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("client")
 @pytest.mark.parametrize("what", ["nan", "index", "open"])
 def test_garbage_is_an_error_and_the_next_call_works(what):
@@ -89,6 +90,7 @@ def assert_works():
     assert tetra_volumes(mesh.vertices, mesh.tetrahedra).sum() == pytest.approx(1.0)
 
 
+@pytest.mark.slow
 def test_a_process_killed_at_work_is_replaced_and_gives_the_same_mesh(client, arc):
     """Nothing is changed about the surface for a lack of memory, say."""
     expected = client.mesh(arc.surface.vertices, arc.surface.triangles, OPTIONS, 60.0)
@@ -133,6 +135,7 @@ def test_a_process_that_died_between_calls_is_replaced(client):
     assert_works()
 
 
+@pytest.mark.slow
 def test_taking_too_long_is_reported_and_the_next_call_works(client, arc):
     busy = {"maxvolume": 1e-6, "fixedvolume": True, "nobisect": False}
     assert_works()

@@ -188,6 +188,7 @@ def test_names_that_the_locale_cannot_spell_keep_their_bytes(tmp_path):
     assert (tmp_path / "text").read_text(encoding="utf-8") == "ıİß"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     [

@@ -107,6 +107,7 @@ def test_texts_of_the_command_line_end_at_once(tmp_path, capsys, monkeypatch, pl
         assert error.count("\n") == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["fifo", "zero"])
 def test_label_files_and_descriptions_end_at_once(tmp_path, kind):
     touch(tmp_path / FS, *LABELS)

@@ -104,6 +104,7 @@ def test_firth_maximizes_the_penalized_likelihood():
     assert fit.log_likelihood == pytest.approx(-best.fun, abs=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("many", [1, 24000])
 def test_firth_of_a_two_by_two_table_adds_half_to_each_cell(many, monkeypatch):
     """The penalized estimates of a saturated model are the log odds with 1/2 added.
@@ -151,6 +152,7 @@ def test_separated_groups_get_finite_answers_and_are_told():
         fit_logistic(np.hstack([base, added]), case, firth=False)
 
 
+@pytest.mark.slow
 def test_likelihood_ratio_does_not_depend_on_units_and_keeps_its_size():
     p = []
     quick = SETTINGS.changed(folds=2, repeats=1)
@@ -243,6 +245,7 @@ def test_curve_steps_at_each_score():
     assert delong(score, case, 0.95).area == 3.5 / 6  # 2 > 1, 2 = 2, 3 > 1, 3 > 2 of six pairs
 
 
+@pytest.mark.slow
 def test_firth_is_used_where_and_only_where_groups_are_separated():
     """Small samples, near separation and beyond; the linear program decides."""
     random = np.random.default_rng(9)

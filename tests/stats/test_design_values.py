@@ -88,6 +88,7 @@ def test_doubts_are_noted_from_their_limits_on():
     assert not {"x, z", "y, z"} & set(notes)
 
 
+@pytest.mark.slow
 def test_designs_that_cannot_be_fitted_are_named():
     five = {f"x{i}": np.random.default_rng(i).standard_normal(ROWS) for i in range(57)}
     names = list(five)

@@ -88,6 +88,7 @@ def random_case(seed=0, subjects=60, points=40):
     return random, matrix, random.normal(2, 0.3, (subjects, points))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("settings", [SETTINGS, HC3], ids=["ordinary", "hc3"])
 def test_missing_values_give_the_fit_of_those_present(settings):
     random, matrix, maps = random_case()
@@ -205,6 +206,7 @@ def test_points_that_cannot_be_fitted_are_missing_alone():
     assert np.isnan(fit.sigma[:4]).all()
 
 
+@pytest.mark.slow
 def test_planted_effect_is_recovered_with_honest_limits():
     """Limits of d, of eta squared and p-values keep their promised rates."""
     random = np.random.default_rng(5)

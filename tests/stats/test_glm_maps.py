@@ -75,6 +75,7 @@ def test_weights_that_do_not_fit_are_refused():
         fit_points(maps, matrix, [contrast], GlmSettings(), covariate[None])
 
 
+@pytest.mark.slow
 def test_null_rate_and_planted_correlation():
     """200 cohorts without an effect, and a correlation of .4 in 100 participants."""
     contrast = Contrast("map", [[0, 0, 0, 1]])
@@ -110,6 +111,7 @@ def test_permutations_test_the_statistic_of_the_model(contrast):
     assert np.flatnonzero(np.isnan(found.p_max)).tolist() == [4]
 
 
+@pytest.mark.slow
 def test_permutations_of_a_map_are_those_of_a_correlation():
     """Seven participants have 5040 orders; a fair sample of them has their p-value."""
     random = np.random.default_rng(3)
@@ -125,6 +127,7 @@ def test_permutations_of_a_map_are_those_of_a_correlation():
         assert found.p_uncorrected[point] == pytest.approx(exact, abs=0.02)
 
 
+@pytest.mark.slow
 def test_permutations_refit_the_model_with_each_point_s_covariate():
     maps, matrix, covariate = cohort(n=80, seed=4, r=0.3)
     for contrast in GROUP_AND_MAP:
@@ -134,6 +137,7 @@ def test_permutations_refit_the_model_with_each_point_s_covariate():
         np.testing.assert_allclose(found.p_uncorrected, test.p, atol=0.037)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("contrast", GROUP_AND_MAP)
 def test_family_wise_error_with_maps_is_kept(contrast):
     smallest = []
@@ -163,6 +167,7 @@ def visits(seed=0, people=30, points=4):
     return np.array([f"sub-{i:02d}" for i in who]), time, matrix, maps, covariate
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("slopes", [False, True])
 def test_a_mixed_model_has_the_covariate_of_each_point(slopes):
     who, time, matrix, maps, covariate = visits()

@@ -188,6 +188,7 @@ def test_no_formula_that_passes_has_more_terms_than_counted(formula):
         assert len(list(Formula(formula))) <= 1001
 
 
+@pytest.mark.slow
 def test_products_of_factors_are_refused_before_columns_are_made():
     many = np.arange(30_000) % 500
     levels = {"a": many, "b": many[::-1], "c": many // 2}
@@ -279,6 +280,7 @@ def outside(source):
     return found
 
 
+@pytest.mark.slow
 @settings(
     max_examples=int(os.environ.get("FUZZ_EXAMPLES", "400")),
     deadline=None,

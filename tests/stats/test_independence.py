@@ -3,6 +3,8 @@
 import subprocess
 import sys
 
+import pytest
+
 #: Import all modules of ``stats``, with all else of the package blocked.
 ALONE = """
 import importlib
@@ -36,12 +38,14 @@ def imported(*others):
     )
 
 
+@pytest.mark.slow
 def test_all_modules_import_without_the_rest_of_the_package():
     run = imported()
     assert run.returncode == 0, run.stderr
     assert {"hipsta_bids.stats.glm", "hipsta_bids.stats.settings"} <= set(run.stdout.split())
 
 
+@pytest.mark.slow
 def test_the_rest_of_the_package_is_blocked():
     run = imported("hipsta_bids.io")
     assert run.returncode == 1

@@ -51,6 +51,7 @@ def test_statistic_is_that_of_the_model(contrast):
     np.testing.assert_allclose(found.statistic, expected.statistic, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_uncorrected_p_approaches_that_of_all_permutations():
     """Six subjects have 720 orders; a fair sample of them has their p-value."""
     random = np.random.default_rng(1)
@@ -66,6 +67,7 @@ def test_uncorrected_p_approaches_that_of_all_permutations():
         assert found.p_uncorrected[point] == pytest.approx(exact, abs=0.02)
 
 
+@pytest.mark.slow
 def test_large_samples_give_the_p_of_the_t_test():
     _, matrix, maps = case(2, subjects=80)
     found = permute(maps, matrix, GROUP, SHEET, settings=SETTINGS.changed(permutations=4000))
@@ -74,6 +76,7 @@ def test_large_samples_give_the_p_of_the_t_test():
     np.testing.assert_allclose(found.p_uncorrected, test.p, atol=0.032)
 
 
+@pytest.mark.slow
 def test_family_wise_error_is_kept_on_null_maps():
     few = SETTINGS.changed(permutations=40)
     smallest = []
@@ -87,6 +90,7 @@ def test_family_wise_error_is_kept_on_null_maps():
     assert (rates >= 0.018).all()
 
 
+@pytest.mark.slow
 def test_enhancement_finds_weak_wide_effects_that_the_maximum_misses():
     hits = np.zeros(2)
     for seed in range(10):
@@ -97,6 +101,7 @@ def test_enhancement_finds_weak_wide_effects_that_the_maximum_misses():
     assert hits[1] > 2 * hits[0]
 
 
+@pytest.mark.slow
 def test_blocks_keep_a_site_effect_from_looking_like_a_group_effect():
     """Group and site go together and the site shifts values: only shuffling inside sites holds."""
     rejections = np.zeros(2)
@@ -150,6 +155,7 @@ def repeated(random, slope_sd=0.3, people=30):
     return who, time, np.column_stack([np.ones(len(who)), group, time, group * time]), maps
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("column", "slope_sd"), [(3, 0.3), (2, 0.3), (2, 0.0)])
 def test_repeated_visits_keep_the_level(column, slope_sd):
     """Blocks change places for the difference of changes; for the change of the others, signs flip

@@ -80,6 +80,7 @@ def marginal_mean(fit, table, fixed, names):
     return np.array([type(fit._results)(fit.model, unit).predict(grid).mean() for unit in units])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("formula", DESIGNS)
 def test_differences_of_levels_are_those_of_marginal_means(formula):
     table = people()
@@ -123,6 +124,7 @@ def test_terms_are_tested_as_by_type_iii_sums_of_squares(formula, coded):
         assert found[name].p[0] == pytest.approx(anova["PR(>F)"][row], rel=1e-7, abs=1e-300)
 
 
+@pytest.mark.slow
 def test_cells_and_conditions():
     table = people()
     fit = smf.ols("y ~ group * sex * age", table).fit()

@@ -171,6 +171,7 @@ def test_missing_values_give_the_fit_of_those_present():
             assert test.df[point] == pytest.approx(one.df[0], rel=1e-5)
 
 
+@pytest.mark.slow
 def test_error_rates_are_kept_in_small_samples():
     """Taking sessions for participants would reject a group effect far too often."""
     who, matrix, maps = case(7, people=10, points=4000)
@@ -251,6 +252,7 @@ def test_random_slopes_agree_with_statsmodels(missing):
         np.testing.assert_allclose(fit.variances["slope"][point], other.cov_re[1, 1], rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_slopes_that_differ_are_not_taken_for_a_change_of_all():
     """With random intercepts only, the error of the mean slope is too small."""
     who, time, matrix, maps = slope_case(2, people=16, points=300)
@@ -261,6 +263,7 @@ def test_slopes_that_differ_are_not_taken_for_a_change_of_all():
     assert (intercepts.p < 0.05).mean() > 0.15
 
 
+@pytest.mark.slow
 def test_slopes_are_tested_by_the_ratio_of_restricted_likelihoods():
     """Half chi squared with 1, half with 2 degrees of freedom."""
     who, time, matrix, maps = slope_case(4, slope_sd=0.0, points=300)
@@ -330,6 +333,7 @@ def test_f_of_groups_in_a_balanced_design_is_analysis_of_variance(slopes):
     np.testing.assert_allclose(test.p, expected.pvalue, rtol=2e-3)
 
 
+@pytest.mark.slow
 def test_slopes_of_participants_keep_the_level_that_intercepts_exceed():
     random = np.random.default_rng(0)
     people, visits, points = 40, 4, 400

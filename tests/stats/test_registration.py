@@ -169,6 +169,7 @@ def test_shift_between_groups_is_reported():
         np.testing.assert_allclose(shifts[name]["shift_se"], stats.sem(part, axis=0), atol=1e-12)
 
 
+@pytest.mark.slow
 def test_curvature_that_is_larger_everywhere_moves_nobody():
     profiles, warps, group = simulated(100, seed=5)
     larger = profiles * np.where(group, 1.3, 1.0)[:, None] + 0.05 * group[:, None]
@@ -187,6 +188,7 @@ def test_curvature_that_is_larger_everywhere_moves_nobody():
     assert root_mean_square(new.warps - same.warps) < 0.2 / (NODES - 1)
 
 
+@pytest.mark.slow
 def test_groups_that_are_moved_apart_are_told_from_those_that_are_not():
     def tested(shift, seed, people=None, groups=("a", "b")):
         profiles, _, group = simulated(60, seed=seed, shift=shift)
@@ -294,6 +296,7 @@ def test_refuses_what_gives_no_template():
             call(profiles, SETTINGS)
 
 
+@pytest.mark.slow
 def test_large_cohorts_are_quick():
     profiles, _, _ = simulated(1500)
     start = process_time()

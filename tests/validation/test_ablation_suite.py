@@ -1,5 +1,7 @@
 """What each part of the method does, as a table."""
 
+import pytest
+
 from validation import ablation, cases, continuity
 
 
@@ -35,6 +37,7 @@ def test_the_table_has_a_row_per_variant():
         assert abs(row["two labelings, r"] - 0.85) < 1e-12
 
 
+@pytest.mark.long
 def test_x_of_the_volume_differs_on_a_phantom():
     spec = ablation.PHANTOMS[3]
     case = cases.Case(spec=spec, voxel_size=(0.4,) * 3)

@@ -167,6 +167,7 @@ def test_brains_that_are_left_out_are_aligned_to_the_others():
     assert retests[0][0].same_label == 1.0
 
 
+@pytest.mark.long
 def test_tables_have_a_target_of_the_default_only(monkeypatch):
     monkeypatch.setattr(alignment, "_KINDS", {"one": "along x"})
     monkeypatch.setattr(alignment, "DIFFERENCES", {"none": ((1.0,) * 4, 0.0)})

@@ -17,6 +17,7 @@ def trial(kind, size, position=(0.5, 0.5)):
     return Trial(body=SPIRAL, injury=(kind, size, position))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("position", [(0.5, 0.5), (0.2, 0.35), (0.82, 0.6)])
 def test_holes_are_filled_to_the_walls_thickness(position):
     found = measure_trial(trial("hole", 0.8, position))
@@ -60,7 +61,7 @@ def test_refusals_name_the_defect(kind, size, reason):
     [
         ("at-border", 1.0, "image-border"),
         ("wrong-voxels", 2.0, "slices-along-axis"),
-        ("bridge-ca1-ca1", 0.8, "section-bump"),
+        ("bridge-ca1-ca1", 0.8, "section-intrusion"),
         ("leak", 3.0, "section-bump"),
         ("salt", 0.03, "noisy-labels"),
         ("cut-short", 8.0, "labels-end"),

@@ -94,6 +94,7 @@ def test_refused_planes_miss_the_target_and_are_explained():
     assert "35° about the width: topology: a knot" in table.notes
 
 
+@pytest.mark.long
 def test_a_short_run_says_what_was_left_out(monkeypatch):
     monkeypatch.setattr(
         ends.cases, "run_cases", lambda work, group, **_: [work(one) for one in group]

@@ -57,6 +57,7 @@ def test_corrections_keep_the_family_wise_error_and_find_the_effect(monkeypatch)
     assert wide > single > 0.2
 
 
+@pytest.mark.long
 def test_measures_together_keep_the_family_wise_error_and_find_more(monkeypatch):
     monkeypatch.setattr(group, "PERMUTATIONS", 60)
     table = group._together(10, *group.limits(10))

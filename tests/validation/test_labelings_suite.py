@@ -54,6 +54,7 @@ def test_the_same_body_has_no_changed_voxel():
     assert labelings.changed_points(mask(inside), mask(inside)).shape == (0, 3)
 
 
+@pytest.mark.long
 def test_brains_are_paired_and_a_thinner_second_labeling_is_thinner(tmp_path):
     labels = tmp_path / "labels"
     labels.mkdir()
@@ -80,6 +81,7 @@ def test_brains_are_paired_and_a_thinner_second_labeling_is_thinner(tmp_path):
     assert not result.flipped
 
 
+@pytest.mark.long
 def test_a_labeling_without_a_map_is_failed(monkeypatch, tmp_path):
     labels = tmp_path / "labels"
     labels.mkdir()

@@ -20,6 +20,7 @@ def trials(*planted, body=ARC):
     return [Trial(body=body, injury=one) for one in planted]
 
 
+@pytest.mark.long
 def test_a_missing_stratum_is_mended_and_thins_the_wall_if_it_is_not():
     planted = dict.fromkeys(CAVITIES)
     (stratum,) = (one for one in planted if one[0] == "stratum")

@@ -33,6 +33,7 @@ def sizes(**changes):
     return Sizes(**{**known, "flagged": False, **changes})
 
 
+@pytest.mark.long
 def test_tissue_that_is_lost_has_the_sizes_that_were_asked_for():
     known = Phantom(SOUND.true).truth(0.5, 0.5).summary
     truth = {(one.name, one.strength): Phantom(one.true).truth(0.5, 0.5).summary for one in LOSSES}
@@ -62,6 +63,7 @@ def test_a_lost_edge_leaves_the_remaining_wall_as_it_is():
     np.testing.assert_allclose(rest.curve.curvature(s), whole.curve.curvature(s))
 
 
+@pytest.mark.long
 def test_errors_of_labels_take_and_add_voxels_where_they_should():
     sound = sheet(SOUND)
     cut = sheet(loss("thin edges without label", 1.5))
@@ -83,6 +85,7 @@ def test_errors_of_labels_take_and_add_voxels_where_they_should():
     assert sheet(loss("labels too thick")).sum() > 1.05 * sound.sum()
 
 
+@pytest.mark.long
 def test_missing_edges_make_the_mean_thickness_rise_while_volume_falls():
     """The paradox itself, measured: no wall of the phantom thickens."""
     results = {
@@ -135,6 +138,7 @@ def test_values_have_a_row_per_loss_and_missing_values():
     assert rows[1]["n_refused"] == 1
 
 
+@pytest.mark.long
 def test_the_stored_values_are_of_these_losses():
     rows = read_tsv(DOCS / "validation" / "paradox--values.tsv")
     assert all(re.fullmatch(r"[a-z0-9_]+", name) for name in rows[0])

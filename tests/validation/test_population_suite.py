@@ -76,6 +76,7 @@ def test_labels_move_with_the_points_they_are_read_at():
     np.testing.assert_array_equal(moved.tissue[:-3], still.tissue[3:])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("voxel", [FINE, (0.4, 0.4, 2.0)])
 def test_a_specimen_has_its_voxels_and_all_of_the_labels(voxel):
     specimen = Specimen(body=SPEC, number=1, voxel=voxel)
@@ -95,6 +96,7 @@ def test_the_first_specimen_of_a_body_is_as_it_is():
     np.testing.assert_array_equal(volume.tissue, labeled_volume(population.FULL_VOXEL).tissue)
 
 
+@pytest.mark.long
 def test_the_plan_takes_all_damages_in_turn():
     bodies = population.find_bodies(None)
     specimens = population.plan(bodies, full=True)

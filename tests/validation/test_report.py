@@ -103,7 +103,7 @@ def test_a_heading_that_the_longest_row_lacks_is_refused():
 def test_a_suite_replaces_its_files_and_leaves_those_of_others(tmp_path):
     for name in ("toy--old.tsv", "toys--bias.tsv", "toys.json"):
         (tmp_path / name).write_text("before")
-    write(TOYS, tmp_path, "the command", "1234abc")
+    write(TOYS, tmp_path, {"command": "the command", "commit": "1234abc"})
     assert {path.name for path in tmp_path.iterdir()} == {
         *("toy.json", "toy--bias.tsv", "toy.png", "toys.json", "toys--bias.tsv")
     }
@@ -120,7 +120,6 @@ def test_a_suite_replaces_its_files_and_leaves_those_of_others(tmp_path):
         "Why.",
         "the command",
     )
-    assert re.fullmatch(r"\d{4}-\d\d-\d\d", record["date"])
     assert record["commit"] == "1234abc"
 
 
@@ -165,12 +164,41 @@ def test_figures_are_png_and_the_same_each_time():
 def test_command_writes_the_report(tmp_path, capsys, one_suite):
     assert command.main(["--full", "--out", str(tmp_path / "a b")]) == ExitCode.OK
     said = capsys.readouterr().out.splitlines()
-    assert said[0] == "Toys: 1 of 2 targets met"
+    assert re.fullmatch(r"Toys: 1 of 2 targets met; \d+ s, \d+ s of CPU time", said[0])
     assert said[1] == f"targets missed: 1; report: {tmp_path / 'a b'}"
     assert one_suite == [True]
     assert (tmp_path / "a b/toy.png").read_bytes() == render(PICTURE)
     record = json.loads((tmp_path / "a b/toy.json").read_text("utf-8"))
     assert record["command"] == "python -m validation --suite toy --full"
+    assert re.fullmatch(r"\d{4}-\d\d-\d\d", record["date"])
+    assert record["seconds"] >= 0
+    assert record["cpu_seconds"] >= 0
+
+
+def test_suites_of_this_code_and_form_are_skipped_unless_again(
+    tmp_path, monkeypatch, capsys, one_suite
+):
+    run = ["--out", str(tmp_path)]
+    for options in ([], [], ["--full"], ["--full"], ["--full", "--again"]):
+        assert command.main([*run, *options]) == ExitCode.OK
+    assert one_suite == [False, True, True]
+    assert capsys.readouterr().out.count("toy: skipped, its record is of this code") == 2
+    monkeypatch.setattr("validation.report.changed", lambda *_: ["hipsta_bids.geometry"])
+    assert command.main([*run, "--full"]) == ExitCode.OK
+    assert one_suite == [False, True, True, True]
+
+
+def test_a_suite_that_is_interrupted_keeps_those_before_it(tmp_path, monkeypatch, one_suite):
+    def stop(_full):
+        raise KeyboardInterrupt
+
+    monkeypatch.setitem(sys.modules, "validation.stopped", SimpleNamespace(run=stop))
+    monkeypatch.setattr("validation.report.SUITES", {"toy": "toys:run", "stopped": "stopped:run"})
+    for _ in range(2):
+        with pytest.raises(KeyboardInterrupt):
+            command.main(["--out", str(tmp_path)])
+    assert one_suite == [False]
+    assert {path.name for path in tmp_path.glob("*.json")} == {"toy.json"}
 
 
 def test_command_is_quick_by_default(tmp_path, one_suite):
@@ -208,10 +236,18 @@ def test_a_suite_of_which_nothing_is_measured_misses_all_targets(monkeypatch, tm
     suite = run_suite(name, full=False)
     assert suite.missed == suite.targets > 0
     # All that texts name in braces is known.
-    write(replace(suite, pictures=()), tmp_path, "the command", "1234abc")
+    write(replace(suite, pictures=()), tmp_path, {})
     assert not re.search(r"\{\w", (tmp_path / f"{name}.json").read_text("utf-8"))
 
 
 @pytest.mark.usefixtures("one_suite")
 def test_a_suite_is_found_by_its_name():
     assert run_suite("toy", full=False).title == "Toys"
+
+
+def test_tables_and_numbers_of_the_page_are_those_of_the_records():
+    from validation_pages import claims_page  # noqa: PLC0415  (reads all records)
+
+    assert (FOLDER.parent / "validation.md").read_text("utf-8") == claims_page(), (
+        "run tools/make-docs"
+    )

@@ -30,6 +30,7 @@ def test_all_kinds_are_drawn_in_both_kinds_of_voxels():
         assert kind.v[0] <= v <= kind.v[1]
 
 
+@pytest.mark.long
 def test_damage_is_where_it_is_said_to_be(site):
     ball = make_defect(site, "leak-interior", 1.2, (0.5, 0.4))
     wall = site.column((0.5, 0.4))[0]

@@ -47,6 +47,7 @@ def test_a_scan_keeps_the_labels_and_moves_them():
     assert not np.allclose(fine.affine[:3, 3], thick.affine[:3, 3], atol=0.5)
 
 
+@pytest.mark.long
 def test_errors_of_labels_change_labels_beside_borders_only():
     still, noisy = (
         draw(Person(name="", sources=(plain(1),), voxels=(visits.FINE,), noise=noise))[0][0]
@@ -98,6 +99,7 @@ def test_tables_say_which_targets_are_met():
     assert row["leakage met"] is True
 
 
+@pytest.mark.long
 def test_a_lost_layer_is_as_thick_as_planted():
     volume, _ = visits.load(plain(0))
     before, after = (visits.lose_layer(volume, layer) for layer in (0.0, visits.LAYER))
