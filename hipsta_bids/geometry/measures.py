@@ -308,10 +308,11 @@ def _polygon_area(points: Float) -> Float:
 def labels_at(points: Float, body: Body) -> NDArray[np.uint8]:
     """Tissue (N,) at points (N, 3), RAS mm: of the body's voxel there, or else of the nearest."""
     voxel = np.rint(body.to_voxels(points)).astype(np.intp)
-    # Of a place beyond the image, the nearest voxel of the image comes first.
-    index = tuple(np.clip(voxel, 0, np.array(body.inside.shape) - 1).T)
+    clipped = np.clip(voxel, 0, np.array(body.inside.shape) - 1)
+    index = tuple(clipped.T)
     labels = body.tissue[index]
-    outside = np.flatnonzero(~body.inside[index])
+    # Along sheared axes, the clipped voxel is not the nearest.
+    outside = np.flatnonzero(~body.inside[index] | (clipped != voxel).any(axis=1))
     if len(outside):
         voxels, _ = body.inside_points()
         labels[outside] = body.tissue[tuple(voxels[body.nearest(points[outside])].T)]

@@ -99,6 +99,7 @@ def euler(state: Bool, *, plates: bool = False) -> int:
 def apply_membranes(
     state: Bool,
     values: NDArray[np.float32],
+    ranked: NDArray[np.float32],
     lifted: NDArray[np.float32],
     settings: TopologySettings,
     *,
@@ -108,10 +109,10 @@ def apply_membranes(
     """Apply the cheapest membranes (in place): all small ones, or one large one.
 
     Without plates, tunnels of the body itself are searched; with plates, pieces of an end's
-    cross-section that are connected only further inside. ``lifted`` receives the values of filled
-    holes. ``contact`` returns whether two turns of the sheet touch at nodes (N, 3).
+    cross-section that are connected only further inside. ``ranked`` is the order by `rank`;
+    ``lifted`` receives the values of filled holes. ``contact`` returns whether two turns of the
+    sheet touch at nodes (N, 3).
     """
-    ranked = _ranked(values)
     solid = with_plates(state, True) if plates else state
     if plates:
         ranked = with_plates(ranked, float(ranked.max()) + 1.0)
@@ -212,10 +213,10 @@ def _priced(
     return sorted(priced, key=lambda c: c[0])
 
 
-def _ranked(values: NDArray[np.float32]) -> NDArray[np.float32]:
+def rank(values: NDArray[np.float32]) -> NDArray[np.float32]:
     """Order in which nodes are added or removed: by value, and by depth where values saturate.
 
-    So membranes come to lie midway across a wide hole, where the field is flat.
+    So membranes lie midway across a wide hole, where the field is flat.
     """
     inside = values > 0
     depth = ndimage.distance_transform_edt(inside) - ndimage.distance_transform_edt(~inside)

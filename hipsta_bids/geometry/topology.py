@@ -126,14 +126,16 @@ def repair_topology(
 
     edits = _before_smoothing(field)
     edits += _remove_islands(state, field, locate) + _fill_cavities(state)
+    ranked = None
     for _ in range(ROUNDS):
         wrong = [plates for plates in (False, True) if membranes.euler(state, plates=plates) != 1]
         if not wrong:
             break
+        ranked = membranes.rank(padded) if ranked is None else ranked
         # Pits only once the body itself is sound: the inside of a closed tube is none.
         pits = _fill_cavities(state, plates=True) if wrong[0] else []
         proposals = pits or membranes.apply_membranes(
-            state, padded, lifted, settings, plates=wrong[0], contact=touching
+            state, padded, ranked, lifted, settings, plates=wrong[0], contact=touching
         )
         edits += proposals
         if not proposals or _has_strips(state, settings):
@@ -410,17 +412,21 @@ def repaired_columns(sheet: Sheet, solid: SolidField) -> Bool:
     candidates = digital.positions(valid)[
         near.min(axis=1) <= radii.max() + gaps[valid].mean(axis=-1)
     ]
-    if not len(candidates):
-        return marked
-    widest = gaps[tuple(candidates.T)].max(axis=0)
-    parts = np.maximum(np.ceil(widest / REPAIR_REACH), 1).astype(int)
-    dense = _cells(sheet.points, candidates, parts)
-    defined = np.isfinite(dense).all(axis=-1)
-    # A balanced tree takes longer to make than it saves.
-    tree = cKDTree(dense[defined], balanced_tree=False, compact_nodes=False)
-    hit = np.concatenate(tree.query_ball_point(nodes, radii)).astype(np.intp)
-    owner = candidates[np.nonzero(defined)[0][hit]]
-    marked[tuple(owner.T)] = True
+    # Few of those reached need places between columns to show it.
+    for is_dense in (False, True):
+        candidates = candidates[~marked[tuple(candidates.T)]]
+        if not len(candidates):
+            break
+        places = sheet.points[tuple(candidates.T)]
+        if is_dense:
+            widest = gaps[tuple(candidates.T)].max(axis=0)
+            parts = np.maximum(np.ceil(widest / REPAIR_REACH), 1).astype(int)
+            places = _cells(sheet.points, candidates, parts)
+        defined = np.isfinite(places).all(axis=-1)
+        # A balanced tree takes longer to make than it saves.
+        tree = cKDTree(places[defined], balanced_tree=False, compact_nodes=False)
+        hit = np.concatenate(tree.query_ball_point(nodes, radii)).astype(np.intp)
+        marked[tuple(candidates[np.nonzero(defined)[0][hit]].T)] = True
     return marked
 
 

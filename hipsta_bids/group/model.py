@@ -289,7 +289,10 @@ def choose_model(
     ``find_groups``.
     """
     references = _requested_references(request)
-    preferred = (comparison or Comparison()).sessions.group_columns
+    # The groups of tables and figures are those of the formula, if it has any.
+    in_formula = {name.casefold() for name in closed_formula(_requested_formula(request)).names}
+    in_formula.intersection_update(settings.model.group_columns)
+    preferred = list(in_formula) or (comparison or Comparison()).sessions.group_columns
     groups = find_groups(table, settings, preferred=preferred)
     if groups is not None and groups.column in references:
         groups = find_groups(table, settings, references[groups.column], preferred=preferred)
@@ -306,14 +309,18 @@ def choose_model(
 def _requested_references(request: ModelRequest) -> dict[str, str]:
     """Return reference levels of options and of codings in the formula; they must not differ."""
     references = dict(request.references)
-    formula = formulas.split_maps(request.formula or "1")[0]
-    if request.file is not None:
-        formula = formulas.parse_model(files.read_json(request.file)).formula
-    for factor, level in closed_formula(formula).references:
+    for factor, level in closed_formula(_requested_formula(request)).references:
         if references.setdefault(factor, level) != level:
             problem = f"--reference {factor}={references[factor]}, but the formula has"
             raise UsageError(f"{problem} contr.treatment({level!r}); give one")
     return references
+
+
+def _requested_formula(request: ModelRequest) -> str:
+    """Return the right-hand side of the formula of a request; ``1`` without any."""
+    if request.file is not None:
+        return formulas.parse_model(files.read_json(request.file)).formula
+    return formulas.split_maps(request.formula or "1")[0]
 
 
 def model_document(

@@ -508,7 +508,8 @@ def without_small_levels(values: Float, model: RowModel, rows: Int) -> Float:
     for member in members[rows[order]].T:
         has_value = np.logical_or.reduceat(known[order] & member[:, None], starts, axis=0)
         is_small |= has_value.sum(axis=0) < least
-    return np.where(is_small, np.nan, values)
+    # Of large cohorts, a copy takes much memory: none is made where no value would change.
+    return np.where(is_small, np.nan, values) if known[:, is_small].any() else values
 
 
 def _covariates(side: SideMaps, positions: Int) -> Float | None:

@@ -30,6 +30,19 @@ def test_labels_are_those_of_the_voxel_or_of_the_nearest():
     assert labels_at(points, body).tolist() == wanted
 
 
+def test_labels_beyond_an_image_with_sheared_axes_are_those_of_the_nearest_voxel():
+    """The header of an image may hold any affine."""
+    straight = halves(10)
+    affine = straight.affine.copy()
+    affine[0, 1] = 0.3  # rows lean by 31 degrees
+    body = plain_body(straight.tissue, affine, straight.ends)
+    index, centers = body.inside_points()
+    points = np.random.default_rng(3).uniform([0, 9, 0], [17, 14, 2], (200, 3))
+    distance = np.linalg.norm(points[:, None] - centers, axis=2)
+    nearest = body.tissue[tuple(index[distance.argmin(axis=1)].T)]
+    np.testing.assert_array_equal(labels_at(points, body), nearest)
+
+
 @pytest.mark.parametrize("border", [3, 10, 17])
 def test_areas_are_finer_than_the_grid(border):
     """The grid's lines are 0.3 mm apart."""

@@ -205,7 +205,7 @@ def no_values(study):
         (other_people, [], 65, "names none of the participants here"),
         (header_only, [], 65, "has no rows"),
         (other_encoding, [], 65, "no UTF-8 text"),
-        (with_commas, [], 65, "separated by tabs"),
+        (with_commas, [], 65, "columns are separated by ','; save it with tabs"),
         (column_twice, [], 65, "'age' occurs more than once"),
         (no_dataset, [], 65, "folder not found"),
         (None, ["--formula", " "], 64, "--formula is empty"),

@@ -111,6 +111,35 @@ def test_participants_who_are_not_in_the_table_are_named_so(study, capsys):
     }
 
 
+def with_own_table(study, lines):
+    path = study.data.parent / "own.tsv"
+    path.write_text("\n".join("\t".join(line) for line in lines) + "\n")
+    return "--covariates", str(path)
+
+
+def test_groups_are_those_of_the_formula(study, capsys):
+    """A table of the user has diagnoses, participants.tsv another grouping; one is unknown."""
+    people = [row[0] for row in read_participants(study.data)]
+    lines = [(label, "CN" if k % 2 else "AD") for k, label in enumerate(people[:-1])]
+    table = with_own_table(study, [("participant_id", "diagnosis"), *lines])
+    run(study, capsys, *table, "--formula", "diagnosis + age")
+    folder = study.out / "group" / "t"
+    record = files.read_json(folder / "analysis.json")["groups"]
+    assert (record["column"], record["levels"]) == ("diagnosis", ["CN", "AD"])
+    assert {row["group"] for row in files.read_tsv(folder / "means.tsv")} == {"CN", "AD"}
+    text = (folder / "methods.md").read_text()
+    assert "known for 29 participants (14 CN, 15 AD)" in text
+    assert "In addition" not in text  # who has no diagnosis is told of once
+
+
+def test_values_that_a_table_of_the_user_replaces_are_named(study, capsys):
+    rows = read_participants(study.data)
+    older = [(rows[2][0], "99"), (rows[3][0], rows[3][2]), (rows[4][0], "n/a")]
+    said, design, _ = run(study, capsys, *with_own_table(study, [("participant_id", "age"), *older]))
+    assert f"note: age of {rows[2][0]} differs from that of earlier tables; own.tsv counts\n" in said
+    assert design[2]["age"] == "99"
+
+
 def with_numbers(study, name, function):
     """Add a column of numbers, given the row and the age."""
     rows = read_participants(study.data)

@@ -2,7 +2,7 @@
 
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import cache
 from pathlib import Path, PurePosixPath
@@ -88,7 +88,9 @@ def read_covariates(
             _check_known(joined, table, path)
             absent = frozenset(joined[PARTICIPANT]) - frozenset(table[PARTICIPANT])
         table = table[table[PARTICIPANT].isin(joined[PARTICIPANT])]
-        joined = _join(joined, mark_missing(table, sidecar, spelled), path)
+        before, joined = joined, _join(joined, mark_missing(table, sidecar, spelled), path)
+        if path in extra and SESSION not in table:
+            spelled.notes += _replaced(before, joined, path)
         described |= sidecar
         if path == main and (parts := _read_sessions(joined, bids_dir)):
             sidecar = _sidecar(bids_dir / "sessions.json")
@@ -105,7 +107,8 @@ def read_covariates(
     folded = joined.columns.str.casefold()
     pair = joined.columns[folded.duplicated(keep=False) & folded.isin(_known_columns(settings))]
     if len(pair):
-        raise InputError(f"columns {' and '.join(pair)} differ in capitals only; keep one")
+        by_name = sorted(pair, key=lambda name: (name.casefold(), name.swapcase()))
+        raise InputError(f"columns {' and '.join(by_name)} differ in capitals only; keep one")
     return joined, absent, spelled
 
 
@@ -254,10 +257,13 @@ def _read(path: Path) -> pd.DataFrame:
         )
     table = pd.DataFrame(rows, dtype=object)
     if PARTICIPANT not in table.columns:
-        raise InputError(
-            f"{path}: has no column participant_id; columns are separated by tabs",
-            reason="bad-table",
+        mark = next((mark for mark in ",;" if mark in table.columns[0]), None)
+        problem = (
+            f"columns are separated by {mark!r}; save it with tabs (.tsv)"
+            if mark
+            else "has no column participant_id; rename the column of participants"
         )
+        raise InputError(f"{path}: {problem}", reason="bad-table")
     return _cleaned(table)
 
 
@@ -304,6 +310,16 @@ def _join(joined: pd.DataFrame, table: pd.DataFrame, path: Path) -> pd.DataFrame
             values = values.where(values.notna(), result[column])
         result[column] = values
     return result
+
+
+def _replaced(before: pd.DataFrame, joined: pd.DataFrame, path: Path) -> Iterator[str]:
+    """Note values of earlier tables that a table of the user replaces."""
+    for column in before.columns.difference([PARTICIPANT, SESSION]):
+        former, current = before[column], joined[column]
+        differs = former.notna() & (former.map(level_name) != current.map(level_name))
+        if differs.any():
+            people = listed(dict.fromkeys(joined.loc[differs, PARTICIPANT]))
+            yield f"{column} of {people} differs from that of earlier tables; {path.name} counts"
 
 
 def add_icv(

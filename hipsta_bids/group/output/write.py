@@ -127,7 +127,7 @@ def write_results(
         cohort,
         analysis,
         settings,
-        len(exclusions),
+        sum(exclusion.reason != "incomplete" for exclusion in exclusions),
         surfaces=[surface for surface in cohorts if surface != SHEET],
         sentences=sentences,
         region=region,
