@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
+from hipsta_bids import __version__
 from hipsta_bids.cli.main import main
 from hipsta_bids.derivatives import dataset
 from hipsta_bids.derivatives.hemisphere import format_column
@@ -70,7 +71,7 @@ def write_hemisphere(place, thickness, curvature, *, volume=500.0, **record):
     content = {
         "decision": "use",
         "settings_hash": digest,
-        "version": "0.1.0",
+        "version": __version__,
         "inputs": [{"file": f"bids:fs:sub-{place.name.subject}/mri/labels.mgz"}],
         "metrics": {"filled_fraction": 0.0, "rule": "labels"},
     }

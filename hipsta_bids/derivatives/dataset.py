@@ -97,8 +97,8 @@ def settle_settings(root: Path, settings: Settings) -> str:
         current = flatten(resolved)
         if former := recorded.keys() - current.keys():
             raise SettingsError(
-                f"{root}: results of version {earlier.get('version', 'unknown')}, of whose "
-                f"settings {len(former)} are gone ({min(former)}, ...); use a new output folder"
+                f"{root}: results of version {earlier.get('version', 'unknown')}, which had "
+                f"{len(former)} other settings ({min(former)}, ...); use a new output folder"
             )
         keys = current if is_same_version else recorded
         changes = [
@@ -136,8 +136,8 @@ def upgrade_notes(root: Path) -> list[str]:
     earlier = files.read_json(path).get("version") if path.is_file() else None
     if earlier in {None, __version__}:
         return []
-    again = f"{__version__} measures all hemispheres again, with the same settings only"
-    return [f"{root}: results of version {earlier}; {again}"]
+    consequence = f"{__version__} measures all hemispheres again, with the same settings only"
+    return [f"{root}: results of version {earlier}; {consequence}"]
 
 
 def shared_settings(settings: Settings) -> tuple[str, dict[str, Any]]:

@@ -8,7 +8,6 @@ import pytest
 from stand_ins import make_scheme
 
 from hipsta_bids import __version__
-from hipsta_bids import __version__
 from hipsta_bids.derivatives import dataset
 from hipsta_bids.derivatives.dataset import COLUMNS, read_status, update_status, write_sidecar
 from hipsta_bids.derivatives.names import DATASET_FILES
@@ -77,7 +76,8 @@ def test_damaged_settings_are_other_settings(tmp_path, damage):
 def test_settings_that_are_gone_are_those_of_another_version(tmp_path):
     earlier = {"hash": "0", "version": "0.0.9", "settings": {"body": {"plane_tilt": 10.0}}}
     files.write_json(tmp_path / "desc-settings.json", earlier)
-    with pytest.raises(SettingsError, match=r"version 0\.0\.9, .* 1 are gone \(body\.plane_tilt.*new output folder"):
+    gone = r"version 0\.0\.9, .* 1 other settings \(body\.plane_tilt.*new output folder"
+    with pytest.raises(SettingsError, match=gone):
         dataset.settle_settings(tmp_path, Settings())
 
 
@@ -90,7 +90,8 @@ def test_a_new_version_may_add_settings(tmp_path):
     del earlier["settings"]["grid"]
     files.write_json(path, earlier)
     (note,) = dataset.upgrade_notes(tmp_path)
-    assert note.endswith(f"; {__version__} measures all hemispheres again, with the same settings only")
+    again = "measures all hemispheres again, with the same settings only"
+    assert note.endswith(f"results of version 0.0.9; {__version__} {again}")
     assert dataset.settle_settings(tmp_path, Settings()) == digest
     assert files.read_json(path) == current
     files.write_json(path, earlier)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from small_cohorts import FAST, place_of, read_participants, write_hemisphere, write_participants
 
+from hipsta_bids import __version__
 from hipsta_bids.cli.main import main
 from hipsta_bids.derivatives.dataset import identity, update_status
 from hipsta_bids.derivatives.names import HemisphereName
@@ -409,7 +410,7 @@ def test_damaged_hemispheres_are_left_out_by_name_and_other_versions_told(study,
     assert "sub-05, hemisphere L, is excluded: thickness reaches 1e+30 mm" in said.out
     assert "sub-06, hemisphere R, is excluded: 100% of the curvature profile" in said.out
     assert said.err.startswith("warning: hemispheres were measured by several versions, 0.0.9 (1),")
-    assert "measure sub-07_hemi-R with 0.1.0" in said.err
+    assert f"measure sub-07_hemi-R with {__version__}" in said.err
     (path,) = study.out.glob("group/*/excluded.tsv")
     excluded = files.read_tsv(path)
     assert [(row["participant_id"], row["hemi"], row["reason"]) for row in excluded] == [

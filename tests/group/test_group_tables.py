@@ -135,8 +135,10 @@ def test_groups_are_those_of_the_formula(study, capsys):
 def test_values_that_a_table_of_the_user_replaces_are_named(study, capsys):
     rows = read_participants(study.data)
     older = [(rows[2][0], "99"), (rows[3][0], rows[3][2]), (rows[4][0], "n/a")]
-    said, design, _ = run(study, capsys, *with_own_table(study, [("participant_id", "age"), *older]))
-    assert f"note: age of {rows[2][0]} differs from that of earlier tables; own.tsv counts\n" in said
+    table = with_own_table(study, [("participant_id", "age"), *older])
+    said, design, _ = run(study, capsys, *table)
+    label = rows[2][0]
+    assert f"note: age of {label} differs between tables; own.tsv counts\n" in said
     assert design[2]["age"] == "99"
 
 

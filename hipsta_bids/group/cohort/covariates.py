@@ -319,7 +319,7 @@ def _replaced(before: pd.DataFrame, joined: pd.DataFrame, path: Path) -> Iterato
         differs = former.notna() & (former.map(level_name) != current.map(level_name))
         if differs.any():
             people = listed(dict.fromkeys(joined.loc[differs, PARTICIPANT]))
-            yield f"{column} of {people} differs from that of earlier tables; {path.name} counts"
+            yield f"{column} of {people} differs between tables; {path.name} counts"
 
 
 def add_icv(
