@@ -67,11 +67,16 @@ def _draw(
     figures = panels.draw_pages(flat, blocks, width=width)
     for axes in (axes for figure in figures for axes in figure.axes if axes.get_gid() is not None):
         ground = grounds[str(axes.get_gid()).rpartition("-")[2]]
+        letters = axes.bbox.width / (style.LETTER_WIDTH * style.SMALL * style.POINT)
         for number, region in enumerate(ground.names):
             x, y = np.nonzero(ground.subfield == number)
             text = re.sub("_(?=[a-z]+$)", "\n", region)
             place = ground.x[x].mean(), ground.y[y].mean()
-            axes.text(*place, text, fontsize=style.SMALL, ha="center", va="center", bbox=_BOX)
+            turn = 90 if max(map(len, text.split())) > letters * np.ptp(ground.x[x]) else 0
+            axes.text(
+                *place, text, fontsize=style.SMALL, ha="center", va="center", bbox=_BOX,
+                rotation=turn,
+            )  # fmt: skip
     return figures
 
 

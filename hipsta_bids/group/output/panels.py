@@ -265,6 +265,9 @@ def _draw_rows(
     feet = _feet_height(sides, unit)
     tallest = (_TALLEST - _TOP - feet) / len(rows) - _HEAD
     unit = min(unit, max(tallest, _LEAST_VIEW / _VIEW_WIDTH))
+    # Maps that height limits leave no space beside them.
+    unused = (widest(2 * bool(surfaces)) - unit) * (n_flat + 2 * _VIEW_WIDTH * bool(surfaces))
+    space, page_width = space - unused, page_width - unused * len(sides)
     height = round(min(unit * upright, tallest) * MM)
     size = height, round(_VIEW_WIDTH * unit * MM)
     scale = min((_fitting(*surface, size) for surface in surfaces.values()), default=1.0)

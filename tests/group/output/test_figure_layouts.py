@@ -96,6 +96,19 @@ def maps(sides="LR", n_groups=2, n_contrasts=1, *, width=None, like=None, kind="
     return draw_pages(grounds, blocks, width=width)
 
 
+def test_maps_that_the_page_limits_in_height_have_no_space_beside_them():
+    """Six rows of flat maps fill a page before they fill two columns; the label is at their bar."""
+    (tall,) = maps(n_groups=6, n_contrasts=0, width=TWO_COLUMNS, like={"surface": False})
+    (flat,) = maps(n_groups=1, n_contrasts=0, width=TWO_COLUMNS, like={"surface": False})
+    assert flat.get_figwidth() * 25.4 == pytest.approx(TWO_COLUMNS, abs=0.1)
+    beyond = [
+        (1 - max(axes.get_position().x1 for axes in figure.axes)) * figure.get_figwidth()
+        for figure in (tall, flat)
+    ]
+    assert beyond[0] == pytest.approx(beyond[1], abs=0.02)  # inches
+    assert tall.get_figwidth() < 0.8 * flat.get_figwidth()
+
+
 def results(groups=("CN", "AD"), sides="LR", measure="thickness_mean"):
     """Tables of registration and classification."""
     random, nodes = np.random.default_rng(0), np.arange(1, 42)
