@@ -265,7 +265,7 @@ def _draw_rows(
     feet = _feet_height(sides, unit)
     tallest = (_TALLEST - _TOP - feet) / len(rows) - _HEAD
     unit = min(unit, max(tallest, _LEAST_VIEW / _VIEW_WIDTH))
-    # Maps that height limits leave no space beside them.
+    # Maps that height limits leave no space next to them.
     unused = (widest(2 * bool(surfaces)) - unit) * (n_flat + 2 * _VIEW_WIDTH * bool(surfaces))
     space, page_width = space - unused, page_width - unused * len(sides)
     height = round(min(unit * upright, tallest) * MM)
