@@ -36,6 +36,14 @@ def test_metadata_have_this_version(name):
     assert "AGPL-3.0-or-later" in content["license"]
 
 
+def test_metadata_have_one_title_and_one_description():
+    citation, archive = yaml.safe_load(read("CITATION.cff")), json.loads(read(".zenodo.json"))
+    descriptions = {json.loads(read("codemeta.json"))["description"], archive["description"]}
+    assert descriptions == {citation["abstract"].strip()}
+    assert archive["title"] == citation["title"]
+    assert f'title: "{citation["title"]}"' in read("paper/paper.md")
+
+
 def test_wheel_and_sdist_hold_the_files_of_the_package(tmp_path):
     """None is missing, and none that Python or an editor left beside them is added."""
     git = shutil.which("git")

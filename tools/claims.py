@@ -1,4 +1,4 @@
-"""Numbers of the README and of ``docs/validation.md``, and the cells of tables they come from.
+"""Numbers of README, ``docs/validation.md`` and the paper, and the cells of tables they come from.
 
 ``docs/validation/claims.toml`` lists texts of a page with ``{}`` for each number, and for each of
 these its source, ``file | rows | column | which | format``. ``rows`` are conditions on columns, all

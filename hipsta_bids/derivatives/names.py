@@ -273,6 +273,11 @@ def output_path(name: HemisphereName, key: str, desc: str | None = None) -> Pure
     -------
     PurePosixPath
         ``sub-X[/ses-Y]/anat/sub-X[_ses-Y]_hemi-H[_space-S]_seg-P[_label-R][_desc-D]_<suffix><extension>``.
+
+    Raises
+    ------
+    KeyError
+        If there is no output of this key.
     """
     return name.folder / output_name(name, key, desc)
 

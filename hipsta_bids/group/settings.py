@@ -45,5 +45,21 @@ if not TYPE_CHECKING:  # type checkers know the tables of the core
 
 
 def load_group_settings(path: Path | None) -> GroupSettings:
-    """Read settings of the group level; see :func:`hipsta_bids.settings.load_settings`."""
+    """Read a user's TOML file of the group level; settings that it omits keep their defaults.
+
+    Parameters
+    ----------
+    path : Path or None
+        The file; ``None`` gives the defaults.
+
+    Returns
+    -------
+    GroupSettings
+        All settings of the group level.
+
+    Raises
+    ------
+    SettingsError
+        If the file cannot be read, or a key or a value in it is wrong.
+    """
     return toml.read_settings(path, GroupSettings)

@@ -68,7 +68,13 @@ _COLORS = ("#1b9e77", "#d95f02", "#7570b3", "#e7298a", "#66a61e", "#e6ab02", "#a
 
 @cache
 def protocol_names() -> tuple[str, ...]:
-    """List the names of the bundled protocols, in alphabetical order."""
+    """List the names of the bundled protocols, in alphabetical order.
+
+    Returns
+    -------
+    tuple of str
+        Names that :func:`load_protocol` and ``--scheme`` take.
+    """
     files = resources.files("hipsta_bids.protocols").iterdir()
     return tuple(sorted(f.name.removesuffix(".toml") for f in files if f.name.endswith(".toml")))
 

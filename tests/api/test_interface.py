@@ -98,6 +98,26 @@ def test_names_and_exit_codes_are_the_promised_and_the_documented_ones():
     assert [path for path in paths if path not in page.partition("## One hemisphere")[0]] == []
 
 
+def test_functions_of_the_reference_have_their_sections():
+    """As docs/python.md promises; only a function without parameters has no errors."""
+    page = (Path(__file__).parents[2] / "docs" / "api.md").read_text(encoding="utf-8")
+    count = 0
+    for path in re.findall(r"^::: (.+)$", page, re.MULTILINE):
+        module, _, name = path.rpartition(".")
+        if ".extensions." in path and path.split(".")[2] not in PRESENT:
+            continue
+        target = getattr(import_module(module), name)
+        if inspect.isfunction(target):
+            sections = [
+                "Returns",
+                *["Parameters", "Raises"] * bool(inspect.signature(target).parameters),
+            ]
+            lines = inspect.getdoc(target).splitlines()
+            assert [section for section in sections if section not in lines] == [], path
+            count += 1
+    assert count > len(NAMES)
+
+
 def test_other_names_are_refused():
     with pytest.raises(AttributeError, match="sheet_plot"):
         _ = hb.sheet_plot

@@ -1,4 +1,4 @@
-"""Every number of docs/validation.md, and of README's claims, comes from a table."""
+"""Every number of docs/validation.md, and of claims of README and paper, comes from a table."""
 
 import json
 import re
@@ -17,6 +17,12 @@ TEXTS = {
     # The claims of the README are its bullets in bold.
     "README.md": "\n".join(
         re.findall(r"^- \*\*.*(?:\n  .*)*", (ROOT / "README.md").read_text("utf-8"), re.MULTILINE)
+    ),
+    # The claims of the paper are its paragraph on the same files.
+    "paper/paper.md": next(
+        text
+        for text in (ROOT / "paper" / "paper.md").read_text("utf-8").split("\n\n")
+        if " measured the same files" in text
     ),
 }
 CLAIMS = [claim for page in TEXTS for claim in read_claims(page)]

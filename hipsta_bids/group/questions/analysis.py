@@ -27,8 +27,20 @@ CONTAINS = {"thickness": ("volume", "surface_volume_ratio")}
 def analyze_cohort(request: Request) -> Analysis:
     """Register, fit a model at each point and to each summary measure, and classify.
 
-    The request is planned (:func:`hipsta_bids.group.output.steps.plan_steps`). ModelError if the
-    model cannot be fitted to these data.
+    Parameters
+    ----------
+    request : Request
+        Cohort, model and settings, planned by :func:`hipsta_bids.group.output.steps.plan_steps`.
+
+    Returns
+    -------
+    Analysis
+        The request with results: registration, maps and summary measures of fits, classification.
+
+    Raises
+    ------
+    ModelError
+        If the model cannot be fitted to these data.
     """
     analysis = design(request)
     for step in LINE:
