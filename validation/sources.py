@@ -17,9 +17,10 @@ import hipsta_bids
 
 #: Where packages lie: that of an installed wheel is not in the checkout.
 _ROOTS = (Path(hipsta_bids.__file__).parents[1], Path(__file__).resolve().parents[1])
-#: What shows, names and writes results, and changes no number. Packages: the version is in one.
+#: What opens files, shows, names and writes results, and changes no number. Packages: the version
+#: is in one.
 _APART = re.compile(
-    r"hipsta_bids|hipsta_bids\.(api|cli|derivatives|reports)\b.*|validation|validation\.(report|sources)"
+    r"hipsta_bids|hipsta_bids\.(api|cli|derivatives|opening|reports)\b.*|validation|validation\.(report|sources)"
 )
 #: Modules that are named in texts: joints, and processes of their own.
 _NAMED = re.compile(r"\"(hipsta_bids(?:\.\w+)+)[:\"]")
@@ -52,7 +53,8 @@ def code_of(*modules: str) -> Code:
 def changed(record: Mapping[str, Any], *modules: str) -> list[str]:
     """List the folders whose code differs from that of a record; all, if the record has none."""
     now, then = code_of(*modules), record.get("code", {})
-    return sorted(name for name in {*now, *then} if now.get(name) != then.get(name))
+    names = {name for name in {*now, *then} if not _APART.fullmatch(name)}
+    return sorted(name for name in names if now.get(name) != then.get(name))
 
 
 def _folder(module: str) -> str:

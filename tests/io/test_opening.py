@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import pytest
 from input_cases import touch
@@ -50,6 +51,19 @@ def test_a_file_of_any_size_is_read_up_to_a_limit(tmp_path):
         opening.open_regular(tmp_path / "y")
     with pytest.raises(OSError, match="no regular file"):
         opening.open_regular(tmp_path)
+
+
+def test_a_file_that_grows_while_it_is_read_is_read_whole(tmp_path, monkeypatch):
+    path, true_status = tmp_path / "x", os.fstat
+    path.write_bytes(b"12345678")
+
+    def before(descriptor):
+        return SimpleNamespace(st_size=3, st_mode=true_status(descriptor).st_mode)
+
+    monkeypatch.setattr(opening.os, "fstat", before)
+    assert opening.read_bounded(path, 8) == b"12345678"
+    with pytest.raises(OSError, match="larger"):
+        opening.read_bounded(path, 7)
 
 
 @pytest.mark.parametrize(
