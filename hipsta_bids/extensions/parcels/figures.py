@@ -64,7 +64,7 @@ def _draw(
     ]
     flat = {hemi: replace(g, names=("",) * len(g.names)) for hemi, g in grounds.items()}
     width = style.TWO_COLUMNS if len(flat) > 1 else style.ONE_COLUMN
-    figures = panels.draw_pages(flat, blocks, width=width)
+    figures = panels.draw_pages(flat, blocks, widest=width)
     for axes in (axes for figure in figures for axes in figure.axes if axes.get_gid() is not None):
         ground = grounds[str(axes.get_gid()).rpartition("-")[2]]
         letters = axes.bbox.width / (style.LETTER_WIDTH * style.SMALL * style.POINT)

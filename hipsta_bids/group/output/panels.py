@@ -84,12 +84,14 @@ def draw_pages(
     *,
     views: Views | None = None,
     width: float | None = None,
+    widest: float | None = None,
     dpi: float = DOTS_PER_INCH,
 ) -> "list[Figure]":
     """Draw rows; the rows of a block are on one figure.
 
-    ``views`` keeps views of surfaces for the next call; ``width`` is in mm; pictures of surfaces
-    have ``dpi`` dots per inch.
+    ``views`` keeps views of surfaces for the next call. ``width`` is the width of figures in mm;
+    ``widest`` is an upper limit for figures that are as narrow as their height allows. Pictures of
+    surfaces have ``dpi`` dots per inch.
     """
     pages: list[list[Row]] = [[]]
     for block in blocks:
@@ -97,7 +99,7 @@ def draw_pages(
             pages.append([])
         pages[-1] += block
     views = {} if views is None else views
-    return [_draw_rows(sides, rows, views, width, dpi) for rows in pages]
+    return [_draw_rows(sides, rows, views, (width, widest), dpi) for rows in pages]
 
 
 def _axes_of(mesh: Mesh, shape: tuple[int, ...], hemi: str, *, sheet: bool) -> dict[str, Float]:
@@ -247,11 +249,17 @@ def _view_columns(
 
 
 def _draw_rows(
-    sides: Mapping[str, Ground], rows: Sequence[Row], views: Views, width: float | None, dpi: float
+    sides: Mapping[str, Ground],
+    rows: Sequence[Row],
+    views: Views,
+    widths: tuple[float | None, float | None],
+    dpi: float,
 ) -> "Figure":
     """Draw rows of panels; all boxes are whole pixels, so that pictures are not resampled."""
+    width, limit = widths
     surfaces = dict(_surfaces(sides))
-    page_width = width or (style.TWO_COLUMNS if len(sides) > 1 and surfaces else style.ONE_COLUMN)
+    usual = (style.ONE_COLUMN, style.TWO_COLUMNS)[min(len(sides) - 1, len(surfaces), 1)]
+    page_width = width or limit or usual
     space = (page_width - _LEFT - _RIGHT - _BETWEEN * (len(sides) - 1)) / len(sides)
     n_flat = int(any(ground.unfolded for ground in sides.values()))
 
@@ -265,9 +273,9 @@ def _draw_rows(
     feet = _feet_height(sides, unit)
     tallest = (_TALLEST - _TOP - feet) / len(rows) - _HEAD
     unit = min(unit, max(tallest, _LEAST_VIEW / _VIEW_WIDTH))
-    # Maps that height limits leave no space next to them.
-    unused = (widest(2 * bool(surfaces)) - unit) * (n_flat + 2 * _VIEW_WIDTH * bool(surfaces))
-    space, page_width = space - unused, page_width - unused * len(sides)
+    if width is None:  # no space is left next to maps of limited height
+        unused = (widest(2 * bool(surfaces)) - unit) * (n_flat + 2 * _VIEW_WIDTH * bool(surfaces))
+        space, page_width = space - unused, page_width - unused * len(sides)
     height = round(min(unit * upright, tallest) * MM)
     size = height, round(_VIEW_WIDTH * unit * MM)
     scale = min((_fitting(*surface, size) for surface in surfaces.values()), default=1.0)

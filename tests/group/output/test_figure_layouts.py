@@ -87,19 +87,19 @@ def titled():
     return [replace(row, title=f"control-patient: freesurfer (n = 14); {', '.join(NINE)}")] * 2
 
 
-def maps(sides="LR", n_groups=2, n_contrasts=1, *, width=None, like=None, kind="t", name="CN-AD",
-         scale=1.0, smallest=1e-6):  # fmt: skip
+def maps(sides="LR", n_groups=2, n_contrasts=1, *, width=None, widest=None, like=None, kind="t",
+         name="CN-AD", scale=1.0, smallest=1e-6):  # fmt: skip
     names = {"D": "LR", "B": "both"}
     grounds = {names.get(hemi, hemi): ground(hemi, **(like or {})) for hemi in sides}
     options = {"kind": kind, "name": name, "scale": scale, "smallest": smallest}
     blocks = list(rows_of(grounds, n_groups, n_contrasts, **options))
-    return draw_pages(grounds, blocks, width=width)
+    return draw_pages(grounds, blocks, width=width, widest=widest)
 
 
 def test_maps_that_the_page_limits_in_height_have_no_space_beside_them():
     """Six rows of flat maps fill a page before they fill two columns; the label is at their bar."""
-    (tall,) = maps(n_groups=6, n_contrasts=0, width=TWO_COLUMNS, like={"surface": False})
-    (flat,) = maps(n_groups=1, n_contrasts=0, width=TWO_COLUMNS, like={"surface": False})
+    (tall,) = maps(n_groups=6, n_contrasts=0, widest=TWO_COLUMNS, like={"surface": False})
+    (flat,) = maps(n_groups=1, n_contrasts=0, widest=TWO_COLUMNS, like={"surface": False})
     assert flat.get_figwidth() * 25.4 == pytest.approx(TWO_COLUMNS, abs=0.1)
     beyond = [
         (1 - max(axes.get_position().x1 for axes in figure.axes)) * figure.get_figwidth()
