@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 from scipy import special
+from scipy.optimize.elementwise import find_root
 
 from hipsta_bids.errors import ModelError
 from hipsta_bids.stats import glm, random_slope
@@ -21,8 +22,6 @@ from hipsta_bids.types import PARTICIPANT
 MAX_CORRELATION = 0.999
 #: Correlations at which the likelihood is looked at first.
 CORRELATIONS = 40
-#: Halvings of the interval that holds the best one.
-HALVINGS = 50
 
 #: Sessions of one participant that distinguish a slope from noise.
 _SLOPE_SESSIONS = 3
@@ -55,6 +54,18 @@ class Sums:
         inverse = np.linalg.inv(self.squares[:, :-1, :-1])
         fixed = inverse @ self.person_squares.sum(axis=0)[:, :-1, :-1]
         return np.asarray(1 - np.trace(fixed, axis1=1, axis2=2) / self.n > glm.MIN_INFORMATION)
+
+    def take(self, points: Int) -> "Sums":
+        """Keep some points."""
+        is_shared = self.sizes.shape[1] == 1
+        return Sums(
+            n=self.n[points],
+            repeated=self.repeated[points],
+            squares=self.squares[points],
+            sizes=self.sizes if is_shared else self.sizes[:, points],
+            people=self.people[:, points],
+            person_squares=self.person_squares[:, points],
+        )
 
     def where(self, usable: Bool) -> "Sums":
         """Replace points that cannot be fitted by harmless ones."""
@@ -139,8 +150,7 @@ def collect_sums(maps: Float, basis: Float, participants: Int) -> Sums:
 def best_ratio(sums: Sums) -> Float:
     """Ratio r of variances that maximizes the restricted likelihood at each point.
 
-    The best of a grid of correlations r / (1 + r), then halving of the interval around it by the
-    sign of the derivative.
+    The best of a grid of correlations r / (1 + r), then the root of the derivative next to it.
     """
     freedom = sums.n - sums.squares.shape[1] + 1
     grid = np.linspace(0.0, MAX_CORRELATION, CORRELATIONS)
@@ -150,17 +160,18 @@ def best_ratio(sums: Sums) -> Float:
         losses.append(freedom * np.log(residual[0]) + penalty[0])
     best = np.argmin(losses, axis=0)
 
-    def rising(correlation: Float) -> Float:
-        *_, residual, penalty = sums.at(correlation / (1 - correlation))
-        return np.asarray(freedom * residual[1] / residual[0] + penalty[1])
+    def rising(correlation: Float, points: Int) -> Float:
+        part = sums.take(points)
+        *_, residual, penalty = part.at(correlation / (1 - correlation))
+        return np.asarray(freedom[points] * residual[1] / residual[0] + penalty[1])
 
+    points = np.arange(len(best))
     low, high = grid[np.maximum(best - 1, 0)], grid[np.minimum(best + 1, len(grid) - 1)]
-    for _ in range(HALVINGS):
-        middle = (low + high) / 2
-        beyond = rising(middle) > 0
-        low, high = np.where(beyond, low, middle), np.where(beyond, middle, high)
-    # Where the loss rises from zero on, the lower limit never leaves it.
-    return np.asarray(low / (1 - low))
+    root = find_root(rising, (low, high), args=(points,))
+    # Where the loss rises or falls all the way, the best is where it begins or ends.
+    edge = np.where(rising(low, points) > 0, low, high)
+    chosen = np.where(root.success, root.x, edge)
+    return np.asarray(chosen / (1 - chosen))
 
 
 def fit_mixed(

@@ -6,14 +6,13 @@ of V = I + Z L L' Z' takes W = L (I + L' A L)^-1 L' between the sums Z' x of its
 of squares.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
 
 from hipsta_bids.stats.arrays import Float, Int
-from hipsta_bids.stats.glm import by_row, information, sum_by
+from hipsta_bids.stats.glm import by_row, chunks, information, sum_by
 
 #: Most steps of the fit with random slopes.
 SLOPE_STEPS = 60
@@ -22,6 +21,12 @@ SLOPE_TOLERANCE = 1e-8
 
 #: Step of numerical derivatives of the three numbers; times have a standard deviation of 1.
 _STEP = 1e-4
+#: That of second ones, and where these look: at the middle, and to both sides along the sum of
+#: each pair of axes.
+_WIDE_STEP = 7 * _STEP
+_PAIRS = np.array([(0, 0), (1, 1), (2, 2), (1, 0), (2, 0), (2, 1)])
+_SHIFTS = _WIDE_STEP * np.eye(3)[_PAIRS].sum(axis=1)
+_CROSS = np.concatenate([np.zeros((1, 3)), _SHIFTS, -_SHIFTS])[:, None]
 #: Damping of the first step, its factor, and when to give up.
 _DAMPING, _FACTOR, _MOST_DAMPING = 1e-3, 6.0, 1e8
 #: A slope of the loss below this is an optimum.
@@ -147,8 +152,8 @@ def best_triangles(sums: SlopeSums) -> Float:
     The best of a few starts, then damped Newton steps with numerical derivatives.
     """
     starts = [np.array(start) for start in product((0.2, 1.0, 3.0), (0.0,), (0.05, 0.3, 1.0))]
-    losses = [_loss(sums, np.tile(start, (len(sums.n), 1))) for start in starts]
-    best: Float = np.array(starts)[np.argmin(losses, axis=0)]
+    tiled = np.broadcast_to(np.array(starts)[:, None], (len(starts), len(sums.n), 3))
+    best: Float = np.array(starts)[np.argmin(_losses(sums, tiled), axis=0)]
     active = np.arange(len(sums.n))
     damping = np.full(len(best), _DAMPING)
     for _ in range(SLOPE_STEPS):
@@ -192,11 +197,9 @@ def slope_freedom(sums: SlopeSums, triangles: Float, rows: Float) -> Float:
         hessian[:, i + 1, 0] = hessian[:, 0, i + 1]
         slopes.append((forms(up, rows) - forms(down, rows)) / (2 * _STEP))
 
-    def fixed_variance(at: Float) -> Float:
-        *_, residual, penalty = solve_slopes(sums, at)
-        return np.asarray(penalty + residual / variance)
-
-    hessian[:, 1:, 1:] = _second(fixed_variance, triangles)
+    solved = (solve_slopes(sums, at) for at in triangles + _CROSS)
+    values = np.array([penalty + residual / variance for *_, residual, penalty in solved])
+    hessian[:, 1:, 1:] = _bend(values)
     form = forms(inverse_here, rows)
     gradient = np.stack([np.ones_like(form), *(slope / form for slope in slopes)], axis=-1)
     size, axes = np.linalg.eigh(hessian)
@@ -218,29 +221,30 @@ def _loss(sums: SlopeSums, triangles: Float) -> Float:
     return np.asarray(freedom * np.log(residual) + penalty)
 
 
+def _losses(sums: SlopeSums, triangles: Float) -> Float:
+    """Losses (tries, points) of several triangles of each point, in blocks that fit in memory."""
+    tries, points = triangles.shape[:2]
+    numbers, flat = np.tile(np.arange(points), tries), triangles.reshape(-1, 3)
+    parts = chunks((sums.person_values.shape[2], len(flat)), sums.products.shape[1])
+    losses = [_loss(sums.take(numbers[part]), flat[part]) for part in parts]
+    return np.concatenate(losses).reshape(tries, points)
+
+
 def _derivatives(sums: SlopeSums, at: Float) -> tuple[Float, Float, Float]:
     """Loss, gradient and Hessian by central differences."""
-    shifts = _STEP * np.eye(3)
-    ups = np.stack([_loss(sums, at + shift) for shift in shifts], axis=1)
-    downs = np.stack([_loss(sums, at - shift) for shift in shifts], axis=1)
-    hessian = _second(lambda point: _loss(sums, point), at)
-    return _loss(sums, at), (ups - downs) / (2 * _STEP), hessian
+    shifts = _STEP * np.eye(3)[:, None]
+    losses = _losses(sums, np.concatenate([at + shifts, at - shifts, at + _CROSS]))
+    gradient = (losses[:3] - losses[3:6]).T / (2 * _STEP)
+    return losses[6], gradient, _bend(losses[6:])
 
 
-def _second(function: Callable[[Float], Float], at: Float) -> Float:
-    """Second derivatives for the three numbers, by central differences of a wider step.
+def _bend(values: Float) -> Float:
+    """Second derivatives (points, 3, 3) from values (13, points) around, by central differences.
 
-    Values next to the middle serve all entries: 13 evaluations.
+    With H that of second derivatives and e of axes, the bend along a pair is (e + f)' H (e + f).
     """
-    step = 10 * _STEP
-    shifts = step * np.eye(3)
-    middle = function(at)
-    shifted = [function(at + shift) + function(at - shift) for shift in shifts]
-    result = np.empty((len(at), 3, 3))
-    for i in range(3):
-        result[:, i, i] = (shifted[i] - 2 * middle) / step**2
-        for j in range(i):
-            corners = function(at + shifts[i] + shifts[j]) + function(at - shifts[i] - shifts[j])
-            mixed = (corners - shifted[i] - shifted[j] + 2 * middle) / (2 * step**2)
-            result[:, i, j] = result[:, j, i] = mixed
+    bends = (values[1:7] + values[7:] - 2 * values[0]) / _WIDE_STEP**2
+    result = np.empty((values.shape[1], 3, 3))
+    for (i, j), bend in zip(_PAIRS, bends, strict=True):
+        result[:, i, j] = result[:, j, i] = bend / 2 - (bends[i] + bends[j]) / 8
     return result
