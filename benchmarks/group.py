@@ -61,8 +61,8 @@ class Run:
     """Processor time by stage, s."""
 
 
-def write_study(data: Path, out: Path, size: int) -> None:
-    """Write a dataset, and what the participant level leaves of it."""
+def write_study(data: Path, out: Path, size: int, n_sessions: int = 1) -> None:
+    """Write a dataset, and what the participant level leaves of it; sessions are a year apart."""
     for more in (["phantom", data, "--n-subjects", 1], [data, out, "participant", "--no-reports"]):
         command = [*COMMAND, *map(str, more)]
         subprocess.run(command, check=True, stdout=subprocess.DEVNULL)  # noqa: S603
@@ -72,26 +72,33 @@ def write_study(data: Path, out: Path, size: int) -> None:
     age, sex = random.uniform(55, 85, size), random.choice(["F", "M"], size)
     rows = zip(names, np.resize(GROUPS, size), [f"{years:.1f}" for years in age], sex, strict=True)
     files.write_tsv(data / "participants.tsv", ["participant_id", "group", "age", "sex"], rows)
+    years = [(f"ses-{n}", f"{2010 + n}-01-01T00:00:00") for n in range(n_sessions)]
+    for name in names if n_sessions > 1 else ():
+        table = data / name / f"{name}_sessions.tsv"
+        table.parent.mkdir(exist_ok=True)
+        files.write_tsv(table, ["session_id", "acq_time"], years)
+    sessions = [f"{n}" for n in range(n_sessions)] if n_sessions > 1 else [None]
+    visits = [(name.removeprefix("sub-"), session) for name in names for session in sessions]
     for seed, place in enumerate(list_results(out)):
-        plan = SimulationPlan(sizes=(min(size, OWN), 0), effect=0)
-        _write_side(place, simulate_cohort(plan, seed), names, random)
+        plan = SimulationPlan(sizes=(min(len(visits), OWN), 0), effect=0)
+        _write_side(place, simulate_cohort(plan, seed), visits, random)
         place.path("qc").unlink()
 
 
 def _write_side(
     place: ResultPlace,
     cohort: SimulatedCohort,
-    names: Sequence[str],
+    visits: Sequence[tuple[str, str | None]],
     random: np.random.Generator,
 ) -> None:
-    """Write one hemisphere of all participants, from that of the phantom."""
+    """Write one hemisphere of all visits, from that of the phantom."""
     sheet, summary = (
         [line.split("\t") for line in place.path(key).read_text(encoding="utf-8").splitlines()]
         for key in ("sheet", "summary")
     )
     every = [
-        replace(place, name=replace(place.name, subject=name.removeprefix("sub-")))
-        for name in names
+        replace(place, name=replace(place.name, subject=subject, session=session))
+        for subject, session in visits
     ]
     for i, new in enumerate(every):
         new.path("qc").parent.mkdir(parents=True, exist_ok=True)

@@ -16,7 +16,7 @@ COMMAND = ("-m", "hipsta_bids.cli.main")
 PATHS = "import sys, pathlib; a, *b = map(pathlib.Path, sys.argv[1:]); "
 FIND = f"{PATHS}import hipsta_bids.inputs.search as s; s.find_inputs(s.InputRequest(bids_dir=a))"
 STUBS = f"{PATHS}import discovery; discovery.write_stubs(a, int(str(b[0])))"
-STUDY = f"{PATHS}import group; group.write_study(a, b[0], int(str(b[1])))"
+STUDY = f"{PATHS}import group; group.write_study(a, b[0], *map(int, str(b[1]).split('x')))"
 N_SUBJECTS, TURNS = 10_000, 3
 
 
@@ -32,8 +32,9 @@ def list_commands(work: Path, options: argparse.Namespace) -> dict[str, tuple[st
     commands[f"find {N_SUBJECTS} x 2"] = ("-c", FIND, str(stubs))
     for size in options.sizes:
         study = f"{work}/bids-{size}", f"{work}/results-{size}"
-        run(ROOT, ("-c", STUDY, *study, str(size)))
-        commands[f"group {size}"] = (*COMMAND, *study, "group")
+        run(ROOT, ("-c", STUDY, *study, size))
+        further = ("--longitudinal",) if "x" in size else ()
+        commands[f"group {size}"] = (*COMMAND, *study, "group", *further)
     return commands
 
 
@@ -53,7 +54,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("bids_dir", type=Path, nargs="?", help="real labels, measured as well")
     parser.add_argument("--baseline", required=True, metavar="COMMIT")
-    parser.add_argument("--sizes", type=int, nargs="*", default=(40, 500), metavar="N")
+    parser.add_argument("--sizes", nargs="*", default=("40", "500", "40x4"), metavar="N[xVISITS]")
     parser.add_argument("--json", type=Path, metavar="FILE")
     options = parser.parse_args(arguments)
     rows = dict[str, list[float]]()

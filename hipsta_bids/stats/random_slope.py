@@ -27,6 +27,8 @@ _WIDE_STEP = 7 * _STEP
 _PAIRS = np.array([(0, 0), (1, 1), (2, 2), (1, 0), (2, 0), (2, 1)])
 _SHIFTS = _WIDE_STEP * np.eye(3)[_PAIRS].sum(axis=1)
 _CROSS = np.concatenate([np.zeros((1, 3)), _SHIFTS, -_SHIFTS])[:, None]
+#: Values at a time, so that what is made of them stays in the processor's cache.
+_BLOCK = 50_000
 #: Damping of the first step, its factor, and when to give up.
 _DAMPING, _FACTOR, _MOST_DAMPING = 1e-3, 6.0, 1e8
 #: A slope of the loss below this is an optimum.
@@ -103,6 +105,15 @@ def solve_slopes(sums: SlopeSums, triangles: Float) -> tuple[Float, Float, Float
     Returns coefficients (points, columns), their covariance over the residual variance, the sum of
     squared residuals (points,), and log |V| + log |X' V^-1 X| (points,).
     """
+    information, right, squares, log_spread = _equations(sums, triangles)
+    inverse = np.asarray(np.linalg.inv(information), dtype=np.float64)
+    scores = np.einsum("pij,pj->pi", inverse, right)
+    residual = squares - np.einsum("pi,pi->p", scores, right)
+    return scores, inverse, residual, log_spread + np.linalg.slogdet(information)[1]
+
+
+def _equations(sums: SlopeSums, triangles: Float) -> tuple[Float, Float, Float, Float]:
+    """Normal equations: X' V^-1 X, X' V^-1 y, y' V^-1 y and log |V| of each point."""
     a, b, c = triangles.T[:, :, None]
     n, s, q = sums.moments
     first = 1 + a**2 * n + 2 * a * b * s + b**2 * q
@@ -116,12 +127,8 @@ def solve_slopes(sums: SlopeSums, triangles: Float) -> tuple[Float, Float, Float
     weighted = plain * y + mixed * t, mixed * y + timed * t
     information = sums.squares - _products(x, z, plain, mixed, timed)
     right = sums.products - _sums(x, weighted[0]) - _sums(z, weighted[1])
-    inverse = np.linalg.inv(information)
-    scores = np.einsum("pij,pj->pi", inverse, right)
-    residual = sums.total - np.sum(weighted[0] * y + weighted[1] * t, axis=1)
-    residual -= np.einsum("pi,pi->p", scores, right)
-    penalty = np.log(determinant).sum(axis=1) + np.linalg.slogdet(information)[1]
-    return scores, np.asarray(inverse, dtype=np.float64), residual, penalty
+    squares = sums.total - np.sum(weighted[0] * y + weighted[1] * t, axis=1)
+    return information, right, squares, np.log(determinant).sum(axis=1)
 
 
 def _products(x: Float, z: Float, plain: Float, mixed: Float, timed: Float) -> Float:
@@ -216,16 +223,18 @@ def forms(inverse: Float, rows: Float) -> Float:
 
 def _loss(sums: SlopeSums, triangles: Float) -> Float:
     """Minus twice the restricted likelihood, but for a constant."""
-    *_, residual, penalty = solve_slopes(sums, triangles)
-    freedom = sums.n - sums.squares.shape[1]
-    return np.asarray(freedom * np.log(residual) + penalty)
+    information, right, squares, log_spread = _equations(sums, triangles)
+    scores = np.linalg.solve(information, right[:, :, None])[:, :, 0]
+    residual = squares - np.einsum("pi,pi->p", scores, right)
+    penalty = log_spread + np.linalg.slogdet(information)[1]
+    return np.asarray((sums.n - sums.squares.shape[1]) * np.log(residual) + penalty)
 
 
 def _losses(sums: SlopeSums, triangles: Float) -> Float:
-    """Losses (tries, points) of several triangles of each point, in blocks that fit in memory."""
+    """Losses (tries, points) of several triangles of each point."""
     tries, points = triangles.shape[:2]
     numbers, flat = np.tile(np.arange(points), tries), triangles.reshape(-1, 3)
-    parts = chunks((sums.person_values.shape[2], len(flat)), sums.products.shape[1])
+    parts = chunks((sums.person_values.shape[2], len(flat)), 1, _BLOCK)
     losses = [_loss(sums.take(numbers[part]), flat[part]) for part in parts]
     return np.concatenate(losses).reshape(tries, points)
 

@@ -467,7 +467,7 @@ def _write_title(figure: "Figure", top: int, words: str) -> None:
     room = _size(figure)[0] - (_LEFT + 1) * MM
     title = _text(figure, _LEFT * MM, top - 3.2 * MM, words, fontsize=TITLE, ha="left")
     first, semicolon, second = words.partition("; ")
-    if semicolon and title.get_window_extent().width > room:
+    if semicolon and style.width_of(title) > room:
         title.remove()
         title = _text(figure, _LEFT * MM, top - 4.5 * MM, first, fontsize=TITLE, ha="left")
         style.fit_text(_text(figure, _LEFT * MM, top - 1.6 * MM, second, ha="left"), room)

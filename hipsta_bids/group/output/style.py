@@ -134,11 +134,18 @@ def letter_panels(axes: "Sequence[Axes]") -> None:
         axis.set_title(letter, loc="left", fontsize=LETTER, weight="bold")
 
 
+def width_of(text: "Text") -> float:
+    """Return the pixels that a text takes, measured without a page to draw on."""
+    from matplotlib.backends.backend_agg import RendererAgg  # noqa: PLC0415  (slow to load)
+
+    return text.get_window_extent(RendererAgg(1, 1, text.figure.dpi)).width
+
+
 def fit_text(text: "Text", room: float) -> None:
     """Shorten a text that takes more than some pixels."""
     words = text.get_text()
-    while text.get_window_extent().width > room and len(words) > 1:
-        share = room / text.get_window_extent().width
+    while (width := width_of(text)) > room and len(words) > 1:
+        share = room / width
         words = words[: min(len(words) - 1, int(share * len(words)))].rstrip(ELLIPSIS)
         text.set_text(words.rstrip() + ELLIPSIS)
 
