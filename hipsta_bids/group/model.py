@@ -60,7 +60,9 @@ def find_groups(
 ) -> Groups | None:
     """Find the column of groups and their reference level; ``preferred`` names are first."""
     by_name = {str(column).casefold(): str(column) for column in table.columns}
-    for name in sorted(settings.model.group_columns, key=lambda name: name not in preferred):
+    for name in sorted(
+        settings.model.group_columns, key=lambda name: name.casefold() not in preferred
+    ):
         column = by_name.get(name.casefold())
         values = formulas.typed(table[column]).dropna() if column else None
         if column is None or values is None or values.nunique() < 2:  # noqa: PLR2004 -- two groups
@@ -291,7 +293,7 @@ def choose_model(
     references = _requested_references(request)
     # The groups of tables and figures are those of the formula, if it has any.
     in_formula = {name.casefold() for name in closed_formula(_requested_formula(request)).names}
-    in_formula.intersection_update(settings.model.group_columns)
+    in_formula.intersection_update(map(str.casefold, settings.model.group_columns))
     preferred = list(in_formula) or (comparison or Comparison()).sessions.group_columns
     groups = find_groups(table, settings, preferred=preferred)
     if groups is not None and groups.column in references:
@@ -387,8 +389,9 @@ def _no_groups(table: pd.DataFrame, group_columns: Sequence[str]) -> ModelError:
         else "BIDS_DIR/participants.tsv is missing or has no further columns; add one, or"
         " --covariates"
     )
+    spelled = {*map(str.casefold, group_columns)}
     for name in columns:
-        if name.casefold() in group_columns and table[name].nunique() == 1:  # noqa: PD101 (missing are none)
+        if name.casefold() in spelled and table[name].nunique() == 1:  # noqa: PD101 (missing are none)
             level = table[name].dropna().iloc[0]
             available = f"{name} is {level} for all in the analysis; see --seg, excluded.tsv"
     return ModelError(f"no column has two groups ({', '.join(group_columns)}); {available}")

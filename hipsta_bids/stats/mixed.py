@@ -170,8 +170,8 @@ def best_ratio(sums: Sums) -> Float:
     root = find_root(rising, (low, high), args=(points,))
     # Where the loss rises or falls all the way, the best is where it begins or ends.
     edge = np.where(rising(low, points) > 0, low, high)
-    chosen = np.where(root.success, root.x, edge)
-    return np.asarray(chosen / (1 - chosen))
+    correlation = np.where(root.success, root.x, edge)
+    return np.asarray(correlation / (1 - correlation))
 
 
 def fit_mixed(

@@ -113,7 +113,7 @@ def solve_slopes(sums: SlopeSums, triangles: Float) -> tuple[Float, Float, Float
 
 
 def _equations(sums: SlopeSums, triangles: Float) -> tuple[Float, Float, Float, Float]:
-    """Normal equations: X' V^-1 X, X' V^-1 y, y' V^-1 y and log |V| of each point."""
+    """Return the normal equations, X' V^-1 X, X' V^-1 y and y' V^-1 y, and log |V|."""
     a, b, c = triangles.T[:, :, None]
     n, s, q = sums.moments
     first = 1 + a**2 * n + 2 * a * b * s + b**2 * q

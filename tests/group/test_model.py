@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 from people_tables import participants
 
-from hipsta_bids.errors import UsageError
+from hipsta_bids.errors import ModelError, UsageError
 from hipsta_bids.group.model import (
     ModelRequest,
     choose_model,
@@ -87,6 +87,16 @@ def test_one_level_is_no_group_and_numbers_name_groups_in_their_order():
     assert find_groups(pd.DataFrame({"age": ["1", "2"]}), DEFAULTS) is None
     table = pd.DataFrame({"group": ["10", "2", "0", "0"]})
     assert find_groups(table, DEFAULTS).levels == ("0", "2", "10")
+
+
+def test_names_of_group_columns_in_settings_are_read_in_any_case_of_letters():
+    settings = DEFAULTS.changed(model={"group_columns": ("Group", "Cohort")})
+    table = participants()
+    table = table.assign(cohort=table["group"].to_numpy()[::-1])
+    *_, groups, _ = choose_model(ModelRequest(formula="cohort + age"), table, settings)
+    assert groups.column == "cohort"
+    with pytest.raises(ModelError, match="cohort is CU for all"):
+        choose_model(ModelRequest(), table.assign(group="CU", cohort="CU")[["cohort"]], settings)
 
 
 @pytest.mark.parametrize("formula", [None, "thickness ~ group + age + sex"])

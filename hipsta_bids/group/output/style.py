@@ -138,7 +138,8 @@ def width_of(text: "Text") -> float:
     """Return the pixels that a text takes, measured without a page to draw on."""
     from matplotlib.backends.backend_agg import RendererAgg  # noqa: PLC0415  (slow to load)
 
-    return text.get_window_extent(RendererAgg(1, 1, text.figure.dpi)).width
+    page: Any = RendererAgg  # it has no types
+    return float(text.get_window_extent(page(1, 1, text.figure.dpi)).width)
 
 
 def fit_text(text: "Text", room: float) -> None:
