@@ -224,9 +224,9 @@ def sum_by(numbers: Int, values: Float) -> Float:
     return np.asarray(np.add.reduceat(values[order], starts, axis=0))
 
 
-def chunks(shape: tuple[int, ...], columns: int, n_values: int = _CHUNK) -> Iterator[slice]:
+def chunks(shape: tuple[int, ...], columns: int, n_values: int = 0) -> Iterator[slice]:
     """Split points into ranges with at most some values, such as fit into memory together."""
-    step = max(1, n_values // (shape[0] * columns))
+    step = max(1, (n_values or _CHUNK) // (shape[0] * columns))
     return (slice(start, start + step) for start in range(0, max(shape[1], 1), step))
 
 
