@@ -341,9 +341,11 @@ def _run(parsed: argparse.Namespace, arguments: Sequence[str]) -> ExitCode:
     for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(variable, "1")
     echo_start(LEVEL, parsed.bids_dir)
-    from hipsta_bids.io.files import check_scratch  # noqa: PLC0415  (heavy)
+    from hipsta_bids.io.files import check_scratch, check_writable  # noqa: PLC0415  (heavy)
 
     check_scratch()
+    if parsed.output_dir.is_dir():  # or nothing was measured, which is said later
+        check_writable(parsed.output_dir)
     from hipsta_bids.stats.inference import PROCESSORS  # noqa: PLC0415  (heavy)
 
     PROCESSORS.set(parsed.n_procs)

@@ -387,3 +387,13 @@ def test_other_settings_into_the_same_folder(bids_dir, tmp_path, capsys):
     assert "body.layer_rule was nearest-label, now nearest-sheet" in said
     assert said.count("\n") == 1
     assert {path: path.read_bytes() for path in out.iterdir() if path.is_file()} == before
+
+
+def test_group_level_says_first_that_it_cannot_write(bids_dir, tmp_path, capsys, monkeypatch):
+    def refuse(_):
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    monkeypatch.setattr(os, "fsync", refuse)
+    command = [str(bids_dir), str(tmp_path), "group"]
+    assert main.main(command) == ExitCode.NOT_WRITABLE
+    assert f"{tmp_path}: not allowed to write there" in capsys.readouterr().err
