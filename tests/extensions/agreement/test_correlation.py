@@ -72,7 +72,7 @@ def test_independent_maps_seldom_correlate(fwhm):
     maps = smooth(np.random.default_rng(int(fwhm)), fwhm, 600)
     pairs = list(zip(maps[::2], maps[1::2], strict=True))
     naive = np.mean([stats.pearsonr(*pair).pvalue < 0.05 for pair in pairs])
-    found = [correlate_maps(*pair, sheet(), 200, seed) for seed, pair in enumerate(pairs)]
+    found = [correlate_maps(*pair, sheet(), 100, seed) for seed, pair in enumerate(pairs)]
     assert naive > 0.4
     for name in ("pearson_p", "spearman_p"):
         size = np.mean([one[name] <= 0.05 for one in found])
@@ -86,7 +86,7 @@ def test_maps_with_gaps_keep_the_error_rate():
     maps[:, random.random(maps.shape[1]) < 0.1] = np.nan
     maps[:, :26] = np.nan
     pairs = zip(maps[::2], maps[1::2], strict=True)
-    found = [correlate_maps(*pair, sheet(), 200, seed) for seed, pair in enumerate(pairs)]
+    found = [correlate_maps(*pair, sheet(), 100, seed) for seed, pair in enumerate(pairs)]
     size = np.mean([one["pearson_p"] <= 0.05 for one in found])
     assert 0.012 <= size <= 0.088  # three binomial SDs
 
