@@ -105,6 +105,15 @@ with Hipsta: our thickness at the place of our mid-surface nearest to each of it
 walls that vary. The summary has medians and means of hemispheres with a map.
 """
 
+#: Starts a command and writes what it cost. A process counts the memory of the one that starts it
+#: as its largest, so this one is small.
+STARTER = """
+import json, os, subprocess, sys
+process = subprocess.Popen(sys.argv[2:])
+_, status, usage = os.wait4(process.pid, 0)
+cost = [status, usage.ru_utime + usage.ru_stime, usage.ru_maxrss * 1024 / 1e6]
+open(sys.argv[1], "w").write(json.dumps(cost))
+"""
 THREADS = {f"{name}_NUM_THREADS": "1" for name in ("OMP", "OPENBLAS", "MKL", "NUMEXPR")}
 
 
@@ -136,9 +145,11 @@ def run(command: Sequence[str], folder: Path, limit: float) -> Run:
     A process that waits instead of working is ended after ``PATIENCE`` times the limit.
     """
     folder.mkdir(parents=True, exist_ok=True)
+    cost, shell = folder / "cost.json", ("/bin/sh", "-c", f'ulimit -t {limit:.0f}; exec "$@"', "sh")
+    cost.unlink(missing_ok=True)
     with (folder / "log.txt").open("wb") as log:
         process = subprocess.Popen(  # noqa: S603  (the user's)
-            ["/bin/sh", "-c", f'ulimit -t {limit:.0f}; exec "$@"', "sh", *command],
+            [sys.executable, "-S", "-c", STARTER, str(cost), *shell, *command],
             stdout=log,
             stderr=subprocess.STDOUT,
             env=os.environ | THREADS,
@@ -146,17 +157,17 @@ def run(command: Sequence[str], folder: Path, limit: float) -> Run:
         )
         timer = threading.Timer(PATIENCE * limit, os.killpg, (process.pid, signal.SIGKILL))
         timer.start()
-        _, status, usage = os.wait4(process.pid, 0)
+        process.wait()
         timer.cancel()
-    code = process.returncode = os.waitstatus_to_exitcode(status)
+    killed = [signal.SIGKILL, limit, np.nan]  # for it waited
+    status, cpu, memory = json.loads(cost.read_text("utf-8")) if cost.exists() else killed
+    code = os.waitstatus_to_exitcode(int(status))
     failure = None
     if code in (-signal.SIGKILL, -signal.SIGXCPU):
         failure = f"no result after {limit:.0f} CPU s"
     elif code != 0:
         failure = last_error((folder / "log.txt").read_text("utf-8", "replace"), code)
-    return Run(
-        cpu=usage.ru_utime + usage.ru_stime, memory=usage.ru_maxrss * 1024 / 1e6, failure=failure
-    )
+    return Run(cpu=cpu, memory=memory, failure=failure)
 
 
 def last_error(log: str, code: int) -> str:
