@@ -89,6 +89,18 @@ def warn(text: str) -> None:
     _print(" ".join(text.split()), sys.stderr)
 
 
+def warn_if_lost(folder: Path, mounts: Path = Path("/proc/self/mounts")) -> None:
+    """Warn of results that end with a container: in its layers, or in its memory."""
+    if "HIPSTA_BIDS_CONTAINER_TYPE" not in os.environ or not mounts.is_file():
+        return
+    fields = [line.split() for line in mounts.read_text(encoding="utf-8").splitlines()]
+    kinds = {Path(place.replace(r"\040", " ")): kind for _, place, kind, *_ in fields}
+    real = folder.resolve()
+    place = next((path for path in (real, *real.parents) if path in kinds), Path("/"))
+    if place == Path("/") or (place == Path("/tmp") and kinds[place] == "tmpfs"):  # noqa: S108
+        warn(f"warning: {folder} is lost with the container; mount a folder, as -v HOST:{folder}")
+
+
 def echo_start(level: str, bids_dir: Path) -> None:
     """Print at once what runs: finding the inputs can take a while."""
     echo(f"hipsta_bids {__version__}, {level} level of {bids_dir}")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from hipsta_bids import __version__, joints
 from hipsta_bids.cli import questions
-from hipsta_bids.cli.console import Progress, echo, echo_start, quiet, warn
+from hipsta_bids.cli.console import Progress, echo, echo_start, quiet, warn, warn_if_lost
 from hipsta_bids.cli.parser import (
     Parser,
     adder,
@@ -344,6 +344,7 @@ def _run(parsed: argparse.Namespace, arguments: Sequence[str]) -> ExitCode:
     from hipsta_bids.io.files import check_scratch, check_writable  # noqa: PLC0415  (heavy)
 
     check_scratch()
+    warn_if_lost(parsed.output_dir)
     if parsed.output_dir.is_dir():  # or nothing was measured, which is said later
         check_writable(parsed.output_dir)
     from hipsta_bids.stats.inference import PROCESSORS  # noqa: PLC0415  (heavy)

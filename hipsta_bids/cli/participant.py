@@ -187,6 +187,7 @@ def _run(options: "Namespace", arguments: Sequence[str]) -> ExitCode:
     for name, reason in dict(options.ignored).items():
         console.echo(f"note: {name} has no effect: {reason}")
     check_folders(options)
+    console.warn_if_lost(options.output_dir)
     collects = options.analysis_level == COLLECT
     if collects and options.shard is not None:
         raise UsageError("collect is about all parts; leave --shard out")

@@ -293,7 +293,7 @@ def _classification(results: GroupResults) -> Iterator[str]:
             side, added = cells.summary_side(row["hemi"], row["added"]), row["added"]
             yield (
                 f"{row['control']} against {row['case']}, {side}: {cells.display_name(added)}"
-                f" adds to {row['base']} (p {p_text(row['p'])});"
+                f" adds to {row['base']} (p {p_text(row['p'])}, not corrected);"
                 f" cross-validated area {row['auc_base_cv']:.2f} to {row['auc_full_cv']:.2f}"
             )
 

@@ -10,10 +10,11 @@ import subprocess
 import sys
 import termios
 import time
+from pathlib import Path
 
 import pytest
 
-from hipsta_bids.cli.console import Progress, echo, echo_table
+from hipsta_bids.cli.console import Progress, echo, echo_table, warn_if_lost
 from hipsta_bids.cli.main import main
 from hipsta_bids.progress import each, listening, tell
 
@@ -213,3 +214,25 @@ def test_what_is_nearly_right_gets_a_proposal(arguments, message, tmp_path, monk
     said = capsys.readouterr().err
     assert message in said
     assert said.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("folder", "is_lost"),
+    [("/out/a", False), ("/my data/x", False), ("/results", True), ("/tmp/a", True)],  # noqa: S108
+)
+def test_results_in_no_mounted_folder_are_said_to_be_lost(
+    folder, is_lost, tmp_path, monkeypatch, capsys
+):
+    mounts = tmp_path / "mounts"
+    mounts.write_text(
+        "overlay / overlay rw,relatime 0 0\nproc /proc proc rw 0 0\ntmpfs /tmp tmpfs rw 0 0\n"
+        "/dev/sda1 /out ext4 rw 0 0\ntmpfs /my\\040data tmpfs rw 0 0\n"
+    )
+    warn_if_lost(Path(folder), mounts)
+    assert capsys.readouterr().err == ""  # outside of containers
+    monkeypatch.setenv("HIPSTA_BIDS_CONTAINER_TYPE", "docker")
+    warn_if_lost(Path(folder), mounts)
+    expected = (
+        f"warning: {folder} is lost with the container; mount a folder, as -v HOST:{folder}\n"
+    )
+    assert capsys.readouterr().err == expected * is_lost

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
 from sys import intern
-from typing import Any
+from typing import Any, get_args
 
 import pandas as pd
 
@@ -26,7 +26,9 @@ from hipsta_bids.io.files import checked_foreign
 from hipsta_bids.protocols.toml import settings_hash
 from hipsta_bids.settings import Settings
 from hipsta_bids.stats.formula import listed
-from hipsta_bids.types import PARTICIPANT, SESSION, Decision, VisitKey
+from hipsta_bids.types import PARTICIPANT, SESSION, Decision, End, VisitKey
+
+_ABSENT = "no labels of this side were measured; see inputs.tsv of the participant level"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,6 +77,8 @@ class SheetRecord:
     """Address of the segmentation."""
     provenance: tuple[str, ...]
     """Where its labels come from, in the order of ``PROVENANCE``."""
+    ends: str
+    """How the ends of the body were placed."""
     sheet: tuple[str, ...] = ()
     """Sessions that share its sheet; none if it has its own."""
     doubtful: bool = False
@@ -156,7 +160,7 @@ def collect_sheets(request: GroupRequest, *, may_lack: bool = False) -> Collecti
     _refuse_several_sheets(records)
     return Collection(
         records=records,
-        exclusions=tuple(judged.excluded),
+        exclusions=(*judged.excluded, *_without_result(judged)),
         grid=grid,
         settings_hash=digest,
         quality=pd.DataFrame(judged.quality),
@@ -216,6 +220,19 @@ def _refuse_none(judged: _Judged, request: GroupRequest) -> None:
         raise NothingToDoError(
             f"{request.roots[0]}: no hemisphere is left for the group level ({reasons})"
         )
+
+
+def _without_result(judged: _Judged) -> Iterator[Exclusion]:
+    """List sides that others have, and of which a visit has no result, not even a failure."""
+    sides = {record.result.name.hemi for record in judged.records}
+    judged_sides = {(q[PARTICIPANT], q[SESSION], q["side"]) for q in judged.quality}
+    for record in judged.records:
+        for hemi in sides - {record.result.name.hemi}:
+            absent = Exclusion.of_sheet(
+                replace(record.result.name, hemi=hemi), "no-result", _ABSENT
+            )
+            if (absent.participant, absent.session, hemi) not in judged_sides:
+                yield absent
 
 
 def _not_compared(quality: Iterable[Mapping[str, str | None]]) -> Iterator[str]:
@@ -397,9 +414,19 @@ def _taken(
         version=intern(str(record.get("version"))),
         source=relocate(str(inputs[0].get("file", "")), request.segmentations),
         provenance=tuple(intern(text) for text in provenance_of(record).values()),
+        ends=intern(_ends(record)),
         sheet=tuple(dict.fromkeys(str(v.get("session")) for v in record.get("visits") or ())),
         doubtful=doubtful,
     )
+
+
+def _ends(record: Mapping[str, Any]) -> str:
+    """Name the ends of the body that were estimated, since labels of head or tail are missing."""
+    rules = {end: _metrics(record).get(f"{end}_end_rule") for end in get_args(End)}
+    if None in rules.values():
+        return files.MISSING
+    estimated = [end for end, rule in rules.items() if rule not in {"labels", "user"}]
+    return f"{' and '.join(estimated)} estimated" if estimated else "labeled"
 
 
 def _metrics(record: Mapping[str, Any]) -> dict[str, Any]:

@@ -191,9 +191,10 @@ def _models(analysis: Analysis, settings: GroupSettings, cite: Callable[[str], s
     levels = escaped(", ".join(map(" ".join, analysis.design.references.items())))
     fits = [fit for maps in analysis.fitted.values() for fit in maps.fits.values()]
     sessions = analysis.comparison.sessions
+    place = "at each point of the sheet" if analysis.fitted else "to each summary measure"
     text = (
-        f"A {analysis.row_model.kind}, {code(analysis.model.text)}, was fitted at each point of the"
-        f" sheet{sessions.subject}{f' (reference levels: {levels})' if levels else ''}."
+        f"A {analysis.row_model.kind}, {code(analysis.model.text)}, was fitted {place}"
+        f"{sessions.subject}{f' (reference levels: {levels})' if levels else ''}."
     )
     if analysis.model.maps:
         text += f" Maps were covariates, with the value of each point {cite('point-covariates')}."
@@ -211,7 +212,7 @@ def _models(analysis: Analysis, settings: GroupSettings, cite: Callable[[str], s
     if "Satterthwaite" in text and any(contrast.n_rows > 1 for contrast in contrasts):
         text += f" Contrasts of several rows were tested by F {cite('fai')}."
     text += sessions.findings(fits, cite)
-    text += f" {_correction(settings.multiplicity, cite, analysis)}"
+    text += f" {_correction(settings.multiplicity, cite, analysis)}" if analysis.fitted else ""
     text += _effect_sizes(analysis, settings, cite)
     return f"{text}{_nonlinear(analysis, settings)}"
 

@@ -223,7 +223,8 @@ def _measures(cohort: Cohort, analysis: results.Analysis) -> Iterator[Columns]:
 def with_fdr(table: pd.DataFrame, settings: GroupSettings) -> pd.DataFrame:
     """Correct the tests of one contrast for the number of measures, sides and models.
 
-    Means of one map over regions are a separate family.
+    Means of one map over regions are a separate family. The two-stage procedure can adjust a p to
+    less than it was; it stays where it was, so that no measure is listed for the others' effects.
     """
     rules = settings.multiplicity
     method = "bh" if rules.method == "bh" else "fdr2"
@@ -231,9 +232,7 @@ def with_fdr(table: pd.DataFrame, settings: GroupSettings) -> pd.DataFrame:
     maps = np.array([name if of_region else "" for name, of_region, _ in parts], dtype=object)
     for _, rows in table.groupby(["contrast", maps], sort=False):
         discoveries = control_fdr(rows["p"].to_numpy(dtype=np.float64), rules.alpha, method)
-        one_sided = rows["alternative"].notna() if "alternative" in rows else False
-        floor = np.where(one_sided, rows["p"], 0.0)  # see Discoveries.at_least
-        table.loc[rows.index, "p_fdr"] = np.maximum(discoveries.adjusted, floor)
+        table.loc[rows.index, "p_fdr"] = np.maximum(discoveries.adjusted, rows["p"])
     return table
 
 

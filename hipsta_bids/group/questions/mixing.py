@@ -20,6 +20,8 @@ from hipsta_bids.types import PARTICIPANT, SESSION, p_text
 #: Largest difference of two edges of voxels, as a share: fields of view differ so within a
 #: protocol, while 0.75 and 0.8 mm are two. Level of tests, for a clause only.
 _SAME_EDGE, _LEVEL = 0.05, 0.05
+#: What labels may have or lack with any program; a mix is named, and not refused.
+_ENDS = "ends of the body"
 
 
 def with_mixes(
@@ -46,6 +48,8 @@ def with_mixes(
             f"hemispheres of one analysis differ in {'; '.join(map(mixed.__getitem__, refused))};"
             f" segment all alike, exclude some, or allow it by --mixed {' '.join(refused)}"
         )
+    if len(ends := Counter(frame[_ENDS])) > 1:
+        mixed[_ENDS] = f"{_ENDS}: {counts_text(ends)}"
     values = {str(term): frame[key].map(complete[term]) for term in complete}
     values |= {"session": frame[SESSION], "side": frame["side"]}
     lines = (
@@ -58,11 +62,11 @@ def with_mixes(
 def _origins(study: Study) -> pd.DataFrame:
     """Return the origin of the labels of each hemisphere of a cohort."""
     table, sides = study.cohort.table, study.cohort.sides
-    records = ((record.result.name, record.provenance) for record in study.collection.records)
+    records = ((r.result.name, (*r.provenance, r.ends)) for r in study.collection.records)
     origins = {(visit_name(n.subject, n.session), n.hemi): origin for n, origin in records}
     places = [(visit, hemi) for hemi, side in sides.items() for visit in table.index[side.rows]]
     entries = [(*place, *origins[place]) for place in places if place in origins]
-    frame = pd.DataFrame(entries, columns=["visit", "side", *PROVENANCE])
+    frame = pd.DataFrame(entries, columns=["visit", "side", *PROVENANCE, _ENDS])
     return frame.join(table[[PARTICIPANT, SESSION]], on="visit")
 
 

@@ -79,7 +79,9 @@ def fit_summaries(
     fit(
         adjusted.formula, rows_of(larger), lambda n: data.grows_with_head(n) and n not in covariates
     )
-    return fits, [f"{data.SIZES} are also tested with head size ({icv})"]
+    unknown = len(design.rows) - len(larger.rows)
+    without = f", which is not known for {unknown} of {len(design.rows)} rows" if unknown else ""
+    return fits, [f"{data.SIZES} are also tested with head size ({icv}){without}"]
 
 
 def _with_head_size(

@@ -93,3 +93,13 @@ def test_a_rating_for_use_overrules_the_decision(study, rating, kept, tmp_path):
     left_out = [(one.participant, one.hemi, one.reason) for one in found.exclusions]
     assert left_out == ([] if kept else [("sub-02", "R", "look: notch")])
     assert not any(record.doubtful for record in found.records)
+
+
+def test_a_side_without_a_result_is_listed_if_others_have_it(tmp_path):
+    _, out = write_dataset(tmp_path)
+    place_of(out, "02", "R").path("qc").unlink()
+    (absent,) = collect_sheets(GroupRequest(roots=(out,))).exclusions
+    assert (absent.participant, absent.hemi, absent.reason) == ("sub-02", "R", "no-result")
+    for path in out.rglob("*_hemi-R_*desc-qc_metrics.json"):
+        path.unlink()
+    assert not collect_sheets(GroupRequest(roots=(out,))).exclusions

@@ -3,9 +3,12 @@
 from dataclasses import replace
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from hipsta_bids.group.output.columns import Frame, find_clusters, peak_table
+from hipsta_bids.group.output.tables import with_fdr
+from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.stats.clusters import sheet_edges
 from hipsta_bids.stats.contrasts import Contrast
 from hipsta_bids.stats.glm import fit_points
@@ -173,3 +176,14 @@ def test_shares_leave_out_points_without_a_subfield():
     for words, shares in ((["n/a"] * 4, ""), (["SUB", "n/a", "n/a", "SUB"], "SUB 50%")):
         ((_, cluster),) = find_clusters(significant, np.ones(4), np.array(words), edges)
         assert cluster == {"extent": 4, "shares": shares}
+
+
+def test_summary_measures_are_not_listed_for_the_effects_of_others():
+    p = np.array([1e-6, 2e-6, 1e-5, 1e-4, 1e-3, 2e-3, 0.01, 0.069, np.nan])
+    assert control_fdr(p, 0.05, "fdr2").adjusted[7] < 0.05  # as the procedure has it
+    table = pd.DataFrame({"contrast": "CN-AD", "measure": [f"m{i}" for i in range(9)], "p": p})
+    adjusted = with_fdr(table.assign(p_fdr=np.nan), GroupSettings())["p_fdr"]
+    assert adjusted[7] == p[7]
+    assert (adjusted[:7] >= p[:7]).all()
+    assert (adjusted[:7] < 0.05).all()
+    assert np.isnan(adjusted[8])

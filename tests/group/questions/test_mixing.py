@@ -126,6 +126,24 @@ def refused(call, dataset, *options):
     return line
 
 
+def test_ends_that_were_estimated_in_one_group_are_named_and_not_refused(tmp_path, call):
+    dataset = make(tmp_path, lambda *_: USUAL)
+    for path in dataset[1].rglob("*_desc-qc_metrics.json"):
+        record = files.read_json(path)
+        patient = is_patient(int(path.name[4:6]) - 1)
+        rules = {"posterior": "labels", "anterior": "core" if patient else "user"}
+        record["metrics"] |= {f"{end}_end_rule": rule for end, rule in rules.items()}
+        files.write_json(path, record)
+    result = call(dataset)
+    (line,) = result.lines
+    counts = "ends of the body: anterior estimated (12), labeled (12)"
+    assert f"hemispheres differ in {counts}; association with group p 0.002 (Fisher" in line
+    assert line.endswith("effects of group may be effects of ends of the body")
+    assert "Note that hemispheres differ in ends of the body" in result.methods
+    assert "was fitted to each summary measure" in result.methods
+    assert "point" not in result.methods.partition("## Statistics")[2].partition("##")[0]
+
+
 @pytest.mark.parametrize("field", PROVENANCE)
 def test_each_kind_of_mix_is_refused_or_named(tmp_path, call, field):
     dataset = make(tmp_path, patients_differ(field))
