@@ -1,9 +1,12 @@
-"""The counts of names and imports that the rules exclude, on sources with known counts."""
+"""Names that the rules exclude, counted in known sources; and names of tests in scripts."""
 
+import re
 from pathlib import Path
 
 import names
 import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
 
 BINDINGS = """
 import other
@@ -76,3 +79,14 @@ def test_the_list_names_file_and_line(tmp_path: Path, capsys: pytest.CaptureFixt
     path.write_text("found = 1\nresult = found\nwhy = found\n")
     assert names.main(["names", "--list", str(path)]) == 0
     assert capsys.readouterr().out == f"{path}:1 found\n{path}:3 why\n"
+
+
+def test_long_checks_name_tests_that_exist():
+    scripts = sorted((ROOT / "tools").glob("test-*"))
+    named = {
+        (script.name, pattern)
+        for script in scripts
+        for pattern in re.findall(r"\btests/[\w/*]+\.py\b", script.read_text("utf-8"))
+    }
+    assert len(named) > 3
+    assert not [(name, pattern) for name, pattern in named if not any(ROOT.glob(pattern))]
