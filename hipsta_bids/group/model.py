@@ -393,7 +393,7 @@ def _no_groups(table: pd.DataFrame, group_columns: Sequence[str]) -> ModelError:
     for name in columns:
         if name.casefold() in spelled and table[name].nunique() == 1:  # noqa: PD101 (missing are none)
             level = table[name].dropna().iloc[0]
-            available = f"{name} is {level} for all in the analysis; see --seg, excluded.tsv"
+            available = f"{name} is {level} for all in the analysis; see --seg and --exclude"
     return ModelError(f"no column has two groups ({', '.join(group_columns)}); {available}")
 
 

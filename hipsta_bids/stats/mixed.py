@@ -168,9 +168,9 @@ def best_ratio(sums: Sums) -> Float:
     points = np.arange(len(best))
     low, high = grid[np.maximum(best - 1, 0)], grid[np.minimum(best + 1, len(grid) - 1)]
     root = find_root(rising, (low, high), args=(points,))
-    # Where the loss rises or falls all the way, the best is where it begins or ends.
-    edge = np.where(rising(low, points) > 0, low, high)
-    correlation = np.where(root.success, root.x, edge)
+    # Without a valley, the loss rises or falls all the way, and the best is at an end of the grid.
+    has_valley = root.success & (rising(low, points) < 0)
+    correlation = np.where(has_valley, root.x, grid[best])
     return np.asarray(correlation / (1 - correlation))
 
 
