@@ -96,6 +96,9 @@ def warn_if_lost(folder: Path, mounts: Path = Path("/proc/self/mounts")) -> None
     fields = [line.split() for line in mounts.read_text(encoding="utf-8").splitlines()]
     kinds = {Path(place.replace(r"\040", " ")): kind for _, place, kind, *_ in fields}
     real = folder.resolve()
+    present = next(path for path in (real, *real.parents) if path.exists())
+    if not os.access(present, os.W_OK):
+        return  # nothing can be written there, as will be said
     place = next((path for path in (real, *real.parents) if path in kinds), Path("/"))
     if place == Path("/") or (place == Path("/tmp") and kinds[place] == "tmpfs"):  # noqa: S108
         warn(f"warning: {folder} is lost with the container; mount a folder, as -v HOST:{folder}")

@@ -228,6 +228,7 @@ def test_results_in_no_mounted_folder_are_said_to_be_lost(
         "overlay / overlay rw,relatime 0 0\nproc /proc proc rw 0 0\ntmpfs /tmp tmpfs rw 0 0\n"
         "/dev/sda1 /out ext4 rw 0 0\ntmpfs /my\\040data tmpfs rw 0 0\n"
     )
+    monkeypatch.setattr(os, "access", lambda *_: True)
     warn_if_lost(Path(folder), mounts)
     assert capsys.readouterr().err == ""  # outside of containers
     monkeypatch.setenv("HIPSTA_BIDS_CONTAINER_TYPE", "docker")
@@ -236,3 +237,6 @@ def test_results_in_no_mounted_folder_are_said_to_be_lost(
         f"warning: {folder} is lost with the container; mount a folder, as -v HOST:{folder}\n"
     )
     assert capsys.readouterr().err == expected * is_lost
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    warn_if_lost(Path(folder), mounts)
+    assert capsys.readouterr().err == ""  # one line will say that it cannot be written
