@@ -225,14 +225,11 @@ def _refuse_none(judged: _Judged, request: GroupRequest) -> None:
 def _without_result(judged: _Judged) -> Iterator[Exclusion]:
     """List sides that others have, and of which a visit has no result, not even a failure."""
     sides = {record.result.name.hemi for record in judged.records}
-    judged_sides = {(q[PARTICIPANT], q[SESSION], q["side"]) for q in judged.quality}
-    for record in judged.records:
-        for hemi in sides - {record.result.name.hemi}:
-            absent = Exclusion.of_sheet(
-                replace(record.result.name, hemi=hemi), "no-result", _ABSENT
-            )
-            if (absent.participant, absent.session, hemi) not in judged_sides:
-                yield absent
+    present = {(name.subject, name.session, name.hemi) for name, _ in judged.digests}
+    for name in (record.result.name for record in judged.records):
+        for hemi in sides - {name.hemi}:
+            if (name.subject, name.session, hemi) not in present:
+                yield Exclusion.of_sheet(replace(name, hemi=hemi), "no-result", _ABSENT)
 
 
 def _not_compared(quality: Iterable[Mapping[str, str | None]]) -> Iterator[str]:
@@ -422,7 +419,8 @@ def _taken(
 
 def _ends(record: Mapping[str, Any]) -> str:
     """Name the ends of the body that were estimated, since labels of head or tail are missing."""
-    rules = {end: _metrics(record).get(f"{end}_end_rule") for end in get_args(End)}
+    metrics = record.get("metrics") or {}
+    rules = {end: metrics.get(f"{end}_end_rule") for end in get_args(End)}
     if None in rules.values():
         return files.MISSING
     estimated = [end for end, rule in rules.items() if rule not in {"labels", "user"}]
