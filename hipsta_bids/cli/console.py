@@ -109,6 +109,12 @@ def echo_start(level: str, bids_dir: Path) -> None:
     echo(f"hipsta_bids {__version__}, {level} level of {bids_dir}")
 
 
+def echo_ignored(options: Sequence[tuple[str, str]]) -> None:
+    """Print which options of other BIDS Apps were given, and why they change nothing."""
+    for name, reason in dict(options).items():
+        echo(f"note: {name} has no effect: {reason}")
+
+
 @contextmanager
 def quiet(enabled: bool) -> Iterator[None]:
     """Print only problems, if that is wanted."""

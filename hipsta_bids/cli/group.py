@@ -9,14 +9,16 @@ from typing import TYPE_CHECKING
 
 from hipsta_bids import __version__, joints
 from hipsta_bids.cli import questions
-from hipsta_bids.cli.console import Progress, echo, echo_start, quiet, warn, warn_if_lost
+from hipsta_bids.cli.console import Progress, echo, echo_ignored, echo_start, quiet, warn, warn_if_lost
 from hipsta_bids.cli.parser import (
     Parser,
+    accept,
     adder,
     bids_label,
     factor_level,
     from_namespace,
     given_settings,
+    help_texts,
     model_text,
     positive_int,
 )
@@ -63,6 +65,8 @@ def group_parser() -> Parser:
     parser.add_argument("output_dir", type=Path, help="the participant level's output dataset")
     parser.add_argument("analysis_level", choices=[LEVEL], help=LEVEL)
     parser.add_argument("--version", action="version", version=f"hipsta_bids {__version__}")
+    raw = {"--skip-bids-validation": "the raw dataset is never validated"}
+    accept(parser, {**help_texts()["without meaning"], **raw})
     _add_sheets(parser)
     for source in joints.find_sources():
         joints.load(source.options)(parser)
@@ -334,6 +338,7 @@ def _check_model(parsed: argparse.Namespace) -> None:
 
 
 def _run(parsed: argparse.Namespace, arguments: Sequence[str]) -> ExitCode:
+    echo_ignored(parsed.ignored)
     _check_model(parsed)
     if parsed.reports_only:
         return _rebuild_reports(parsed.output_dir, parsed.name)

@@ -184,8 +184,7 @@ def run_participant_level(options: "Namespace", arguments: Sequence[str] = ()) -
 
 def _run(options: "Namespace", arguments: Sequence[str]) -> ExitCode:
     pin_threads()
-    for name, reason in dict(options.ignored).items():
-        console.echo(f"note: {name} has no effect: {reason}")
+    console.echo_ignored(options.ignored)
     check_folders(options)
     console.warn_if_lost(options.output_dir)
     collects = options.analysis_level == COLLECT

@@ -135,6 +135,14 @@ def test_options_without_meaning_are_noted(tmp_path, capsys):
     assert "has no effect" not in capsys.readouterr().out
 
 
+def test_the_group_level_accepts_them_too(tmp_path, capsys):
+    options = "--omp-nthreads 4 --low-mem --skip-bids-validation".split()
+    assert main.main([str(tmp_path), str(tmp_path), "group", *options]) == 66
+    said = capsys.readouterr().out
+    for name in ("--omp-nthreads", "--low-mem", "--skip-bids-validation"):
+        assert f"note: {name} has no effect: " in said
+
+
 @pytest.mark.usefixtures("seen")
 def test_quiet(tmp_path, capsys):
     assert main.main(["in", str(tmp_path), "participant", "--quiet", "--notrack"]) == 0
