@@ -86,7 +86,7 @@ separable: $(STAMP)
 	PYTHON="$(BIN)/python" tools/test-separable
 
 release: $(STAMP) validation separable
-	set -e; for script in tutorials questions faults fuzz container cluster reports long install; do \
+	set -e; for script in tutorials questions disclosure faults fuzz container cluster reports long install; do \
 		PYTHON="$(BIN)/python" "tools/test-$$script"; done
 
 # All suites, on the real labels too where they are: LABELS=BIDS_DIR.

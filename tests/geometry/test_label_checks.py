@@ -277,7 +277,7 @@ def real():
     return [(read_label_volume(item), item.hemi) for item in items]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.skipif(not DATA.is_dir(), reason="shared test data not found")
 def test_flips_of_real_labels_are_noticed_and_rotations_are_not():
     random = np.random.default_rng(5)

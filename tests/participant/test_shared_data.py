@@ -133,6 +133,7 @@ def test_a_second_run_skips_all(out, capsys):
     assert "12 hemispheres" in capsys.readouterr().out
 
 
+@pytest.mark.long
 def test_the_mirror_image_has_the_same_map():
     """Mirrored, some failed as `label-order`, others differed by RMS .08 mm; the suite has all."""
     hemi = "R"
@@ -149,6 +150,7 @@ def test_the_mirror_image_has_the_same_map():
     np.testing.assert_allclose(back, maps.sheet.points, atol=1e-5)
 
 
+@pytest.mark.long
 def test_a_hole_beside_the_edge_moves_nothing_far_away():
     """Cut to the edge instead of filled, it moved two fifths of the map without a flag."""
     request = InputRequest(bids_dir=DATA, participant_labels=("01",), hemis=("L",))

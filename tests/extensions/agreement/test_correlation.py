@@ -80,6 +80,7 @@ def test_independent_maps_seldom_correlate(fwhm):
         assert 0.012 <= size <= 0.088, name
 
 
+@pytest.mark.long
 def test_maps_with_gaps_keep_the_error_rate():
     random = np.random.default_rng(5)
     maps = smooth(random, 6.0, 600)
