@@ -2,7 +2,7 @@
 # Without it, the base is the one that has this name today, or was loaded by it.
 ARG BASE_IMAGE=python:3.11-slim-bookworm
 # Written into datasets and descriptors: the image, and where its code is.
-ARG IMAGE=hipsta_bids:1.0.0.dev0
+ARG IMAGE=hipsta_bids:1.0.0
 ARG CODE_URL=
 
 # Packages, which change less often than the program: nothing here depends on its code.
@@ -75,7 +75,7 @@ COPY --from=slim /opt/hipsta_bids /opt/hipsta_bids
 COPY --from=program /program /opt/hipsta_bids
 LABEL org.opencontainers.image.title="hipsta_bids" \
       org.opencontainers.image.description="BIDS App for hippocampal thickness, curvature and shape maps from subfield segmentations" \
-      org.opencontainers.image.version="1.0.0.dev0" \
+      org.opencontainers.image.version="1.0.0" \
       org.opencontainers.image.authors="The hipsta_bids developers" \
       org.opencontainers.image.vendor="The hipsta_bids developers" \
       org.opencontainers.image.licenses="AGPL-3.0-or-later" \

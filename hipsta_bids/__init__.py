@@ -5,7 +5,7 @@
 ``plot_surface`` and ``plot_group``. They are loaded when first used.
 """
 
-__version__ = "1.0.0.dev0"
+__version__ = "1.0.0"
 
 #: The Python interface, by the module that has it.
 _MODULES = {
