@@ -45,8 +45,12 @@ RUN command -v strip || { apt-get update; apt-get install --yes --no-install-rec
     # Axes that nothing draws on, pictures of buttons, and helpers of matplotlib's own tests.
     rm -r mpl_toolkits/axes_grid1 mpl_toolkits/axisartist matplotlib/mpl-data/images matplotlib/testing; \
     rm -r PIL/_avif.* PIL/_imagingft.* pillow.libs/libavif-* pillow.libs/libfreetype-* pillow.libs/libharfbuzz-*; \
-    # Compilers, other databases, graphs of regions, restored images, time series.
-    rm -r numpy/distutils skimage/graph skimage/restoration skimage/segmentation statsmodels/tsa \
+    # Of scikit-image contours, skeletons, and what they load; pages of dask's server.
+    rm -r skimage/feature skimage/filters/rank skimage/future skimage/graph skimage/io skimage/metrics \
+        skimage/registration skimage/restoration skimage/segmentation skimage/transform \
+        distributed/http/static; \
+    # Compilers, other databases, time series.
+    rm -r numpy/distutils statsmodels/tsa \
         sqlalchemy/dialects/m*sql sqlalchemy/dialects/oracle sqlalchemy/dialects/postgresql sqlalchemy/testing; \
     find . -path '*.libs/*' -prune -o -type f -name '*.so*' -exec strip --strip-unneeded {} +; \
     python -m compileall -q -j 0 --invalidation-mode unchecked-hash /opt/hipsta_bids
