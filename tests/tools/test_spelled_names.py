@@ -90,3 +90,11 @@ def test_long_checks_name_tests_that_exist():
     }
     assert len(named) > 3
     assert not [(name, pattern) for name, pattern in named if not any(ROOT.glob(pattern))]
+
+
+def test_the_fuzz_check_finds_the_modules_of_the_tests():
+    (folder,) = re.findall(r'\$here/\.\./(\w+)"', (ROOT / "tools/test-fuzz").read_text("utf-8"))
+    inputs = (ROOT / "tools/fuzz_inputs.py").read_text("utf-8")
+    modules = re.findall(r'import_module\("(\w+)"\)', inputs)
+    assert len(modules) > 1
+    assert [name for name in modules if not (ROOT / folder / f"{name}.py").is_file()] == []
