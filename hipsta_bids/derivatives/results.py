@@ -87,8 +87,8 @@ def _order(result: ResultPlace) -> tuple[str, ...]:
 def read_record(result: ResultPlace) -> dict[str, Any]:
     """Read the quality record."""
     record = files.read_json(result.path("qc"))
-    for name in FILE_LISTS:
-        entries = record.get(name) or []
+    lists = {name: record.get(name) or [] for name in FILE_LISTS}
+    for name, entries in {**lists, "metrics": [record.get("metrics") or {}]}.items():
         if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
             raise InputError(f"{result.path('qc')}: bad {name}; {_REDO}", reason="bad-json")
     return record

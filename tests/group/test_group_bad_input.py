@@ -155,6 +155,10 @@ def no_list_of_files(study):
     edit_record(place_of(study.out, "07", "R"), inputs=["rh.mgz"])
 
 
+def no_metrics(study):
+    edit_record(place_of(study.out, "07", "R"), metrics="none")
+
+
 def no_grid(study):
     files.write_json(study.out / "desc-settings.json", {"settings": {"sheet": {"x_nodes": "41"}}})
 
@@ -221,6 +225,7 @@ def no_values(study):
         (mixed_settings, [], 65, "sub-07_hemi-R"),
         (other_grid, [], 65, "21 x 7 nodes"),
         (no_list_of_files, [], 65, "hemi-R_seg-demo_desc-qc_metrics.json: bad inputs"),
+        (no_metrics, [], 65, "hemi-R_seg-demo_desc-qc_metrics.json: bad metrics"),
         (no_grid, [], 65, "x_nodes is '41', but has to be a whole number"),
         (no_sheet, [], 65, "sub-05_hemi-L"),
         (unfinished, [], 65, "sub-99_hemi-L"),

@@ -420,8 +420,8 @@ def _taken(
 def _ends(record: Mapping[str, Any]) -> str:
     """Name the ends of the body that were estimated, since labels of head or tail are missing."""
     metrics = record.get("metrics") or {}
-    rules = {end: metrics.get(f"{end}_end_rule") for end in get_args(End)}
-    if None in rules.values():
+    rules = {end: str(metrics.get(f"{end}_end_rule") or files.MISSING) for end in get_args(End)}
+    if files.MISSING in rules.values():
         return files.MISSING
     estimated = [end for end, rule in rules.items() if rule not in {"labels", "user"}]
     return f"{' and '.join(estimated)} estimated" if estimated else "labeled"
