@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hipsta_bids import __version__, joints
-from hipsta_bids.cli import questions
-from hipsta_bids.cli.console import Progress, echo, echo_ignored, echo_start, quiet, warn, warn_if_lost
+from hipsta_bids.cli import console, questions
 from hipsta_bids.cli.parser import (
     Parser,
     accept,
@@ -323,7 +322,7 @@ def is_group_level(arguments: Sequence[str]) -> bool:
 def run_group_level(arguments: Sequence[str]) -> ExitCode:
     """Run the group level."""
     parsed = group_parser().parse_args(arguments)
-    with quiet(parsed.quiet):
+    with console.quiet(parsed.quiet):
         return _run(parsed, arguments)
 
 
@@ -338,40 +337,40 @@ def _check_model(parsed: argparse.Namespace) -> None:
 
 
 def _run(parsed: argparse.Namespace, arguments: Sequence[str]) -> ExitCode:
-    echo_ignored(parsed.ignored)
+    console.echo_ignored(parsed.ignored)
     _check_model(parsed)
     if parsed.reports_only:
         return _rebuild_reports(parsed.output_dir, parsed.name)
     # Thousands of tiny fits: threads of the linear algebra would only get in each other's way.
     for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(variable, "1")
-    echo_start(LEVEL, parsed.bids_dir)
+    console.echo_start(LEVEL, parsed.bids_dir)
     from hipsta_bids.io.files import check_scratch, check_writable  # noqa: PLC0415  (heavy)
 
     check_scratch()
-    warn_if_lost(parsed.output_dir)
+    console.warn_if_lost(parsed.output_dir)
     if parsed.output_dir.is_dir():  # or nothing was measured, which is said later
         check_writable(parsed.output_dir)
     from hipsta_bids.stats.inference import PROCESSORS  # noqa: PLC0415  (heavy)
 
     PROCESSORS.set(parsed.n_procs)
     settings = _settings(parsed)
-    with Progress(-1 if parsed.quiet else 0):
+    with console.Progress(-1 if parsed.quiet else 0):
         answer = (
             questions.run_question if questions.is_question(parsed) else questions.run_comparison
         )
         result = answer(parsed, _options(parsed, arguments, settings), settings)
     for warning in result.warnings:
-        warn(f"warning: {warning}")
+        console.warn(f"warning: {warning}")
     for note in result.notes:
-        echo(f"note: {note}")
+        console.echo(f"note: {note}")
     left_out = f"{result.n_excluded} exclusions of participants, visits or hemispheres"
     left_out += " (see excluded.tsv for the reasons)" if result.n_excluded else ""
-    echo(f"{result.n_participants} participants in the model, {left_out}")
-    echo(f"results: {result.folder}")
-    echo(f"report: {result.page or result.folder / 'methods.md'}")
+    console.echo(f"{result.n_participants} participants in the model, {left_out}")
+    console.echo(f"results: {result.folder}")
+    console.echo(f"report: {result.page or result.folder / 'methods.md'}")
     if result.problem is not None:
-        warn(f"report: {result.problem}")
+        console.warn(f"report: {result.problem}")
     return ExitCode.OK if result.problem is None else ExitCode.INTERNAL
 
 
@@ -395,9 +394,9 @@ def _rebuild_reports(root: Path, name: str | None) -> ExitCode:
     problems = [pages.write_group_report(root, model, makers[model]) for model in models]
     for model, problem in zip(models, problems, strict=True):
         if problem is None:
-            echo(f"report: {root / group_report(model)}")
+            console.echo(f"report: {root / group_report(model)}")
         else:
-            warn(f"report: {problem}")
+            console.warn(f"report: {problem}")
     return ExitCode.INTERNAL if any(problems) else ExitCode.OK
 
 

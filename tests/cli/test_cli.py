@@ -136,7 +136,7 @@ def test_options_without_meaning_are_noted(tmp_path, capsys):
 
 
 def test_the_group_level_accepts_them_too(tmp_path, capsys):
-    options = "--omp-nthreads 4 --low-mem --skip-bids-validation".split()
+    options = ["--omp-nthreads", "4", "--low-mem", "--skip-bids-validation"]
     assert main.main([str(tmp_path), str(tmp_path), "group", *options]) == 66
     said = capsys.readouterr().out
     for name in ("--omp-nthreads", "--low-mem", "--skip-bids-validation"):
