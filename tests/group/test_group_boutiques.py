@@ -35,8 +35,9 @@ def test_group_level_of_several_parts_leaves_all_outputs(folder):
     assert "Exit code\n0\n" in done.stdout, done.stdout
     assert "30 participants in the model" in done.stdout
     listed = {entry["id"] for entry in read_descriptor("hipsta_bids_group")["output-files"]}
-    # What only --retest and --power write.
-    assert outputs_found(done) == listed - {"output_agreement", "output_sample_sizes"}
+    # What only --retest, --power, and hemispheres with other decisions than `use` write.
+    absent = {"output_agreement", "output_sample_sizes", "output_quality"}
+    assert outputs_found(done) == listed - absent
     assert outputs_missing(done) == ""
 
 
