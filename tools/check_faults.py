@@ -232,7 +232,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="tools/test-faults", description=__doc__)
     parser.add_argument("--kills", type=int, default=20, metavar="N")
     parser.add_argument("--n-subjects", type=int, default=2, metavar="N", help="to be measured")
-    parser.add_argument("--stubs", type=int, default=5000, metavar="N", help="to be found")
+    parser.add_argument("--stubs", type=int, default=10_000, metavar="N", help="to be found")
     options = parser.parse_args(arguments)
     with tempfile.TemporaryDirectory(prefix="hipsta-faults-") as folder:
         work = Path(folder)
